@@ -1,0 +1,176 @@
+"""What a set of spike counts is worth, in numbers that a silent network cannot flatter.
+
+The class of a sample is the output neuron with most spikes. A network that never fires gives
+(0, 0, 0) everywhere; an ordinary argmax calls that class 0 and looks good on a quiet recording.
+So a tie is shared here, accuracies with a unique winner and with a margin stand beside it, and
+nothing depends on the order of the classes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+CLASSES = ("no_slip", "incipient", "gross")
+"""Class names; their positions are the labels 0, 1, 2 and the output neurons."""
+
+NO_SLIP, INCIPIENT, GROSS = range(3)
+
+DEFAULT_MARGIN = 2.0
+"""Spikes by which a winner must lead to count as decided (the paper's rule for a detection)."""
+
+Counts = npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]]
+Labels = npt.NDArray[np.integer[Any]]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Three accuracies in 0..1 over the same samples; None where there are no samples.
+
+    Attributes:
+        argmax: a sample whose class ties for the maximum with k-1 others counts 1/k, so a silent
+            network scores 1/3 and the order of the classes cannot matter.
+        strict: only a unique winner counts; a tie is wrong.
+        margin: only a unique winner that leads every other by at least the margin counts.
+        n: number of samples.
+    """
+
+    argmax: float | None
+    strict: float | None
+    margin: float | None
+    n: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Everything the report prints about one set of classified windows.
+
+    Attributes:
+        accuracy: the three accuracies.
+        confusion: int64 (3, 4); rows are true classes, columns predicted ones in the order of
+            `CLASSES`, and the fourth column holds the undecided samples (no unique winner).
+        precision: right among all decided for the class; undecided samples are in no class.
+        recall: right among all that truly are of the class; undecided samples are not right.
+        balance: share of each class among the samples.
+    """
+
+    accuracy: Accuracy
+    confusion: IntArray
+    precision: dict[str, float | None]
+    recall: dict[str, float | None]
+    balance: dict[str, float | None]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; what cannot be computed is None."""
+        return {
+            "accuracy": asdict(self.accuracy),
+            "confusion": self.confusion.tolist(),
+            "precision": dict(self.precision),
+            "recall": dict(self.recall),
+            "balance": dict(self.balance),
+        }
+
+
+def check(counts: Counts, labels: Labels) -> tuple[Counts, IntArray]:
+    """Counts (n, 3) and labels (n,) in 0..2, or a ValueError that says what is wrong."""
+    counts, labels = np.asarray(counts), np.asarray(labels)
+    classes = len(CLASSES)
+    if counts.ndim != 2 or counts.shape[1] != classes:
+        raise ValueError(f"counts have the shape {counts.shape}; expected (n, {classes})")
+    if labels.shape != counts.shape[:1]:
+        raise ValueError(f"{labels.shape} labels for {counts.shape[0]} rows of counts")
+    if counts.size and not np.isfinite(counts).all():
+        raise ValueError("counts hold a value that is not finite")
+    return counts, check_labels(labels)
+
+
+def check_labels(labels: Labels) -> IntArray:
+    """Labels as int64, or a ValueError if one is no class."""
+    labels = np.asarray(labels)
+    if labels.ndim != 1 or (labels.size and not np.issubdtype(labels.dtype, np.integer)):
+        raise ValueError(f"labels are {labels.dtype} {labels.shape}; expected integers (n,)")
+    if labels.size and (labels.min() < 0 or labels.max() >= len(CLASSES)):
+        raise ValueError(f"labels range over {labels.min()}..{labels.max()}; expected 0..2")
+    return labels.astype(np.int64)
+
+
+def winners(counts: Counts, margin: float = 0.0) -> npt.NDArray[np.int8]:
+    """The class that leads every other by at least `margin`, int8 (n,); -1 where there is none.
+
+    A tie has no winner even where `margin` is 0.
+    """
+    counts = np.asarray(counts)
+    if not len(counts):
+        return np.empty(0, np.int8)
+    ordered = np.sort(counts, axis=1)
+    lead = ordered[:, -1] - ordered[:, -2]
+    decided = (lead > 0) & (lead >= margin)
+    return np.where(decided, counts.argmax(axis=1), -1).astype(np.int8)
+
+
+def accuracy(counts: Counts, labels: Labels, margin: float = DEFAULT_MARGIN) -> Accuracy:
+    """The three accuracies of spike counts (n, 3) against labels int (n,)."""
+    counts, labels = check(counts, labels)
+    n = len(labels)
+    if n == 0:
+        return Accuracy(None, None, None, 0)
+    top = counts == counts.max(axis=1, keepdims=True)
+    hit = top[np.arange(n), labels]
+    # sixths are whole numbers for 1, 1/2 and 1/3: the sum is exact in any order
+    sixths = int((6 // top.sum(axis=1))[hit].sum())
+    return Accuracy(
+        argmax=sixths / (6 * n),
+        strict=int((winners(counts) == labels).sum()) / n,
+        margin=int((winners(counts, margin) == labels).sum()) / n,
+        n=n,
+    )
+
+
+def confusion(counts: Counts, labels: Labels) -> IntArray:
+    """How often each true class (row) was called what (column), int64 (3, 4).
+
+    The fourth column is 'undecided': no unique winner. Rows add up to the samples of the class.
+    """
+    counts, labels = check(counts, labels)
+    columns = len(CLASSES) + 1
+    found = winners(counts).astype(np.int64)
+    found[found < 0] = columns - 1
+    cells = np.bincount(labels * columns + found, minlength=len(CLASSES) * columns)
+    return cells.reshape(len(CLASSES), columns).astype(np.int64)
+
+
+def class_balance(labels: Labels) -> dict[str, float | None]:
+    """Share of each class among the labels; None where there are no labels."""
+    labels = check_labels(labels)
+    each = np.bincount(labels, minlength=len(CLASSES))
+    return {name: _share(each[k], len(labels)) for k, name in enumerate(CLASSES)}
+
+
+def score(counts: Counts, labels: Labels, margin: float = DEFAULT_MARGIN) -> Scores:
+    """Accuracies, confusion matrix, precision, recall and class balance in one.
+
+    Args:
+        counts: spike counts (n, 3), integer or float.
+        labels: true classes, integer (n,), 0..2.
+        margin: spikes by which a winner must lead for the margin accuracy.
+
+    Raises:
+        ValueError: shapes that do not fit, a label that is no class, a count not finite.
+    """
+    table = confusion(counts, labels)
+    return Scores(
+        accuracy=accuracy(counts, labels, margin),
+        confusion=table,
+        precision={n: _share(table[k, k], table[:, k].sum()) for k, n in enumerate(CLASSES)},
+        recall={n: _share(table[k, k], table[k].sum()) for k, n in enumerate(CLASSES)},
+        balance=class_balance(labels),
+    )
+
+
+def _share(part: int | np.integer[Any], whole: int | np.integer[Any]) -> float | None:
+    return int(part) / int(whole) if whole else None

@@ -1,0 +1,156 @@
+"""The spiking network, written down in Sinabs: this is what "the network" means.
+
+Everything faster (`analysis.iaf`) is held to the spike counts that this file gives. Sinabs'
+defaults are not the paper's neuron: an IAF there may fire many times a step and keeps what is
+above the threshold, while the paper's fires once and is reset. Nothing here touches Sinabs' chip
+back end, because that imports a vendor package which installs things when it is imported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from sinabs.activation import MembraneReset, SingleExponential, SingleSpike
+from sinabs.layers import IAFSqueeze
+from torch import nn
+
+from analysis.metrics import CLASSES
+from protocols.settings import Network, Windows
+
+WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
+"""Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""
+
+SPIKING = ("iaf1", "iaf2", "iaf3", "iaf4")
+"""Names of the spiking layers, one after each layer of `WEIGHTED`."""
+
+Array = npt.NDArray[Any]
+Counts = npt.NDArray[np.int64]
+
+
+def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
+    """A network with fresh weights: conv, conv of stride 2, two fully connected, IAF after each.
+
+    Time is folded into the batch: the modules take (n * steps, channels, cells, cells) float32
+    and give (n * steps, 3) spikes. There are no biases. Weights are torch's default draw times
+    ``settings.weight_scale``; torch's global random state is left as it was.
+
+    Args:
+        settings: channels, kernels, hidden neurons, weight scale.
+        windows: shape of a sample.
+        seed: the same seed gives the same weights to the bit.
+    """
+    side = math.ceil(windows.cells / 2)
+    k1, k2 = settings.conv1_kernel, settings.conv2_kernel
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        conv1 = nn.Conv2d(
+            windows.channels, settings.conv1_channels, k1, padding=k1 // 2, bias=False
+        )
+        conv2 = nn.Conv2d(
+            settings.conv1_channels,
+            settings.conv2_channels,
+            k2,
+            stride=2,
+            padding=k2 // 2,
+            bias=False,
+        )
+        fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden, bias=False)
+        fc2 = nn.Linear(settings.hidden, len(CLASSES), bias=False)
+    with torch.no_grad():
+        for layer, scale in zip((conv1, conv2, fc1, fc2), settings.weight_scale, strict=True):
+            layer.weight.mul_(scale)
+    return nn.Sequential(
+        OrderedDict(
+            conv1=conv1,
+            iaf1=_iaf(windows.steps),
+            conv2=conv2,
+            iaf2=_iaf(windows.steps),
+            flatten=nn.Flatten(),
+            fc1=fc1,
+            iaf3=_iaf(windows.steps),
+            fc2=fc2,
+            iaf4=_iaf(windows.steps),
+        )
+    )
+
+
+def _iaf(steps: int) -> IAFSqueeze:
+    """One spike a step at most, reset to zero, no lower bound; threshold 1."""
+    return IAFSqueeze(
+        num_timesteps=steps,
+        spike_threshold=torch.tensor(1.0),
+        spike_fn=SingleSpike,
+        reset_fn=MembraneReset(),
+        surrogate_grad_fn=SingleExponential(),
+    )
+
+
+def weights(net: nn.Sequential) -> dict[str, torch.Tensor]:
+    """Copies of the weights by name (``conv1.weight`` ...), without neuron states."""
+    return {f"{n}.weight": getattr(net, n).weight.detach().clone() for n in WEIGHTED}
+
+
+def set_weights(net: nn.Sequential, values: dict[str, torch.Tensor]) -> None:
+    """Put weights into a network that `build` made.
+
+    Raises:
+        ValueError: a weight is missing or too many, or has another shape.
+    """
+    expected = {f"{n}.weight": getattr(net, n).weight for n in WEIGHTED}
+    if set(values) != set(expected):
+        raise ValueError(f"weights {sorted(values)}; expected {sorted(expected)}")
+    with torch.no_grad():
+        for name, parameter in expected.items():
+            if values[name].shape != parameter.shape:
+                raise ValueError(
+                    f"{name} has the shape {tuple(values[name].shape)}; "
+                    f"expected {tuple(parameter.shape)}"
+                )
+            parameter.copy_(values[name])
+
+
+def reset_states(net: nn.Sequential) -> None:
+    """Put every neuron to potential zero, as before an independent sample."""
+    for name in SPIKING:
+        getattr(net, name).reset_states()
+
+
+def check_samples(net: nn.Sequential, shape: tuple[int, ...]) -> None:
+    """A ValueError unless `shape` is (n, steps, channels, height, width) of this network."""
+    steps, channels = net.iaf1.num_timesteps, net.conv1.in_channels
+    if len(shape) != 5 or shape[1:3] != (steps, channels):
+        raise ValueError(f"samples have the shape {shape}; expected (n, {steps}, {channels}, H, W)")
+
+
+def spike_counts(net: nn.Sequential, x: Array, batch: int = 64) -> Counts:
+    """Output spikes of each sample by Sinabs' own layers: the reference.
+
+    States are reset before every batch, and the samples of a batch have states of their own.
+
+    Args:
+        net: from `build`.
+        x: event counts (n, steps, channels, height, width), uint8 or float32.
+        batch: samples at a time.
+
+    Returns:
+        int64 (n, 3) in the order of `analysis.metrics.CLASSES`.
+
+    Raises:
+        ValueError: samples of another shape.
+    """
+    check_samples(net, x.shape)
+    out = np.zeros((len(x), len(CLASSES)), np.int64)
+    with torch.no_grad():
+        for start in range(0, len(x), batch):
+            part = torch.from_numpy(x[start : start + batch].astype(np.float32))
+            reset_states(net)
+            spikes = net(part.flatten(0, 1))
+            counts = spikes.unflatten(0, (len(part), -1)).sum(dim=1)
+            out[start : start + batch] = counts.numpy().astype(np.int64)
+    reset_states(net)
+    return out

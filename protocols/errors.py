@@ -1,0 +1,47 @@
+"""The one error a person sees when what they wrote is wrong.
+
+Every input file of the project (protocols, rig files) and every bad option ends in an
+`InputError`: it names the file, the key, the value, and what would be right. The command line
+prints it as one message and exits with 2.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class InputError(ValueError):
+    """Wrong input, said so that it can be mended without reading any code.
+
+    Attributes:
+        file: the file the input came from, or a command-line option's name.
+        key: the path of the key inside it, such as ``collection.factors.depth.values[2]``.
+        value: what was found there, as text; ``None`` where nothing was found.
+        expected: what would be right, as a phrase.
+    """
+
+    def __init__(
+        self, file: str | Path, key: str, value: object | None, expected: str
+    ) -> None:
+        self.file = str(file)
+        self.key = key
+        self.value = None if value is None else _short(value)
+        self.expected = expected
+        super().__init__(self.message)
+
+    @property
+    def message(self) -> str:
+        """``file: key = value: expected`` in one line."""
+        where = f"{self.file}: {self.key}" if self.key else self.file
+        found = "" if self.value is None else f" = {self.value}"
+        return f"{where}{found}: {self.expected}"
+
+    def in_file(self, file: str | Path) -> InputError:
+        """The same error, for input that turned out to come from `file`."""
+        return InputError(file, self.key, self.value, self.expected)
+
+
+def _short(value: object, limit: int = 80) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,232 @@
+"""From the phases of a protocol and one trial's condition to a motion program.
+
+Also where a protocol's motion is held against its own limits, level by level, so that a message
+can name the level that breaks a limit rather than the trial that would have.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from decimal import Decimal
+from itertools import product
+from typing import Any
+
+from protocols.model import (
+    Approach,
+    Collection,
+    Hold,
+    Level,
+    PlateMotion,
+    Press,
+    Protocol,
+    Release,
+    Retract,
+    Return,
+    Slide,
+)
+from protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from protocols.quantity import FactorRef, canonical
+from protocols.yaml_file import KeyedError
+
+Condition = Mapping[str, Level]
+
+
+def _value(field: Decimal | FactorRef | str, condition: Condition) -> float:
+    level = condition[field.factor] if isinstance(field, FactorRef) else field
+    return float(level)
+
+
+def _side(field: str | FactorRef, condition: Condition) -> int:
+    side = condition[field.factor] if isinstance(field, FactorRef) else field
+    return {"left": -1, "right": 1}[str(side)]
+
+
+def build_program(collection: Collection, condition: Condition) -> Program:
+    """The motion program of one trial.
+
+    Recording runs from the end of settling in the last hold before the slide or retraction to
+    the end of that motion. A slide is centred on the plate; a disturbance goes to the side
+    (right is +x) during the whole retraction, on one straight path.
+    """
+    motion = collection.motion
+    acting = next(i for i, phase in enumerate(motion) if isinstance(phase, (Slide, Retract)))
+    holds = [i for i, phase in enumerate(motion) if isinstance(phase, Hold) and i < acting]
+    approach = next(phase for phase in motion if isinstance(phase, Approach))
+    home = Position(0.0, 0.0, -float(approach.clearance))
+    start_xy = (0.0, 0.0)
+    if isinstance(motion[acting], Slide):
+        half = _half_slide(motion[acting], condition)
+        start_xy = (-half[0], -half[1])
+    steps: list[Step] = []
+    at = home
+    for index, phase in enumerate(motion):
+        recorded = holds[-1] <= index <= acting
+        if isinstance(phase, Approach):
+            at = Position(*start_xy, -float(phase.clearance))
+            steps.append(Move("approach", at, float(phase.speed)))
+        elif isinstance(phase, Press):
+            at = Position(at.x_mm, at.y_mm, _value(phase.depth, condition))
+            steps.append(Move("press", at, float(phase.speed)))
+        elif isinstance(phase, Hold):
+            if phase.settle:
+                steps.append(Dwell("settle", float(phase.settle)))
+            steps.append(Dwell("hold", float(phase.duration), recorded))
+        elif isinstance(phase, Slide):
+            half = _half_slide(phase, condition)
+            at = Position(at.x_mm + 2 * half[0], at.y_mm + 2 * half[1], at.depth_mm)
+            steps.append(Move("slide", at, _value(phase.speed, condition), recorded))
+        elif isinstance(phase, Retract):
+            distance, speed = _value(phase.distance, condition), _value(phase.speed, condition)
+            share = _signed_share(phase, condition)
+            at = Position(at.x_mm + share * distance, at.y_mm, at.depth_mm - distance)
+            steps.append(Move("retract", at, speed * math.hypot(1.0, share), recorded))
+        elif isinstance(phase, PlateMotion):
+            steps.append(PlateStep("plate", phase.action, float(phase.duration), recorded))
+        elif isinstance(phase, Release):
+            at = Position(at.x_mm, at.y_mm, -float(phase.clearance))
+            steps.append(Move("release", at, float(phase.speed)))
+        elif isinstance(phase, Return):
+            at = Position(0.0, 0.0, home.depth_mm)
+            steps.append(Move("return", at, float(phase.speed)))
+    return Program(home, tuple(steps))
+
+
+def _half_slide(phase: Any, condition: Condition) -> tuple[float, float]:
+    """Half of the slide's vector; multiples of 90 degrees are exact."""
+    half = _value(phase.distance, condition) / 2
+    angle = math.fmod(_value(phase.direction, condition), 360.0)
+    exact = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
+    unit = exact.get(angle % 360.0)
+    if unit is None:
+        unit = (math.cos(math.radians(angle)), math.sin(math.radians(angle)))
+    return half * unit[0], half * unit[1]
+
+
+def _signed_share(phase: Retract, condition: Condition) -> float:
+    if phase.disturbance is None:
+        return 0.0
+    return _value(phase.disturbance.share, condition) / 100.0 * _side(
+        phase.disturbance.side, condition
+    )
+
+
+def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -> None:
+    """Hold every level of every phase against the protocol's limits.
+
+    Args:
+        enabled: the levels taken, by factor.
+
+    Raises:
+        KeyedError: the first limit broken, with the key of the level that breaks it.
+    """
+    collection = protocol.collection
+    limits = collection.limits
+
+    def levels(field: Any, key: str) -> Iterator[tuple[Any, str]]:
+        """Each value a field can take, with the key it is written under."""
+        if not isinstance(field, FactorRef):
+            yield field, key
+            return
+        written = collection.factors[field.factor]
+        for index, level in enumerate(enabled[field.factor]):
+            place = f".values[{index}]" if written.values is not None else ".range"
+            yield level, f"collection.factors.{field.factor}{place}"
+
+    def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> None:
+        for value, where in levels(field, key):
+            if isinstance(value, str):
+                raise KeyedError(where, value, f"is a word where a number in {unit} belongs")
+            if value > limit:
+                raise KeyedError(
+                    where, f"{canonical(value)} {unit}",
+                    f"is over collection.limits.{name} = {canonical(limit)} {unit}",
+                )
+            if value <= 0:
+                raise KeyedError(where, f"{canonical(value)} {unit}", "must be more than 0")
+
+    for index, phase in enumerate(collection.motion):
+        base = f"collection.motion[{index}]"
+        if isinstance(phase, (Approach, Press, Slide, Retract, Release, Return)):
+            at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+        if isinstance(phase, (Approach, Release)):
+            at_most(
+                phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
+            )
+        if isinstance(phase, Press):
+            at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
+        if isinstance(phase, Slide):
+            at_most(phase.distance, f"{base}.distance", Decimal(10_000), "workspace", "mm")
+            _check_slide(phase, base, levels, limits)
+        if isinstance(phase, Retract):
+            at_most(phase.distance, f"{base}.distance", Decimal(10_000), "clearance", "mm")
+            _check_retract(phase, base, levels, limits)
+    if collection.maintenance.warm_up is not None:
+        warm_up, base = collection.maintenance.warm_up, "collection.maintenance.warm_up"
+        at_most(warm_up.depth, f"{base}.depth", limits.depth, "depth", "mm")
+        at_most(warm_up.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+        at_most(warm_up.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
+    if collection.maintenance.rezero is not None:
+        rezero, base = collection.maintenance.rezero, "collection.maintenance.rezero"
+        at_most(rezero.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
+        at_most(rezero.search, f"{base}.search", limits.depth, "depth", "mm")
+    if collection.plate is not None:
+        at_most(collection.plate.mass, "collection.plate.mass", Decimal(5), "mass (fixed)", "kg")
+
+
+Levels = Callable[[Any, str], Iterator[tuple[Any, str]]]
+
+
+def _inside(x: float, y: float, limits: Any) -> str | None:
+    for name, value, axis in (("x", x, limits.workspace.x), ("y", y, limits.workspace.y)):
+        if not float(axis.low) - 1e-9 <= value <= float(axis.high) + 1e-9:
+            return (
+                f"reaches {name} = {value:.3f} mm, outside collection.limits.workspace.{name} = "
+                f"{canonical(axis.low)} to {canonical(axis.high)} mm"
+            )
+    return None
+
+
+def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> None:
+    pairs = product(
+        levels(phase.distance, f"{base}.distance"), levels(phase.direction, f"{base}.direction")
+    )
+    for (distance, where), (direction, from_key) in pairs:
+        if isinstance(direction, str):
+            raise KeyedError(from_key, direction, "is a word where a number in deg belongs")
+        probe = Slide.model_construct(
+            phase="slide", distance=distance, speed=phase.speed, direction=direction
+        )
+        half = _half_slide(probe, {})
+        for sign in (-1, 1):
+            broken = _inside(sign * half[0], sign * half[1], limits)
+            if broken:
+                raise KeyedError(
+                    where, f"{canonical(distance)} mm",
+                    f"a slide at {canonical(direction)} deg {broken}",
+                )
+
+
+def _check_retract(phase: Retract, base: str, levels: Levels, limits: Any) -> None:
+    if phase.disturbance is None:
+        return
+    key = f"{base}.disturbance"
+    for side, where in levels(phase.disturbance.side, f"{key}.side"):
+        if side not in {"left", "right"}:
+            raise KeyedError(where, side, "must be 'left' or 'right'")
+    for share, where in levels(phase.disturbance.share, f"{key}.share"):
+        if isinstance(share, str) or not 0 <= share <= 200:
+            raise KeyedError(where, share, "must be from 0 to 200 percent of the retraction speed")
+        for distance, _ in levels(phase.distance, f"{base}.distance"):
+            reach = float(share) / 100 * float(distance)
+            broken = _inside(reach, 0.0, limits) or _inside(-reach, 0.0, limits)
+            if broken:
+                raise KeyedError(where, f"{canonical(share)} percent", broken)
+        for speed, at in levels(phase.speed, f"{base}.speed"):
+            total = float(speed) * math.hypot(1.0, float(share) / 100)
+            if total > float(limits.speed) + 1e-9:
+                raise KeyedError(
+                    at, f"{canonical(speed)} mm/s",
+                    f"with a disturbance of {canonical(share)} percent makes {total:.3f} mm/s, "
+                    f"over collection.limits.speed = {canonical(limits.speed)} mm/s",
+                )

@@ -1,0 +1,288 @@
+"""The plan: the ordered table of trials that a protocol expands to.
+
+Ids come from decimal text, the order from hashes of ids: the same protocol gives the same plan on
+every machine, and a level added later changes no id, no split and no relative order of the trials
+that were there already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from protocols.errors import InputError
+from protocols.hashing import hash_data, hash_integer
+from protocols.model import Level, Protocol
+from protocols.motion import build_program, check_limits
+from protocols.program import Program
+from protocols.quantity import FILE_UNITS, canonical, to_decimal
+from protocols.split import assign, check_split
+from protocols.yaml_file import KeyedError, load
+
+Role = Literal["measured", "reference"]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One planned trial."""
+
+    index: int
+    """Place in the plan, from 0."""
+    id: str
+    """Content-derived: ``depth=2.4mm,direction=45deg,speed=0.6mmps,r=1``."""
+    role: Role
+    block: int
+    repetition: int
+    condition: tuple[tuple[str, Level], ...]
+    split: str
+    """``train``, ``validation``, ``test``, or ``none`` for reference trials."""
+    seed: int
+
+
+@dataclass(frozen=True)
+class Task:
+    """Something to be done before a trial: by the arm, or by a person."""
+
+    kind: Literal["changeover", "warm_up", "rezero", "clean"]
+    by_person: bool
+    prompt: str
+    expected: str
+    slot: int
+    """Which occurrence it is; with the rig's seed it decides a simulated rezero."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A protocol expanded. Iterating gives the trials in the order they are taken."""
+
+    protocol: Protocol
+    file: str
+    enabled: Mapping[str, tuple[Level, ...]]
+    trials: tuple[Trial, ...]
+    _programs: dict[tuple[tuple[str, Level], ...], Program] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    def __iter__(self) -> Iterator[Trial]:
+        return iter(self.trials)
+
+    def program(self, trial: Trial) -> Program:
+        """The motion program of `trial`."""
+        if trial.condition not in self._programs:
+            self._programs[trial.condition] = build_program(
+                self.protocol.collection, dict(trial.condition)
+            )
+        return self._programs[trial.condition]
+
+    def seconds(self, trial: Trial, *, recorded_only: bool = False) -> float:
+        """Planned seconds of motion of one trial."""
+        return self.program(trial).seconds(recorded_only=recorded_only)
+
+    @cached_property
+    def total_seconds(self) -> float:
+        """Planned seconds of motion of all trials, maintenance and people's work left out."""
+        return sum(self.seconds(trial) for trial in self.trials)
+
+    def describe(self, trial: Trial) -> dict[str, str]:
+        """The trial's condition as text with units, by factor."""
+        factors = self.protocol.collection.factors
+        return {name: factors[name].text(level) for name, level in trial.condition}
+
+    def mass_kg(self, trial: Trial) -> float | None:
+        """Mass of the sliding plate in this trial; None where there is none."""
+        plate = self.protocol.collection.plate
+        if plate is None:
+            return None
+        level = plate.mass
+        return float(dict(trial.condition)[level.factor] if hasattr(level, "factor") else level)
+
+    def tasks_before(self, trial: Trial) -> tuple[Task, ...]:
+        """What the protocol wants done before `trial`, in order, in an undisturbed campaign."""
+        before = self.trials[trial.index - 1] if trial.index else None
+        tasks = list(self.changeovers(before, trial))
+        upkeep = self.protocol.collection.maintenance
+        if upkeep.clean is not None and trial.index and trial.index % upkeep.clean.every == 0:
+            tasks.append(
+                Task("clean", True, upkeep.clean.prompt, "done", trial.index // upkeep.clean.every)
+            )
+        if upkeep.warm_up is not None and trial.index == 0:
+            tasks.append(Task("warm_up", False, "warm-up presses", "", 0))
+        if upkeep.rezero is not None and trial.index % upkeep.rezero.every == 0:
+            tasks.append(self.rezero_task(trial))
+        return tuple(tasks)
+
+    def rezero_task(self, trial: Trial) -> Task:
+        """The search for depth zero that `trial` relies on."""
+        upkeep = self.protocol.collection.maintenance.rezero
+        slot = 0 if upkeep is None else trial.index // upkeep.every
+        return Task("rezero", False, "touch off to find depth zero", "", slot)
+
+    def changeovers(self, before: Trial | None, trial: Trial) -> tuple[Task, ...]:
+        """What a person must change between two trials (or before the first)."""
+        past = dict(before.condition) if before is not None else {}
+        tasks = []
+        for name, level in trial.condition:
+            factor = self.protocol.collection.factors[name]
+            if factor.changeover == "person" and past.get(name) != level:
+                text = factor.text(level)
+                tasks.append(Task("changeover", True, f"set {name} to {text}", text, trial.block))
+        return tuple(tasks)
+
+    def stretches(self) -> list[tuple[int, int]]:
+        """(first, last) indices of runs of trials that need no person in between."""
+        starts = [t.index for t in self.trials if any(x.by_person for x in self.tasks_before(t))]
+        starts = sorted({0, *starts})
+        ends = [start - 1 for start in starts[1:]] + [len(self.trials) - 1]
+        return list(zip(starts, ends, strict=True))
+
+    def warnings(self) -> list[str]:
+        """What is allowed and probably not meant."""
+        windows, samples = self.protocol.analysis.windows, self.protocol.analysis.samples
+        need = windows.length_ms * samples.per_class / 1000
+        found = []
+        for phase in self.protocol.collection.motion:
+            if phase.phase == "hold" and float(phase.duration) < need:
+                found.append(
+                    f"collection.motion: a hold of {canonical(phase.duration)} s is shorter than "
+                    f"{samples.per_class} no-slip windows of {windows.length_ms} ms ({need:g} s)"
+                )
+        return found
+
+    @cached_property
+    def collection_hash(self) -> str:
+        """Hash of all that decides what is collected, the levels taken left out.
+
+        Levels, repetitions and reference trials only add trials; the ids say which.
+        """
+        data = self.protocol.collection.model_dump(mode="json", by_alias=True)
+        for factor in data["factors"].values():
+            for key in ("values", "range", "off"):
+                factor.pop(key)
+        for key in ("repetitions", "references"):
+            data.pop(key)
+        return hash_data(data)
+
+    @cached_property
+    def analysis_hash(self) -> str:
+        """Hash of the `analysis:` section."""
+        return hash_data(self.protocol.analysis.model_dump(mode="json"))
+
+
+def load_plan(path: Path, enable: Iterable[str] = ()) -> Plan:
+    """Read the protocol at `path` and expand it.
+
+    Args:
+        enable: levels to switch on, as ``factor=level`` (``disturbance=125``).
+
+    Raises:
+        InputError: anything wrong, with file, key, value and what would be right.
+    """
+    return make_plan(load(Protocol, path, "protocol"), str(path), enable)
+
+
+def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:
+    """Expand a protocol that was read from `file`."""
+    levels = _enabled(protocol, enable)
+    try:
+        check_limits(protocol, levels)
+        split = check_split(protocol.analysis.split, protocol.collection.factors)
+    except KeyedError as error:
+        raise InputError(file, error.key, error.value, str(error)) from None
+    analysis = protocol.analysis.model_copy(update={"split": split})
+    protocol = protocol.model_copy(update={"analysis": analysis})
+    plan = Plan(protocol, file, levels, tuple(_expand(protocol, levels)))
+    limit = float(protocol.collection.limits.duration)
+    for trial in plan:
+        if plan.seconds(trial) > limit:
+            raise InputError(
+                file, "collection.limits.duration", f"{limit:g} s",
+                f"trial {trial.id} would take {plan.seconds(trial):.1f} s; raise the limit or "
+                "shorten the motion",
+            )
+    return plan
+
+
+def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level, ...]]:
+    factors = protocol.collection.factors
+    levels = {name: factor.levels() for name, factor in factors.items()}
+    for text in enable:
+        name, _, raw = text.partition("=")
+        if name not in factors:
+            raise InputError("--enable", name, text, f"must name a factor: {', '.join(factors)}")
+        factor = factors[name]
+        try:
+            level: Level = raw if factor.unit is None else to_decimal(raw.strip())
+        except ValueError as error:
+            raise InputError("--enable", name, raw, str(error)) from None
+        if level not in (*factor.levels(), *factor.off):
+            off = ", ".join(factor.text(item) for item in factor.off) or "none"
+            raise InputError("--enable", name, raw, f"is not a level that is off; off are: {off}")
+        if level not in levels[name]:
+            levels[name] = (*levels[name], level)
+    return levels
+
+
+def condition_id(protocol: Protocol, condition: Mapping[str, Level]) -> str:
+    """``depth=2.4mm,direction=45deg``: factors by name, levels as decimal text with unit."""
+    parts = []
+    for name in sorted(condition):
+        level, unit = condition[name], protocol.collection.factors[name].unit
+        text = level if isinstance(level, str) else canonical(level)
+        parts.append(f"{name}={text}{FILE_UNITS.get(unit or '', unit or '')}")
+    return ",".join(parts)
+
+
+def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iterator[Trial]:
+    collection = protocol.collection
+    factors = collection.factors
+    outer = [name for name in factors if factors[name].changeover == "person"]
+    inner = [name for name in factors if name not in outer]
+    repetitions = range(1, collection.repetitions + 1)
+    splits: dict[str, str] = {}
+    references = collection.references
+    index = block = taken = 0
+
+    def trial(
+        condition: Mapping[str, Level], trial_id: str, repetition: int, role: Role, split: str
+    ) -> Trial:
+        ordered = tuple((name, condition[name]) for name in factors)
+        seed = hash_integer(collection.seed, trial_id)
+        return Trial(index, trial_id, role, block, repetition, ordered, split, seed)
+
+    for outer_levels in product(*(levels[name] for name in outer)):
+        fixed = dict(zip(outer, outer_levels, strict=True))
+        cells = []
+        for inner_levels in product(*(levels[name] for name in inner)):
+            condition = {**fixed, **dict(zip(inner, inner_levels, strict=True))}
+            cell = condition_id(protocol, condition)
+            ids = [f"{cell},r={repetition}" for repetition in repetitions]
+            parts = assign(condition, ids, protocol.analysis.split)
+            splits.update(zip(ids, parts, strict=True))
+            cells.append((cell, condition))
+        for repetition in repetitions:
+            ordered = cells
+            if collection.order == "shuffled":
+                ordered = sorted(
+                    cells, key=lambda item: hash_integer(collection.seed, repetition, item[0])
+                )
+            for cell, condition in ordered:
+                if references is not None and taken % references.every == 0:
+                    number = taken // references.every + 1
+                    reference_id = f"reference,{condition_id(protocol, references.condition)}"
+                    yield trial(
+                        references.condition, f"{reference_id},r={number}", number, "reference",
+                        "none",
+                    )
+                    index += 1
+                name = f"{cell},r={repetition}"
+                yield trial(condition, name, repetition, "measured", splits.pop(name))
+                index += 1
+                taken += 1
+            block += 1

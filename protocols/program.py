@@ -1,0 +1,86 @@
+"""The motion program of one trial: what a planned trial tells a rig to do, step by step.
+
+Coordinates are the plate's: `x` to the right and `y` up along the contact surface, origin at the
+plate's centre, `depth` the indentation of the highest papilla tip (positive pressed in, negative
+clear of the plate). The rig turns them into arm poses with its taught contact plane, so a
+program is the same on every rig.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+PlateAction = Literal["raise", "release", "catch"]
+
+
+@dataclass(frozen=True)
+class Position:
+    """A place of the sensor's centre in plate coordinates, millimetres."""
+
+    x_mm: float
+    y_mm: float
+    depth_mm: float
+
+    def distance_mm(self, other: Position) -> float:
+        """Straight-line distance to `other`."""
+        return math.dist(
+            (self.x_mm, self.y_mm, self.depth_mm), (other.x_mm, other.y_mm, other.depth_mm)
+        )
+
+
+@dataclass(frozen=True)
+class Move:
+    """A straight move at constant speed (along the whole path, not per axis)."""
+
+    phase: str
+    to: Position
+    speed_mm_s: float
+    recorded: bool = False
+
+
+@dataclass(frozen=True)
+class Dwell:
+    """Standing still."""
+
+    phase: str
+    seconds: float
+    recorded: bool = False
+
+
+@dataclass(frozen=True)
+class PlateStep:
+    """Something done to the sliding plate: `release` takes `seconds` as a ramp."""
+
+    phase: str
+    action: PlateAction
+    seconds: float
+    recorded: bool = False
+
+
+Step = Move | Dwell | PlateStep
+
+
+@dataclass(frozen=True)
+class Program:
+    """The steps of one trial in order; the arm begins and ends at `home`."""
+
+    home: Position
+    steps: tuple[Step, ...]
+
+    def seconds(self, *, recorded_only: bool = False) -> float:
+        """Planned duration, without the arm's ramps."""
+        total, at = 0.0, self.home
+        for step in self.steps:
+            duration, at = step_seconds(step, at)
+            if step.recorded or not recorded_only:
+                total += duration
+        return total
+
+
+def step_seconds(step: Step, at: Position) -> tuple[float, Position]:
+    """Duration of `step` begun at `at`, seconds, and where it ends."""
+    if isinstance(step, Move):
+        return at.distance_mm(step.to) / step.speed_mm_s, step.to
+    return step.seconds, at

@@ -1,0 +1,159 @@
+"""Physical quantities as exact decimals in one unit a kind.
+
+A protocol's numbers become trial ids, so they must be the same on every machine and for every
+way of writing them: ``2.4 mm``, ``2.40 mm`` and ``0.24 cm`` are one level. They are therefore
+kept as `decimal.Decimal` in the canonical unit of their kind, and never pass through a float.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainSerializer
+
+# unit -> (canonical unit of its kind, factor to it); all factors are exact decimals
+UNITS: dict[str, tuple[str, Decimal]] = {
+    "mm": ("mm", Decimal(1)),
+    "um": ("mm", Decimal("0.001")),
+    "cm": ("mm", Decimal(10)),
+    "m": ("mm", Decimal(1000)),
+    "mm/s": ("mm/s", Decimal(1)),
+    "cm/s": ("mm/s", Decimal(10)),
+    "m/s": ("mm/s", Decimal(1000)),
+    "deg": ("deg", Decimal(1)),
+    "s": ("s", Decimal(1)),
+    "ms": ("s", Decimal("0.001")),
+    "min": ("s", Decimal(60)),
+    "kg": ("kg", Decimal(1)),
+    "g": ("kg", Decimal("0.001")),
+    "percent": ("percent", Decimal(1)),
+    "%": ("percent", Decimal(1)),
+    "px": ("px", Decimal(1)),
+    "Hz": ("Hz", Decimal(1)),
+    "kHz": ("Hz", Decimal(1000)),
+    "ppm": ("ppm", Decimal(1)),
+    "N": ("N", Decimal(1)),
+}
+# how a canonical unit is written where a slash or a percent sign cannot stand (file names)
+FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}
+
+_PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
+_LARGEST = Decimal("1e9")
+
+
+def canonical(value: Decimal) -> str:
+    """`value` as the one decimal string that stands for it: no exponent, no trailing zeros."""
+    text = format(value.normalize(), "f")
+    return "0" if text in {"-0", "0"} else text
+
+
+def to_decimal(raw: object) -> Decimal:
+    """A plain number as a finite decimal.
+
+    Raises:
+        ValueError: not a number, not finite, or beyond 1e9 in size.
+    """
+    if isinstance(raw, bool) or not isinstance(raw, (int, float, str, Decimal)):
+        raise ValueError("must be a number")
+    try:
+        value = Decimal(repr(raw)) if isinstance(raw, float) else Decimal(raw)
+    except InvalidOperation as error:
+        raise ValueError("must be a number") from error
+    if not value.is_finite():
+        raise ValueError("must be a finite number")
+    if abs(value) > _LARGEST:
+        raise ValueError("must be at most 1e9 in size")
+    return value
+
+
+def parse(raw: object, unit: str) -> Decimal:
+    """Text such as ``"15 mm"`` as a decimal in the canonical `unit`.
+
+    Raises:
+        ValueError: no number, no unit, or a unit of another kind; the text says what is right.
+    """
+    if isinstance(raw, (int, float, Decimal)) and not isinstance(raw, bool):
+        raise ValueError(f"has no unit: write a number with a unit, such as '{raw} {unit}'")
+    match = _PATTERN.fullmatch(raw) if isinstance(raw, str) else None
+    if match is None:
+        raise ValueError(f"must be a finite number with a unit, such as '1.5 {unit}'")
+    number, written = match.groups()
+    base, factor = UNITS.get(written, ("", Decimal(1)))
+    if base != unit:
+        allowed = ", ".join(name for name, (kind, _) in UNITS.items() if kind == unit)
+        raise ValueError(f"has the unit '{written}' where one of these belongs: {allowed}")
+    return to_decimal(number) * factor
+
+
+@dataclass(frozen=True)
+class FactorRef:
+    """``$depth`` in a motion phase: the level of that factor in the trial at hand."""
+
+    factor: str
+
+    def __str__(self) -> str:
+        return f"${self.factor}"
+
+
+def parse_or_ref(raw: object, unit: str) -> Decimal | FactorRef:
+    """A quantity, or a reference to a factor (``$name``)."""
+    if isinstance(raw, FactorRef):
+        return raw
+    if isinstance(raw, str) and raw.startswith("$"):
+        if not re.fullmatch(r"\$[a-z][a-z0-9_]*", raw):
+            raise ValueError("must be a factor's name after '$', such as '$depth'")
+        return FactorRef(raw[1:])
+    return parse(raw, unit)
+
+
+def _checked(
+    unit: str, reader: Callable[[object, str], Any], low: Decimal | None, strict: bool
+) -> Callable[[object], Any]:
+    def read(raw: object) -> Any:
+        value = reader(raw, unit)
+        if isinstance(value, Decimal) and low is not None:
+            if strict and value <= low:
+                raise ValueError(f"must be more than {canonical(low)} {unit}")
+            if value < low:
+                raise ValueError(f"must be at least {canonical(low)} {unit}")
+        return value
+
+    return read
+
+
+def _writer(unit: str) -> Callable[[Any], str]:
+    def write(value: Any) -> str:
+        return str(value) if isinstance(value, FactorRef) else f"{canonical(value)} {unit}"
+
+    return write
+
+
+def _quantity(unit: str, low: str | None, strict: bool, *, ref: bool) -> Any:
+    bound = None if low is None else Decimal(low)
+    kind: Any = (Decimal | FactorRef) if ref else Decimal
+    reader = parse_or_ref if ref else parse
+    return Annotated[
+        kind,
+        BeforeValidator(_checked(unit, reader, bound, strict)),
+        PlainSerializer(_writer(unit)),
+    ]
+
+
+# Types for pydantic fields: decimals in the canonical unit that the name says.
+Millimetres: Any = _quantity("mm", None, False, ref=False)
+PositiveMillimetres: Any = _quantity("mm", "0", True, ref=False)
+PositiveSpeed: Any = _quantity("mm/s", "0", True, ref=False)
+Seconds: Any = _quantity("s", "0", False, ref=False)
+PositiveSeconds: Any = _quantity("s", "0", True, ref=False)
+PositiveKilograms: Any = _quantity("kg", "0", True, ref=False)
+PositivePixels: Any = _quantity("px", "0", True, ref=False)
+# The same, or a factor's name after a dollar sign.
+MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)
+SpeedOrRef: Any = _quantity("mm/s", "0", True, ref=True)
+DegreesOrRef: Any = _quantity("deg", None, False, ref=True)
+KilogramsOrRef: Any = _quantity("kg", "0", True, ref=True)
+PercentOrRef: Any = _quantity("percent", "0", False, ref=True)

@@ -1,0 +1,145 @@
+"""The `analysis:` section of a protocol: what stored data are made to mean.
+
+It is hashed apart from the collection: nothing in here can make collected data unusable. Each
+model is handed whole to the step that uses it, and that step is stale when its model changes.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from protocols.yaml_file import KeyedError, StrictModel
+
+
+class Labelling(StrictModel):
+    """Ground truth from the outside video."""
+
+    rule: Literal["paper"] = "paper"
+    threshold_px: float = Field(default=2.0, gt=0, le=100)
+    """A marker slips when its displacement exceeds this, pixels."""
+    reference_ms: float = Field(default=200.0, gt=0)
+    """The markers' reference positions are their means over this last part of the hold."""
+
+
+class Windows(StrictModel):
+    """From events to samples of shape (steps, channels, cells, cells)."""
+
+    length_ms: int = Field(default=30, ge=1, le=1000)
+    step_ms: int = Field(default=1, ge=1, le=100)
+    crop_px: int = Field(default=400, ge=20, le=480)
+    pool_px: int = Field(default=20, ge=1, le=240)
+    polarity: Literal["positive", "negative", "both"] = "positive"
+
+    @model_validator(mode="after")
+    def _fits(self) -> Windows:
+        if self.length_ms % self.step_ms:
+            raise KeyedError("analysis.windows.step_ms", self.step_ms, "must divide length_ms")
+        if self.crop_px % self.pool_px:
+            raise KeyedError("analysis.windows.pool_px", self.pool_px, "must divide crop_px")
+        return self
+
+    @property
+    def steps(self) -> int:
+        """Time steps of a sample (30)."""
+        return self.length_ms // self.step_ms
+
+    @property
+    def cells(self) -> int:
+        """Cells along one side of a sample (20)."""
+        return self.crop_px // self.pool_px
+
+    @property
+    def channels(self) -> int:
+        """1, or 2 when both polarities are kept apart."""
+        return 2 if self.polarity == "both" else 1
+
+
+class Samples(StrictModel):
+    """How many windows a trial gives to each class."""
+
+    per_class: int = Field(default=50, ge=1, le=10_000)
+
+
+class Split(StrictModel):
+    """Which trials train, which choose the model, which test it.
+
+    ``ranked``: repetitions ranked by a hash inside each condition, conditions spread evenly
+    inside the strata (docs/decisions/0006). ``leave_conditions_out``: whole levels are held out.
+    """
+
+    method: Literal["ranked", "leave_conditions_out"] = "ranked"
+    train: float = Field(default=0.70, ge=0, le=1)
+    validation: float = Field(default=0.15, ge=0, le=1)
+    test: float = Field(default=0.15, ge=0, le=1)
+    strata: tuple[str, ...] = ("depth", "speed")
+    validation_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    test_levels: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _sums(self) -> Split:
+        if abs(self.train + self.validation + self.test - 1.0) > 1e-9:
+            raise KeyedError(
+                "analysis.split", (self.train, self.validation, self.test),
+                "train, validation and test must add up to 1",
+            )
+        if self.method == "leave_conditions_out" and not self.test_levels:
+            raise KeyedError(
+                "analysis.split.test_levels", {}, "must name the levels that are held out"
+            )
+        return self
+
+
+class Network(StrictModel):
+    """The spiking network: two convolutions, two fully connected layers, IAF neurons."""
+
+    conv1_channels: int = Field(default=8, ge=1, le=256)
+    conv2_channels: int = Field(default=16, ge=1, le=256)
+    hidden: int = Field(default=32, ge=1, le=1024)
+    conv1_kernel: Literal[1, 3, 5, 7] = 5
+    conv2_kernel: Literal[1, 3, 5, 7] = 3
+    """Side of the square kernels, cells."""
+    weight_scale: tuple[float, float, float, float] = (4.0, 3.0, 4.0, 3.0)
+    """Factors on the default initial weights; without them the deep layers stay silent."""
+
+
+class Training(StrictModel):
+    """How the network is fitted."""
+
+    epochs: int = Field(default=12, ge=1, le=10_000)
+    batch: int = Field(default=64, ge=1, le=4096)
+    learning_rate: float = Field(default=2e-3, gt=0, le=1)
+    patience: int = Field(default=5, ge=1)
+    """Epochs without a better validation accuracy before it stops."""
+    seeds: tuple[int, ...] = (0,)
+
+    @field_validator("seeds")
+    @classmethod
+    def _some(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
+            raise ValueError("must hold at least one seed, none negative, none twice")
+        return seeds
+
+
+class Detection(StrictModel):
+    """From spike counts of consecutive windows to two estimated onsets."""
+
+    smoothing: int = Field(default=4, ge=1, le=1000)
+    """Windows over which spike counts are averaged."""
+    margin: float = Field(default=2.0, ge=0)
+    """The winner must exceed every other class by at least this many mean spikes."""
+    false_early_ms: float = Field(default=30.0, ge=0)
+    """A detection earlier than the true onset by more than this is false."""
+
+
+class AnalysisSettings(StrictModel):
+    """The whole `analysis:` section."""
+
+    labelling: Labelling = Labelling()
+    windows: Windows = Windows()
+    samples: Samples = Samples()
+    split: Split = Split()
+    network: Network = Network()
+    training: Training = Training()
+    detection: Detection = Detection()

@@ -1,0 +1,95 @@
+"""Which trials train, choose and test: a function of a trial's own condition and nothing else.
+
+A split that is cut from a ranking of all trials moves when a level is added. Here a trial's place
+in [0, 1) is (rank of its repetition in its condition + u) / repetitions, where u is a point of a
+low-discrepancy sequence over the condition's levels, shifted by a hash of its stratum. So adding
+a level to any factor moves nothing, and every stratum still gets its shares to within about one
+trial (docs/decisions/0006 has the measured counts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from protocols.hashing import hash_integer
+from protocols.model import Factor, Level
+from protocols.quantity import canonical, parse
+from protocols.settings import Split
+from protocols.yaml_file import KeyedError
+
+GOLDEN = 0.6180339887498949
+_SCALE = float(1 << 63)
+
+
+def assign(
+    condition: Mapping[str, Level], repetition_ids: Sequence[str], split: Split
+) -> list[str]:
+    """The split (``train``, ``validation``, ``test``) of each repetition of one condition."""
+    if split.method == "leave_conditions_out":
+        texts = {name: _text(level) for name, level in condition.items()}
+        for part, held in (("test", split.test_levels), ("validation", split.validation_levels)):
+            if any(texts.get(name) in levels for name, levels in _canonical(held).items()):
+                return [part] * len(repetition_ids)
+        return ["train"] * len(repetition_ids)
+    stratum = [(name, _text(condition[name])) for name in sorted(split.strata) if name in condition]
+    u = hash_integer("split", stratum) / _SCALE
+    for name in sorted(condition):
+        if name not in split.strata:
+            u += _point(name, condition[name])
+    u %= 1.0
+    ranks = sorted(range(len(repetition_ids)), key=lambda i: hash_integer("split", repetition_ids[i]))
+    result = ["test"] * len(repetition_ids)
+    for rank, index in enumerate(ranks):
+        place = (rank + u) / len(repetition_ids)
+        if place < split.train:
+            result[index] = "train"
+        elif place < split.train + split.validation:
+            result[index] = "validation"
+    return result
+
+
+def _point(name: str, level: Level) -> float:
+    """Levels in even steps become a golden-ratio (Weyl) sequence; words a hash."""
+    if isinstance(level, str):
+        return hash_integer("split", name, level) / _SCALE
+    return (float(level) * GOLDEN) % 1.0
+
+
+def _text(level: Level) -> str:
+    return level if isinstance(level, str) else canonical(level)
+
+
+def _canonical(held: Mapping[str, Sequence[str]]) -> dict[str, set[str]]:
+    return {name: {level.split()[0] for level in levels} for name, levels in held.items()}
+
+
+def check_split(split: Split, factors: Mapping[str, Factor]) -> Split:
+    """`split` with its levels in canonical text.
+
+    Raises:
+        KeyedError: a factor or a level that the protocol does not have.
+    """
+    if split.method != "leave_conditions_out":
+        return split
+    fixed: dict[str, dict[str, tuple[str, ...]]] = {}
+    for part in ("validation_levels", "test_levels"):
+        fixed[part] = {}
+        for name, levels in getattr(split, part).items():
+            key = f"analysis.split.{part}.{name}"
+            if name not in factors:
+                raise KeyedError(key, name, f"is not a factor; there are {', '.join(factors)}")
+            factor = factors[name]
+            known = {factor.text(level) for level in (*factor.levels(), *factor.off)}
+            texts = []
+            for level in levels:
+                text = level
+                if factor.unit is not None:
+                    try:
+                        text = f"{canonical(parse(level, factor.unit))} {factor.unit}"
+                    except ValueError as error:
+                        raise KeyedError(key, level, str(error)) from None
+                if text not in known:
+                    raise KeyedError(key, level, f"is no level of it; there are {sorted(known)}")
+                texts.append(text)
+            fixed[part][name] = tuple(texts)
+    return split.model_copy(update=fixed)

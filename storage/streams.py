@@ -1,0 +1,119 @@
+"""What devices hand over, chunk by chunk: plain arrays with raw device times.
+
+A chunk is the unit that flows from a device through the rig into the recording being written.
+Nothing here converts a time: raw device times are kept as they came, and clock maps are added
+later (docs/decisions/0002). All times are int64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+I64 = npt.NDArray[np.int64]
+F64 = npt.NDArray[np.float64]
+U8 = npt.NDArray[np.uint8]
+U16 = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class EventChunk:
+    """Events in time order, each array of shape (n,)."""
+
+    x: U16
+    """Column, pixels from the left."""
+    y: U16
+    """Row, pixels from the top."""
+    p: U8
+    """Polarity: 1 brighter, 0 darker."""
+    t_us: I64
+    """Camera clock, microseconds, never decreasing."""
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+
+@dataclass(frozen=True)
+class PulseChunk:
+    """Rising edges of the sync line as one device saw them, shape (n,)."""
+
+    t_ns: I64
+    """That device's clock, nanoseconds (a microsecond counter times 1,000)."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True)
+class PoseChunk:
+    """Arm poses as the controller reported them, n of them."""
+
+    t_ns: I64
+    """Controller clock, nanoseconds, shape (n,)."""
+    host_ns: I64
+    """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
+    xyz_mm: F64
+    """Tool centre point in the arm's base frame, mm, shape (n, 3)."""
+    rotvec_deg: F64
+    """Rotation vector, degrees, shape (n, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True)
+class FrameChunk:
+    """Frames of the outside camera in order, n of them."""
+
+    images: U8
+    """Grey levels, shape (n, height, width)."""
+    number: I64
+    """The camera's own frame counter, shape (n,); a gap is a lost frame."""
+    t_ns: I64
+    """Middle of exposure on the camera's clock, nanoseconds, shape (n,)."""
+    host_ns: I64
+    """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
+    sync: U8
+    """Level of the sync line during the exposure: 0 or 1, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """When one step of the motion program ran, on the arm's controller clock."""
+
+    index: int
+    phase: str
+    start_ns: int
+    end_ns: int
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Where a rig puts its streams; a trial being written is one."""
+
+    def add_events(self, chunk: EventChunk) -> None:
+        """Append events (time order over all calls)."""
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        """Append sync pulses seen by the event camera."""
+
+    def add_arm_pulses(self, chunk: PulseChunk) -> None:
+        """Append sync pulses seen by the arm's digital input."""
+
+    def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        """Append the pulses that the sync box says it sent, on its own clock."""
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        """Append arm poses."""
+
+    def add_frames(self, chunk: FrameChunk) -> None:
+        """Append frames."""
+
+
+Json = dict[str, Any]
