@@ -121,9 +121,7 @@ def fit_rate_thresholds(totals: FloatArray, labels: IntArray) -> tuple[float, fl
     j = int(np.argmax(two + (end - running).max(axis=1)))
     i = int(np.argmax(running[: j + 1].max(axis=1) + (running[j] - running[: j + 1]).max(axis=1)))
 
-    edges = np.concatenate(
-        [[values[0] - 0.5], (values[1:] + values[:-1]) / 2, [values[-1] + 0.5]]
-    )
+    edges = np.concatenate([[values[0] - 0.5], (values[1:] + values[:-1]) / 2, [values[-1] + 0.5]])
     parts = np.stack([running[i], running[j] - running[i], end - running[j]])
     # the lower intervals may be empty (the upper never is, at the smallest best cut): a total
     # below all those seen then votes with its neighbour

@@ -20,9 +20,7 @@ class InputError(ValueError):
         expected: what would be right, as a phrase.
     """
 
-    def __init__(
-        self, file: str | Path, key: str, value: object | None, expected: str
-    ) -> None:
+    def __init__(self, file: str | Path, key: str, value: object | None, expected: str) -> None:
         self.file = str(file)
         self.key = key
         self.value = None if value is None else _short(value)

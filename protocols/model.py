@@ -102,7 +102,7 @@ class Factor(StrictModel):
     unit: str | None = None
     values: tuple[LevelField, ...] | None = None
     range: Range | None = None
-    off: tuple[LevelField, ...] = ()
+    optional: tuple[LevelField, ...] = ()
     """Levels that the protocol knows but does not take unless they are switched on."""
     changeover: Literal["none", "person"] = "none"
     """`person`: somebody has to change it by hand, so its levels become outer blocks."""
@@ -123,7 +123,7 @@ class Factor(StrictModel):
         if not levels:
             raise ValueError("has no levels; give at least one")
         seen: set[Level] = set()
-        for level in (*levels, *self.off):
+        for level in (*levels, *self.optional):
             if level in seen:
                 raise ValueError(f"has the level {_write_level(level)} twice")
             seen.add(level)
@@ -370,7 +370,8 @@ class Collection(StrictModel):
         for name in factors:
             if not _NAME.fullmatch(name) or name == "r":
                 raise KeyedError(
-                    f"collection.factors.{name}", name,
+                    f"collection.factors.{name}",
+                    name,
                     "a factor's name is a small letter, then small letters, digits and '_' "
                     "('r' stands for the repetition)",
                 )
@@ -383,7 +384,8 @@ class Collection(StrictModel):
             count *= len(factor.levels())
             if count > MAX_TRIALS:
                 raise KeyedError(
-                    f"collection.factors.{name}", f"{count:,} trials",
+                    f"collection.factors.{name}",
+                    f"{count:,} trials",
                     f"the factorial has more than {MAX_TRIALS:,} trials",
                 )
         self._check_references()
@@ -402,13 +404,15 @@ class Collection(StrictModel):
                 raise KeyedError(key, given[name], f"must be a level in '{factor.unit or 'words'}'")
             if factor.changeover == "person":
                 raise KeyedError(
-                    key, given[name],
+                    key,
+                    given[name],
                     "a reference trial cannot ask for a changeover; leave references out",
                 )
         for name in given:
             if name not in self.factors:
                 raise KeyedError(
-                    f"collection.references.condition.{name}", given[name],
+                    f"collection.references.condition.{name}",
+                    given[name],
                     f"is not a factor; the factors are {', '.join(self.factors)}",
                 )
 
@@ -448,7 +452,8 @@ class Collection(StrictModel):
         for name in self.factors:
             if f"${name}" not in used:
                 raise KeyedError(
-                    f"collection.factors.{name}", name,
+                    f"collection.factors.{name}",
+                    name,
                     f"is used by no phase; write ${name} where it belongs",
                 )
 
@@ -459,7 +464,9 @@ def _references_in(part: Any) -> list[FactorRef]:
     if isinstance(part, tuple):
         return [ref for item in part for ref in _references_in(item)]
     if isinstance(part, StrictModel):
-        return [ref for name in type(part).model_fields for ref in _references_in(getattr(part, name))]
+        return [
+            ref for name in type(part).model_fields for ref in _references_in(getattr(part, name))
+        ]
     return []
 
 

@@ -106,8 +106,10 @@ def _half_slide(phase: Any, condition: Condition) -> tuple[float, float]:
 def _signed_share(phase: Retract, condition: Condition) -> float:
     if phase.disturbance is None:
         return 0.0
-    return _value(phase.disturbance.share, condition) / 100.0 * _side(
-        phase.disturbance.side, condition
+    return (
+        _value(phase.disturbance.share, condition)
+        / 100.0
+        * _side(phase.disturbance.side, condition)
     )
 
 
@@ -139,7 +141,8 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
                 raise KeyedError(where, value, f"is a word where a number in {unit} belongs")
             if value > limit:
                 raise KeyedError(
-                    where, f"{canonical(value)} {unit}",
+                    where,
+                    f"{canonical(value)} {unit}",
                     f"is over collection.limits.{name} = {canonical(limit)} {unit}",
                 )
             if value <= 0:
@@ -150,9 +153,7 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
         if isinstance(phase, (Approach, Press, Slide, Retract, Release, Return)):
             at_most(phase.speed, f"{base}.speed", limits.speed, "speed", "mm/s")
         if isinstance(phase, (Approach, Release)):
-            at_most(
-                phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm"
-            )
+            at_most(phase.clearance, f"{base}.clearance", limits.clearance, "clearance", "mm")
         if isinstance(phase, Press):
             at_most(phase.depth, f"{base}.depth", limits.depth, "depth", "mm")
         if isinstance(phase, Slide):
@@ -202,7 +203,8 @@ def _check_slide(phase: Slide, base: str, levels: Levels, limits: Any) -> None:
             broken = _inside(sign * half[0], sign * half[1], limits)
             if broken:
                 raise KeyedError(
-                    where, f"{canonical(distance)} mm",
+                    where,
+                    f"{canonical(distance)} mm",
                     f"a slide at {canonical(direction)} deg {broken}",
                 )
 
@@ -226,7 +228,8 @@ def _check_retract(phase: Retract, base: str, levels: Levels, limits: Any) -> No
             total = float(speed) * math.hypot(1.0, float(share) / 100)
             if total > float(limits.speed) + 1e-9:
                 raise KeyedError(
-                    at, f"{canonical(speed)} mm/s",
+                    at,
+                    f"{canonical(speed)} mm/s",
                     f"with a disturbance of {canonical(share)} percent makes {total:.3f} mm/s, "
                     f"over collection.limits.speed = {canonical(limits.speed)} mm/s",
                 )

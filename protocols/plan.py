@@ -18,7 +18,7 @@ from protocols.errors import InputError
 from protocols.hashing import hash_data, hash_integer
 from protocols.model import Level, Protocol
 from protocols.motion import build_program, check_limits
-from protocols.program import Program
+from protocols.program import Dwell, Program
 from protocols.quantity import FILE_UNITS, canonical, to_decimal
 from protocols.split import assign, check_split
 from protocols.yaml_file import KeyedError, load
@@ -147,12 +147,15 @@ class Plan:
         windows, samples = self.protocol.analysis.windows, self.protocol.analysis.samples
         need = windows.length_ms * samples.per_class / 1000
         found = []
-        for phase in self.protocol.collection.motion:
-            if phase.phase == "hold" and float(phase.duration) < need:
-                found.append(
-                    f"collection.motion: a hold of {canonical(phase.duration)} s is shorter than "
-                    f"{samples.per_class} no-slip windows of {windows.length_ms} ms ({need:g} s)"
-                )
+        program = self.program(self.trials[0])
+        hold = sum(
+            step.seconds for step in program.steps if isinstance(step, Dwell) and step.recorded
+        )
+        if hold < need:
+            found.append(
+                f"collection.motion: the recorded hold of {hold:g} s is shorter than "
+                f"{samples.per_class} no-slip windows of {windows.length_ms} ms ({need:g} s)"
+            )
         return found
 
     @cached_property
@@ -163,7 +166,7 @@ class Plan:
         """
         data = self.protocol.collection.model_dump(mode="json", by_alias=True)
         for factor in data["factors"].values():
-            for key in ("values", "range", "off"):
+            for key in ("values", "range", "optional"):
                 factor.pop(key)
         for key in ("repetitions", "references"):
             data.pop(key)
@@ -202,7 +205,9 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
     for trial in plan:
         if plan.seconds(trial) > limit:
             raise InputError(
-                file, "collection.limits.duration", f"{limit:g} s",
+                file,
+                "collection.limits.duration",
+                f"{limit:g} s",
                 f"trial {trial.id} would take {plan.seconds(trial):.1f} s; raise the limit or "
                 "shorten the motion",
             )
@@ -221,9 +226,11 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
             level: Level = raw if factor.unit is None else to_decimal(raw.strip())
         except ValueError as error:
             raise InputError("--enable", name, raw, str(error)) from None
-        if level not in (*factor.levels(), *factor.off):
-            off = ", ".join(factor.text(item) for item in factor.off) or "none"
-            raise InputError("--enable", name, raw, f"is not a level that is off; off are: {off}")
+        if level not in (*factor.levels(), *factor.optional):
+            optional = ", ".join(factor.text(item) for item in factor.optional) or "none"
+            raise InputError(
+                "--enable", name, raw, f"is not an optional level; optional are: {optional}"
+            )
         if level not in levels[name]:
             levels[name] = (*levels[name], level)
     return levels
@@ -277,7 +284,10 @@ def _expand(protocol: Protocol, levels: Mapping[str, tuple[Level, ...]]) -> Iter
                     number = taken // references.every + 1
                     reference_id = f"reference,{condition_id(protocol, references.condition)}"
                     yield trial(
-                        references.condition, f"{reference_id},r={number}", number, "reference",
+                        references.condition,
+                        f"{reference_id},r={number}",
+                        number,
+                        "reference",
                         "none",
                     )
                     index += 1

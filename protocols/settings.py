@@ -81,7 +81,8 @@ class Split(StrictModel):
     def _sums(self) -> Split:
         if abs(self.train + self.validation + self.test - 1.0) > 1e-9:
             raise KeyedError(
-                "analysis.split", (self.train, self.validation, self.test),
+                "analysis.split",
+                (self.train, self.validation, self.test),
                 "train, validation and test must add up to 1",
             )
         if self.method == "leave_conditions_out" and not self.test_levels:

@@ -37,7 +37,9 @@ def assign(
         if name not in split.strata:
             u += _point(name, condition[name])
     u %= 1.0
-    ranks = sorted(range(len(repetition_ids)), key=lambda i: hash_integer("split", repetition_ids[i]))
+    ranks = sorted(
+        range(len(repetition_ids)), key=lambda i: hash_integer("split", repetition_ids[i])
+    )
     result = ["test"] * len(repetition_ids)
     for rank, index in enumerate(ranks):
         place = (rank + u) / len(repetition_ids)
@@ -79,7 +81,7 @@ def check_split(split: Split, factors: Mapping[str, Factor]) -> Split:
             if name not in factors:
                 raise KeyedError(key, name, f"is not a factor; there are {', '.join(factors)}")
             factor = factors[name]
-            known = {factor.text(level) for level in (*factor.levels(), *factor.off)}
+            known = {factor.text(level) for level in (*factor.levels(), *factor.optional)}
             texts = []
             for level in levels:
                 text = level

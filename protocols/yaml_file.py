@@ -31,7 +31,7 @@ class StrictModel(BaseModel):
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """PyYAML's safe loader without aliases, with decimals for floats and unique keys."""
 
     depth = 0
@@ -46,7 +46,8 @@ class _Loader(yaml.SafeLoader):
         self.depth += 1
         if self.depth > MAX_DEPTH:
             raise yaml.MarkedYAMLError(
-                problem=f"nested more than {MAX_DEPTH} deep", problem_mark=self.peek_event().start_mark
+                problem=f"nested more than {MAX_DEPTH} deep",
+                problem_mark=self.peek_event().start_mark,
             )
         node = super().compose_node(parent, index)
         self.depth -= 1
@@ -116,7 +117,9 @@ def read_text(path: Path, what: str) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            path, f"byte {error.start}", data[error.start : error.start + 1].hex(),
+            path,
+            f"byte {error.start}",
+            data[error.start : error.start + 1].hex(),
             "is not UTF-8; save the file as UTF-8 text",
         ) from None
 

@@ -198,8 +198,15 @@ class Operator(Protocol):
 
 
 @runtime_checkable
-class Truthful(Protocol):
-    """A simulated rig's knowledge of what really happened; a real rig has none."""
+class Simulation(Protocol):
+    """The world behind a simulated rig; a real rig has none."""
 
-    def truth(self) -> dict[str, Any]:
-        """Simulation truth of the trial that just ran, on the sync box's clock (JSON)."""
+    def begin_trial(self, seed: int) -> None:
+        """Draw everything that varies by trial from `seed`, forgetting what ran before."""
+
+    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
+        """What really happened in the trial that just ran (JSON), times in ns of the sync box.
+
+        Args:
+            reference_arm_ns: arm controller time from which displacements are counted.
+        """

@@ -1,1 +1,1 @@
-"""placeholder"""
+"""What is kept: recordings, the crash-safe trial store, derived results."""

@@ -1,0 +1,133 @@
+"""The ground truth: when the first marker slips, and when the centre does.
+
+The rule is the paper's and is kept literal: a marker slips in the first frame in which it is more
+than 2 pixels from where it stood before the motion. Every accuracy and latency the project reports
+rests on these two times, so the rule stands alone here, over plain arrays, with nothing smoothed
+and nothing guessed: a frame in which a marker was not seen says nothing about it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocols.settings import Labelling
+
+NO_ONSET = -1
+"""Stands in `Onsets.per_marker_ns` for a marker that never slipped."""
+
+
+@dataclass(frozen=True)
+class Onsets:
+    """The onsets of one trial, on its time line.
+
+    Attributes:
+        incipient_ns: the first slip of any marker; None when none slipped.
+        gross_ns: the slip of the centre marker; None when it did not slip.
+        first_marker: the marker that slipped first, of several in one frame the one that moved
+            farthest; None when none slipped.
+        per_marker_ns: (m,) int64, each marker's slip, -1 for none.
+    """
+
+    incipient_ns: int | None
+    gross_ns: int | None
+    first_marker: int | None
+    per_marker_ns: NDArray[np.int64]
+
+
+def displacements(
+    xy: NDArray[np.float64],
+    reference_frames: slice | NDArray[np.bool_],
+    plate_xy: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """How far each marker is from its reference position, pixels.
+
+    The reference position is the mean over the reference frames in which the marker was seen. With
+    a plate both are taken relative to the plate's own marker, so that what remains is the motion of
+    the papilla on the plate.
+
+    Args:
+        xy: (n, m, 2) marker positions, pixels, NaN where a marker was not seen.
+        reference_frames: a slice of frames or an (n,) mask: the end of the hold.
+        plate_xy: (n, 2) position of the plate's marker, pixels, NaN where it is unknown.
+
+    Returns:
+        (n, m) float64, NaN where the marker or the plate is unknown in that frame, or in all of the
+        reference frames.
+
+    Raises:
+        ValueError: shapes that do not fit, or no reference frame.
+    """
+    if xy.ndim != 3 or xy.shape[2] != 2:
+        raise ValueError(f"xy has the shape {xy.shape}: must be (frames, markers, 2)")
+    if plate_xy is not None:
+        if plate_xy.shape != (xy.shape[0], 2):
+            raise ValueError(f"plate_xy has the shape {plate_xy.shape}, not {(xy.shape[0], 2)}")
+        xy = xy - plate_xy[:, None, :]
+    if not isinstance(reference_frames, slice) and (
+        reference_frames.dtype != np.bool_ or reference_frames.shape != xy.shape[:1]
+    ):
+        raise ValueError(f"reference_frames must be a slice or a mask of {xy.shape[0]} frames")
+    reference = xy[reference_frames]
+    if reference.shape[0] == 0:
+        raise ValueError("no reference frame: the recording starts after the hold")
+    seen = np.asarray(np.isfinite(reference).all(axis=2))
+    count = seen.sum(axis=0)
+    # sums about one frame's value: the mean of equal positions must be that position to the bit
+    first = reference[seen.argmax(axis=0), np.arange(xy.shape[1])]
+    total = np.where(seen[:, :, None], reference - first, 0.0).sum(axis=0)
+    at_rest = first + total / np.maximum(count, 1)[:, None]
+    at_rest[count == 0] = np.nan
+    moved = xy - at_rest
+    return np.hypot(moved[:, :, 0], moved[:, :, 1])
+
+
+def paper_onsets(
+    frame_ns: NDArray[np.int64],
+    displacement: NDArray[np.float64],
+    centre: int,
+    settings: Labelling,
+    not_before_ns: int | None = None,
+) -> Onsets:
+    """The paper's rule: the time of the first frame over the threshold, marker by marker.
+
+    Args:
+        frame_ns: (n,) int64, the frames' times on the trial's time line, strictly increasing.
+        displacement: (n, m) pixels, NaN where unknown (never a slip).
+        centre: index of the centre marker.
+        settings: `threshold_px`; a displacement equal to it is no slip.
+        not_before_ns: frames earlier than this are not looked at (the hold).
+
+    Raises:
+        ValueError: shapes that do not fit, times out of order, or no such marker.
+    """
+    if displacement.ndim != 2 or frame_ns.shape != displacement.shape[:1]:
+        raise ValueError(
+            f"frame_ns {frame_ns.shape} and displacement {displacement.shape}: "
+            "must be (frames,) and (frames, markers)"
+        )
+    if frame_ns.dtype.kind not in "iu":
+        raise ValueError(f"frame_ns must be int64, not {frame_ns.dtype}")
+    if (np.diff(frame_ns) <= 0).any():
+        raise ValueError("frame_ns must increase strictly; frames out of order have no onset")
+    markers = displacement.shape[1]
+    if not 0 <= centre < markers:
+        raise ValueError(f"centre = {centre}: must be one of {markers} markers")
+    # a comparison with NaN is False
+    over: NDArray[np.bool_] = displacement > settings.threshold_px
+    if not_before_ns is not None:
+        over &= (frame_ns >= not_before_ns)[:, None]
+    slipped = np.asarray(over.any(axis=0))
+    if not slipped.any():
+        return Onsets(None, None, None, np.full(markers, NO_ONSET, np.int64))
+    frame = over.argmax(axis=0)
+    first = int(frame[slipped].min())
+    in_first = np.where(over[first], displacement[first], -1.0)
+    return Onsets(
+        incipient_ns=int(frame_ns[first]),
+        gross_ns=int(frame_ns[frame[centre]]) if slipped[centre] else None,
+        first_marker=int(in_first.argmax()),
+        per_marker_ns=np.where(slipped, frame_ns[frame], NO_ONSET).astype(np.int64),
+    )

@@ -1,0 +1,335 @@
+"""Fitting the spiking network to windows, choosing an epoch, and keeping the result.
+
+Surrogate gradients through the fused neurons of `analysis.iaf`, cross-entropy on output spike
+counts, Adam. Two traps of spiking networks are dealt with here: a layer that never fires passes
+for a network that says "no slip" (it is named in the warnings), and a result that cannot be
+repeated (everything random comes from one seed, and at a fixed number of torch threads the same
+call gives the same bits).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import ValidationError
+from scipy.special import log_softmax
+from torch import nn
+
+from analysis import metrics
+from analysis.iaf import fused_counts, fused_layers
+from analysis.network import SPIKING, build, check_samples, set_weights, weights
+from protocols.settings import Network, Training, Windows
+
+Array = npt.NDArray[Any]
+
+MICRO_BATCH = 16
+"""Samples whose gradients are computed at once; they are summed up to ``training.batch``. Small
+enough for the processor's cache, which is up to twice as fast as a batch of 64 in one piece."""
+
+SILENT_RATE = 1e-5
+"""Spikes per neuron and step at or below which a layer counts as silent."""
+
+SATURATED_RATE = 0.9
+"""Spikes per neuron and step at or above which a layer counts as saturated (1 is the most)."""
+
+FORMAT = "sliplab-model-1"
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one pass over the training samples gave.
+
+    Attributes:
+        epoch: 1 for the first.
+        loss: mean cross-entropy of the training samples, each before the step it was used in.
+        train_argmax: their accuracy, likewise, ties shared (`analysis.metrics.Accuracy`).
+        val_loss: mean cross-entropy of the validation samples after the epoch.
+        val_argmax, val_strict, val_margin: their accuracies.
+        rates: mean spikes per neuron and step of each spiking layer over the epoch, by name.
+    """
+
+    epoch: int
+    loss: float
+    train_argmax: float
+    val_loss: float
+    val_argmax: float
+    val_strict: float
+    val_margin: float
+    rates: dict[str, float]
+
+    @property
+    def merit(self) -> tuple[float, float, float]:
+        """What epochs are compared by, the larger the better: see `fit`."""
+        return (self.val_strict, self.val_argmax, -self.val_loss)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained network and how it came about.
+
+    Attributes:
+        state_dict: weights of the chosen epoch, by name; no neuron states.
+        network, windows, training, seed: what was asked for.
+        history: one record an epoch.
+        chosen_epoch: the epoch the weights are from.
+        warnings: in words, what is wrong with the chosen network; empty when nothing is.
+        epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
+            that the same training gives the same file.
+    """
+
+    state_dict: dict[str, torch.Tensor]
+    network: Network
+    windows: Windows
+    training: Training
+    seed: int
+    history: tuple[EpochRecord, ...]
+    chosen_epoch: int
+    warnings: tuple[str, ...]
+    epoch_seconds: tuple[float, ...] = field(default=(), compare=False)
+
+    @property
+    def chosen(self) -> EpochRecord:
+        """The record of the chosen epoch."""
+        return self.history[self.chosen_epoch - 1]
+
+
+def fit(
+    train_x: Array,
+    train_y: metrics.Labels,
+    val_x: Array,
+    val_y: metrics.Labels,
+    network: Network,
+    windows: Windows,
+    training: Training,
+    seed: int,
+    on_epoch: Callable[[EpochRecord], None] | None = None,
+) -> Fitted:
+    """Train one network and keep its best epoch.
+
+    The best epoch has the highest STRICT validation accuracy on raw spike counts: a unique winner
+    that is right. Argmax would give a silent network something for its ties, and a detection
+    needs a winner. Equal epochs are told apart by argmax accuracy (ties shared), then by the lower
+    validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
+    ``training.patience`` epochs in a row were no better.
+
+    Args:
+        train_x, val_x: event counts uint8 (n, steps, channels, cells, cells); they stay uint8
+            until a batch is made.
+        train_y, val_y: classes, integer (n,), 0..2.
+        network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
+        seed: decides the first weights and the order of the samples.
+        on_epoch: called with each record as soon as it is there.
+
+    Raises:
+        ValueError: no samples, shapes that do not fit, a label that is no class.
+        FloatingPointError: the loss is no longer finite (the learning rate is too high).
+    """
+    net = build(network, windows, seed)
+    train_y = _check(net, train_x, train_y, "training")
+    val_y = _check(net, val_x, val_y, "validation")
+    optimizer = torch.optim.Adam(
+        [p for p in net.parameters() if p.requires_grad], lr=training.learning_rate
+    )
+    rng = np.random.default_rng([seed, 1])
+    history: list[EpochRecord] = []
+    seconds: list[float] = []
+    best, kept = 0, weights(net)
+    for epoch in range(1, training.epochs + 1):
+        started = time.perf_counter()
+        order = rng.permutation(len(train_x))
+        loss, counts, rates = _one_epoch(net, optimizer, train_x, train_y, order, training.batch)
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is {loss} in epoch {epoch}; "
+                f"learning_rate = {training.learning_rate} is too high"
+            )
+        record = _record(epoch, loss, counts, train_y, fused_counts(net, val_x), val_y, rates)
+        history.append(record)
+        seconds.append(time.perf_counter() - started)
+        if on_epoch is not None:
+            on_epoch(record)
+        if best == 0 or record.merit > history[best - 1].merit:
+            best, kept = epoch, weights(net)
+        elif epoch - best >= training.patience:
+            break
+    return Fitted(
+        state_dict=kept,
+        network=network,
+        windows=windows,
+        training=training,
+        seed=seed,
+        history=tuple(history),
+        chosen_epoch=best,
+        warnings=_warnings(history[best - 1]),
+        epoch_seconds=tuple(seconds),
+    )
+
+
+def restore(fitted: Fitted) -> nn.Sequential:
+    """The trained network as Sinabs modules; for `analysis.iaf.fused_counts` on a live stream."""
+    net = build(fitted.network, fitted.windows, fitted.seed)
+    set_weights(net, fitted.state_dict)
+    return net
+
+
+def predict_counts(fitted: Fitted, x: Array) -> npt.NDArray[np.int64]:
+    """Output spikes int64 (n, 3) of samples (n, steps, channels, cells, cells).
+
+    Raises:
+        ValueError: samples of another shape.
+    """
+    return fused_counts(restore(fitted), x)
+
+
+def save(path: Path, fitted: Fitted) -> None:
+    """Write a model file: whole or not at all, and the same bytes for the same model."""
+    content = {
+        "format": FORMAT,
+        "state_dict": fitted.state_dict,
+        "network": fitted.network.model_dump(mode="json"),
+        "windows": fitted.windows.model_dump(mode="json"),
+        "training": fitted.training.model_dump(mode="json"),
+        "seed": fitted.seed,
+        "history": [asdict(record) for record in fitted.history],
+        "chosen_epoch": fitted.chosen_epoch,
+        "warnings": list(fitted.warnings),
+    }
+    buffer = io.BytesIO()  # torch writes a file's name into it; a buffer has none
+    torch.save(content, buffer)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(buffer.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def load(path: Path) -> Fitted:
+    """Read a model file that `save` wrote. Nothing in it is executed.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        fitted = Fitted(
+            state_dict=content["state_dict"],
+            network=Network.model_validate(content["network"]),
+            windows=Windows.model_validate(content["windows"]),
+            training=Training.model_validate(content["training"]),
+            seed=content["seed"],
+            history=tuple(EpochRecord(**record) for record in content["history"]),
+            chosen_epoch=content["chosen_epoch"],
+            warnings=tuple(content["warnings"]),
+        )
+        restore(fitted)
+    except FileNotFoundError:
+        raise
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        RuntimeError,
+        ValidationError,
+        pickle.UnpicklingError,
+    ) as error:
+        raise ValueError(f"{path}: not a model file of this program: {error}") from error
+    return fitted
+
+
+def _one_epoch(
+    net: nn.Sequential,
+    optimizer: torch.optim.Optimizer,
+    x: Array,
+    y: metrics.IntArray,
+    order: metrics.IntArray,
+    batch: int,
+) -> tuple[float, metrics.IntArray, dict[str, float]]:
+    """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates."""
+    loss = 0.0
+    counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
+    fired = dict.fromkeys(SPIKING, 0.0)
+    for start in range(0, len(x), batch):
+        chosen = order[start : start + batch]
+        optimizer.zero_grad()
+        for first in range(0, len(chosen), MICRO_BATCH):
+            part = chosen[first : first + MICRO_BATCH]
+            layers = fused_layers(net, torch.from_numpy(x[part].astype(np.float32)))
+            out = layers[SPIKING[-1]].sum(dim=1)
+            summed = nn.functional.cross_entropy(out, torch.from_numpy(y[part]), reduction="sum")
+            (summed / len(chosen)).backward()  # type: ignore[no-untyped-call]
+            loss += summed.item()
+            counts[part] = out.detach().numpy().astype(np.int64)
+            for name, spikes in layers.items():
+                fired[name] += spikes.detach().mean().item() * len(part)
+        optimizer.step()
+    return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
+
+
+def _record(
+    epoch: int,
+    loss: float,
+    train_counts: metrics.IntArray,
+    train_y: metrics.IntArray,
+    val_counts: metrics.IntArray,
+    val_y: metrics.IntArray,
+    rates: dict[str, float],
+) -> EpochRecord:
+    val = metrics.accuracy(val_counts, val_y)
+    train = metrics.accuracy(train_counts, train_y)
+    log_p = log_softmax(val_counts.astype(np.float64), axis=1)
+    return EpochRecord(
+        epoch=epoch,
+        loss=loss,
+        train_argmax=train.argmax or 0.0,
+        val_loss=-float(log_p[np.arange(len(val_y)), val_y].mean()),
+        val_argmax=val.argmax or 0.0,
+        val_strict=val.strict or 0.0,
+        val_margin=val.margin or 0.0,
+        rates=rates,
+    )
+
+
+def _warnings(record: EpochRecord) -> tuple[str, ...]:
+    """Layers that are silent or saturated, by name."""
+    found = []
+    for name, rate in record.rates.items():
+        if rate <= SILENT_RATE:
+            found.append(f"layer {name} is silent: {rate:.2g} spikes per neuron and step")
+        elif rate >= SATURATED_RATE:
+            found.append(f"layer {name} is saturated: {rate:.2g} spikes per neuron and step")
+    return tuple(found)
+
+
+def _check(net: nn.Sequential, x: Array, y: metrics.Labels, what: str) -> metrics.IntArray:
+    y = metrics.check_labels(y)
+    if not len(y) or len(x) != len(y):
+        raise ValueError(f"{len(x)} {what} samples and {len(y)} labels; expected as many, not none")
+    check_samples(net, x.shape)
+    if x.dtype != np.uint8:
+        raise ValueError(f"{what} samples are {x.dtype}; expected uint8 counts")
+    return y

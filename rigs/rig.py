@@ -1,0 +1,294 @@
+"""One rig: runs one trial's motion while its streams flow, and owns the ordered safe stop.
+
+The same code drives a simulated and a real rig: it knows only capabilities. On any failure the
+arm is stopped before anything else; it retracts only if it is healthy; nothing here unlocks a
+protective stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
+from rigs.capabilities import (
+    Arm,
+    ArmFault,
+    ArmState,
+    Clock,
+    EventCamera,
+    FrameCamera,
+    Operator,
+    Plate,
+    RigError,
+    Segment,
+    Simulation,
+    SyncBox,
+)
+from rigs.plate_frame import PlateFrame
+from storage.streams import Json, Sink, StepTimes
+
+RETRACT_SPEED_MM_S = 10.0
+_MOVE_GRACE_S = 10.0
+
+
+class StopRequested(Exception):
+    """A person asked the rig to stop; the arm has been stopped."""
+
+
+@dataclass(frozen=True)
+class TrialRun:
+    """What the rig can say of a trial besides its streams."""
+
+    steps: tuple[tuple[StepTimes, bool], ...]
+    """Each step with its times, and whether it was recorded."""
+    zero_mm: float
+    truth: Json | None
+
+    @property
+    def recorded_ns(self) -> tuple[int, int]:
+        """Start and end of the recorded steps on the arm's clock."""
+        recorded = [step for step, kept in self.steps if kept]
+        return recorded[0].start_ns, recorded[-1].end_ns
+
+
+@dataclass
+class Rig:
+    """Arm, cameras, sync box and what else a trial needs.
+
+    Attributes:
+        poll_s: how often streams are read and stop requests looked at.
+        code_seed: of the sync box's pulse code; the trial's own seed changes it from trial to
+            trial so that no two trials can be mistaken for each other.
+        simulation: the world behind a simulated rig, None on a real one.
+    """
+
+    name: str
+    clock: Clock
+    arm: Arm
+    events: EventCamera
+    frames: FrameCamera
+    sync: SyncBox
+    operator: Operator
+    frame: PlateFrame
+    poll_s: float
+    plate: Plate | None = None
+    simulation: Simulation | None = None
+    should_stop: Callable[[], bool] = field(default=lambda: False)
+
+    def connect(self) -> None:
+        """Connect the arm; cameras connect when they are built. Raises ArmFault."""
+        self.arm.connect()
+
+    def close(self) -> None:
+        """Give every device back, the arm first; safe to call more than once."""
+        self.arm.stop()
+        for device in (self.arm, self.events, self.frames, self.sync):
+            device.close()
+
+    def run_trial(
+        self,
+        program: Program,
+        sink: Sink,
+        seed: int,
+        frame_px: tuple[int, int] | None,
+        rate_hz: int,
+    ) -> TrialRun:
+        """Run one trial; its recorded steps flow into `sink`.
+
+        Raises:
+            StopRequested: `should_stop` became true; the arm is stopped and clear.
+            RigError: anything failed; the arm is stopped.
+        """
+        if self.simulation is not None:
+            self.simulation.begin_trial(seed)
+        with self._safely(program.home):
+            if frame_px is not None:
+                self.frames.set_region(*frame_px)
+            at = self._position()
+            self._move(Move("home", program.home, RETRACT_SPEED_MM_S), at, None)
+            steps = []
+            at, recording, reference = program.home, False, 0
+            for index, step in enumerate(program.steps):
+                if step.recorded and not recording:
+                    self._start_streams(seed, rate_hz, frame_px is not None)
+                    recording = True
+                if recording and not step.recorded:
+                    self._stop_streams(sink, frame_px is not None)
+                    recording = False
+                if step.phase in {"slide", "retract"}:
+                    reference = self.arm.now_ns()
+                times = self._step(index, step, at, sink if recording else None)
+                steps.append((times, step.recorded))
+                at = step_seconds(step, at)[1]
+            truth = None
+            if self.simulation is not None:
+                truth = self.simulation.truth(reference)
+            return TrialRun(tuple(steps), self.frame.zero_mm, truth)
+
+    def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
+        """Warm the skin up: press at the plate's centre and let go, `times` times."""
+        home = Position(0.0, 0.0, -clearance_mm)
+        with self._safely(home):
+            self._move(Move("home", home, RETRACT_SPEED_MM_S), self._position(), None)
+            for _ in range(times):
+                deep = Position(0.0, 0.0, depth_mm)
+                self._move(Move("warm up", deep, speed_mm_s), home, None)
+                self._move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
+
+    def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
+        """Find depth zero: creep in until the event rate says that a papilla touches.
+
+        The rate of 0.5 s standing still is the noise; a touch is a count in 50 ms above
+        its mean by eight standard deviations (Poisson) and ten events.
+
+        Args:
+            search_mm: hard limit beyond the taught plane.
+
+        Returns:
+            The new depth zero in the taught frame, mm; the frame uses it from now on.
+
+        Raises:
+            RigError: nothing was touched within `search_mm`.
+        """
+        if self.simulation is not None:
+            self.simulation.begin_trial(seed)
+        self.frame = self.frame.with_zero(0.0)
+        start = Position(0.0, 0.0, -search_mm)
+        with self._safely(start):
+            self._move(Move("home", start, RETRACT_SPEED_MM_S), self._position(), None)
+            self.events.start()
+            try:
+                self._wait(0.5)
+                quiet = len(self.events.read()) * 0.1  # per 50 ms
+                limit = quiet + 8 * quiet**0.5 + 10
+                zero = self._creep(search_mm, speed_mm_s, limit)
+            finally:
+                self.events.stop()
+            self._move(Move("release", start, RETRACT_SPEED_MM_S), self._position(), None)
+        self.frame = self.frame.with_zero(zero)
+        return zero
+
+    def _creep(self, search_mm: float, speed_mm_s: float, limit: float) -> float:
+        target = Position(0.0, 0.0, search_mm)
+        self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])
+        while not self.arm.progress().done:
+            self._wait(0.05)
+            depth = self.frame.position(self.arm.pose().xyz_mm).depth_mm
+            if len(self.events.read()) > limit:
+                self.arm.stop()
+                return depth - speed_mm_s * 0.025  # it happened in the middle of those 50 ms
+        raise RigError(
+            "arm", f"touching off met nothing within {search_mm:g} mm of the taught plane; "
+            "teach the contact plane again"
+        )
+
+    def _step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
+        start = self.arm.now_ns()
+        if isinstance(step, Move):
+            start, end = self._move(step, at, sink)
+            return StepTimes(index, step.phase, start, end)
+        if isinstance(step, PlateStep):
+            if self.plate is None:
+                raise RigError("plate", f"this rig has no sliding plate to {step.action}")
+            self.plate.act(step.action, step.seconds)
+        self._wait(step.seconds, sink)
+        return StepTimes(index, step.phase, start, self.arm.now_ns())
+
+    def _move(self, step: Move, at: Position, sink: Sink | None) -> tuple[int, int]:
+        start = self.arm.now_ns()
+        seconds = at.distance_mm(step.to) / step.speed_mm_s
+        if seconds == 0:
+            return start, start
+        self.arm.start([Segment(self.frame.pose(step.to), step.speed_mm_s)])
+        deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
+        while not (progress := self.arm.progress()).done:
+            if not progress.state.healthy:
+                raise ArmFault("arm", f"{progress.state.value} in the phase '{step.phase}'")
+            if self.clock.now_ns() > deadline:
+                raise ArmFault("arm", f"did not end the phase '{step.phase}' in time")
+            left = seconds - (self.arm.now_ns() - start) / 1e9
+            self._wait(min(self.poll_s, max(left, 1e-3)), sink)
+        if not progress.state.healthy:
+            raise ArmFault("arm", f"{progress.state.value} in the phase '{step.phase}'")
+        return progress.finished[-1]
+
+    def _wait(self, seconds: float, sink: Sink | None = None) -> None:
+        """Let time pass in polls; streams are read and stop requests looked at in each."""
+        end = self.clock.now_ns() + round(seconds * 1e9)
+        while (left := end - self.clock.now_ns()) > 0:
+            self.clock.wait(min(self.poll_s, left / 1e9))
+            if sink is not None:
+                self._drain(sink)
+            if self.should_stop():
+                raise StopRequested
+
+    def _start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
+        self.arm.read_poses()
+        self.arm.read_pulses()
+        self.events.start()
+        if with_frames:
+            self.frames.start()
+        self.sync.start(rate_hz, seed % 65535 + 1)
+
+    def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
+        self._drain(sink)
+        self.sync.stop()
+        self._drain(sink)
+        self.events.stop()
+        if with_frames:
+            self.frames.stop()
+
+    def _drain(self, sink: Sink) -> None:
+        sink.add_events(self.events.read())
+        sink.add_event_pulses(self.events.read_pulses())
+        sink.add_poses(self.arm.read_poses())
+        sink.add_arm_pulses(self.arm.read_pulses())
+        sink.add_sync_pulses(self.sync.read_pulses())
+        sink.add_frames(self.frames.read())
+
+    def _position(self) -> Position:
+        return self.frame.position(self.arm.pose().xyz_mm)
+
+    @contextmanager
+    def _safely(self, clear: Position) -> Iterator[None]:
+        """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras."""
+        try:
+            yield
+        except BaseException:
+            self.arm.stop()
+            try:
+                self._retract(clear)
+            finally:
+                self.events.stop()
+                self.frames.stop()
+                self.sync.stop()
+            raise
+
+    def _retract(self, clear: Position) -> None:
+        """Straight out along the plate's normal, only with a healthy arm, bounded in time."""
+        if not self.arm.state().healthy:
+            return
+        at = self._position()
+        out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
+        if at.distance_mm(out) == 0:
+            return
+        self.arm.start([Segment(self.frame.pose(out), RETRACT_SPEED_MM_S)])
+        polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
+        for _ in range(polls):
+            if self.arm.progress().done:
+                return
+            self.clock.wait(self.poll_s)
+        self.arm.stop()
+
+
+def advice(state: ArmState) -> str:
+    """What a person must do about an arm in this state."""
+    return {
+        ArmState.PROTECTIVE_STOP: "look at the arm, clear the cause, and unlock the protective "
+        "stop on the pendant; then run the same command again",
+        ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm on the pendant",
+        ArmState.DISCONNECTED: "check power and network of the arm's controller",
+    }.get(state, "run the same command again")
+

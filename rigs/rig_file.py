@@ -1,0 +1,171 @@
+"""Rig files: which devices a rig has, where its plate is, and what it may do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from protocols.errors import InputError
+from protocols.hashing import hash_text
+from protocols.plan import Plan
+from protocols.program import Move
+from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
+from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
+from rigs.mock.settings import MockSettings
+
+
+def _mm(raw: object) -> float:
+    return float(parse(raw, "mm"))
+
+
+Millimetre = Annotated[float, BeforeValidator(_mm)]
+Point = tuple[Millimetre, Millimetre, Millimetre]
+
+
+class ContactPlane(StrictModel):
+    """The plate, taught by touching three points with the sensor's centre papilla."""
+
+    centre: Point
+    right: Point
+    """Any point at least 5 mm to the right of the centre, as the sensor sees the plate."""
+    above: Point
+    """Any point at least 5 mm above the centre."""
+    date: str = Field(pattern=r"^\d{4}-\d{2}-\d{2}$")
+
+
+class Calibration(StrictModel):
+    """What was measured on this rig."""
+
+    contact_plane: ContactPlane
+
+
+class RigLimits(StrictModel):
+    """What this arm may do here, whatever a protocol says."""
+
+    depth: PositiveMillimetres
+    speed: PositiveSpeed
+    reach: PositiveMillimetres
+    """How far the sensor's centre may go from the plate's centre."""
+
+
+class Skin(StrictModel):
+    """The sensor's papillae: one in the centre, rings of evenly spaced ones around it."""
+
+    serial: str = Field(min_length=1, max_length=40)
+    ring_counts: tuple[Annotated[int, Field(ge=1, le=60)], ...]
+    ring_spacing: PositiveMillimetres
+    radius: PositiveMillimetres
+
+    def layout_mm(self) -> list[tuple[float, float]]:
+        """Nominal (x, y) of every papilla from the centre, centre first, mm."""
+        import math
+
+        places = [(0.0, 0.0)]
+        for ring, count in enumerate(self.ring_counts, start=1):
+            radius = ring * float(self.ring_spacing)
+            for index in range(count):
+                angle = 2 * math.pi * index / count
+                places.append((radius * math.cos(angle), radius * math.sin(angle)))
+        return places
+
+
+class Estimates(StrictModel):
+    """What this rig's streams take, measured, for the plan's estimate of disk space."""
+
+    noise_events_per_s: float = Field(ge=0)
+    signal_events_per_mm: float = Field(ge=0)
+    """Events of one millimetre of recorded motion in contact."""
+    bytes_per_event: float = Field(gt=0)
+    bytes_per_frame: float = Field(ge=0)
+    """Of one frame of 480 x 480 px; larger ones in proportion to `frame_area_share`."""
+    frame_area_share: float = Field(ge=0, le=1)
+    """Share of a frame's bytes that grows with its area; the rest belongs to the markers."""
+    fixed_bytes: float = Field(ge=0)
+    """Of one trial: poses, pulses, record."""
+
+
+class FrameCameraSpec(StrictModel):
+    """The outside camera."""
+
+    scale_px_per_mm: float = Field(gt=0, le=200)
+    spool: bool = False
+    """Write raw frames first and encode after the trial, where encoding live is too slow."""
+
+
+class RigFile(StrictModel):
+    """A whole rig file."""
+
+    rig: Literal[1]
+    """Version of the file format."""
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,47}$")]
+    driver: Literal["mock"]
+    poll: PositiveSeconds
+    """How often streams are read and stop requests looked at."""
+    calibration: Calibration
+    limits: RigLimits
+    skin: Skin
+    frame_camera: FrameCameraSpec
+    estimates: Estimates
+    mock: MockSettings
+
+    @model_validator(mode="after")
+    def _poll_is_short(self) -> RigFile:
+        if self.poll > 1:
+            raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits for it")
+        return self
+
+    @property
+    def simulated(self) -> bool:
+        """Whether everything that comes from this rig is a simulation."""
+        return self.driver == "mock"
+
+    def frame_px(self, plan: Plan) -> tuple[int, int] | None:
+        """(width, height) of the recorded region in pixels, multiples of 16; None without video."""
+        recording = plan.protocol.collection.recording
+        if "frames" not in recording.streams:
+            return None
+        scale = self.frame_camera.scale_px_per_mm
+        sides = (float(recording.region.width), float(recording.region.height))
+        return tuple(max(16, round(side * scale / 16) * 16) for side in sides)  # type: ignore[return-value]
+
+
+def load_rig_file(path: Path) -> tuple[RigFile, str]:
+    """A checked rig file and its text.
+
+    Raises:
+        InputError: anything wrong, with file, key, value and what would be right.
+    """
+    text = read_text(path, "rig file")
+    return validate(RigFile, parse_yaml(text, path), path), text
+
+
+def rig_hash(text: str) -> str:
+    """Hash of a rig file's content."""
+    return hash_text(text)
+
+
+def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
+    """Hold every motion of a plan against the rig's own limits.
+
+    Raises:
+        InputError: the first move that the rig may not make.
+    """
+    limits = rig.limits
+    for trial in plan:
+        for step in plan.program(trial).steps:
+            if not isinstance(step, Move):
+                continue
+            reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
+            for what, value, limit, unit in (
+                ("depth", step.to.depth_mm, float(limits.depth), "mm"),
+                ("speed", step.speed_mm_s, float(limits.speed), "mm/s"),
+                ("reach", reach, float(limits.reach), "mm"),
+            ):
+                if value > limit + 1e-9:
+                    raise InputError(
+                        file, f"limits.{what}", f"{limit:g} {unit}",
+                        f"trial {trial.id} of {plan.file} needs {value:g} {unit} "
+                        f"in its phase '{step.phase}'",
+                    )

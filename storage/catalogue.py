@@ -1,0 +1,65 @@
+"""Every committed trial of a store as one pandas table, units in the column names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+
+from storage.store import Store
+
+
+def catalogue(store: Store) -> pd.DataFrame:
+    """One row a committed trial: campaign, id, condition, counts, quality.
+
+    Conditions become columns by factor; levels with a unit are numbers, the unit stands in the
+    column's name (``depth_mm``), a slash in it as ``_per_``.
+    """
+    rows: list[dict[str, Any]] = []
+    for campaign in store.campaigns():
+        for recording in campaign.recordings():
+            record = recording.record
+            row: dict[str, Any] = {
+                "campaign": campaign.name,
+                "trial": record["trial"],
+                "experiment": record["experiment"],
+                "role": record["role"],
+                "repetition": record["repetition"],
+                "block": record["block"],
+                "attempt": record["attempt"],
+                "simulated": record["simulated"],
+                "recorded_s": record["recorded_s"],
+                "events": record["counts"]["events"],
+                "frames": record["counts"]["frames"],
+                "sync_uncertainty_us": record["clocks"]["events"]["uncertainty_ns"] / 1000,
+                "passed": record["quality"]["passed"],
+            }
+            row.update(_condition(record["condition"]))
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _condition(condition: dict[str, str]) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    for name, text in condition.items():
+        number, _, unit = text.partition(" ")
+        if unit:
+            columns[f"{name}_{unit.replace('/', '_per_')}"] = float(number)
+        else:
+            columns[name] = number
+    return columns
+
+
+def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
+    """Rows for which a pandas expression holds, such as ``depth_mm > 2.8 and events > 1000``.
+
+    Raises:
+        ValueError: the expression cannot be read, or names something besides columns.
+    """
+    if "@" in expression or "__" in expression:
+        raise ValueError("must use columns, numbers, text and operators only")
+    try:
+        return table.query(expression, engine="python", local_dict={}, global_dict={})
+    except Exception as error:
+        columns = ", ".join(map(str, table.columns))
+        raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None

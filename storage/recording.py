@@ -1,0 +1,113 @@
+"""A committed trial as the analysis sees it: raw streams, clock maps, record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from storage.clockmap import ClockMap
+from storage.files import read_json
+from storage.hdf5 import StreamReader
+from storage.streams import I64, U8, EventChunk, Json
+from storage.video import read_frame, read_frames
+from storage.writer import CHECKSUMS, DATA, FRAMES, RECORD
+
+
+class Recording:
+    """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @cached_property
+    def record(self) -> Json:
+        """The trial's record."""
+        return read_json(self.folder / RECORD)
+
+    @property
+    def trial_id(self) -> str:
+        """The trial's id."""
+        return str(self.record["trial"])
+
+    @cached_property
+    def checksum(self) -> str:
+        """One hash that stands for the raw data of this trial."""
+        sums = read_json(self.folder / CHECKSUMS)
+        return "".join(str(sums[name]["sha256"])[:16] for name in sorted(sums))
+
+    @property
+    def has_video(self) -> bool:
+        """Whether frames were recorded."""
+        return (self.folder / FRAMES).exists()
+
+    def open(self) -> StreamReader:
+        """The HDF5 file, as a context manager."""
+        return StreamReader(self.folder / DATA)
+
+    def clock(self, device: str) -> ClockMap:
+        """The map from a device's clock (``events``, ``frames``, ``arm``) to the time line.
+
+        Raises:
+            KeyError: the trial has no such clock.
+        """
+        return ClockMap.from_json(self.record["clocks"][device]["map"])
+
+    def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
+        """Events between two times of the time line, on the camera's own clock."""
+        clock = self.clock("events")
+        bounds = [
+            None if t is None else -(-int(clock.to_device(t)) // 1000) for t in (start_ns, end_ns)
+        ]
+        with self.open() as reader:
+            return reader.events(*bounds)
+
+    def frame_times(self) -> I64:
+        """Middle of exposure of every frame on the time line, ns."""
+        with self.open() as reader:
+            times = reader.column("frames/t")
+        return np.asarray(self.clock("frames").to_reference(times))
+
+    def frames(self, threads: int = 1) -> Iterator[U8]:
+        """Decoded frames, uint8 of shape (height, width)."""
+        return read_frames(self.folder / FRAMES, threads)
+
+    def frame(self, index: int) -> U8:
+        """One decoded frame."""
+        return read_frame(self.folder / FRAMES, index)
+
+    def step(self, phase: str) -> tuple[int, int]:
+        """Start and end of a phase of the motion on the time line, ns.
+
+        The last step of that name is meant, which is the recorded one.
+
+        Raises:
+            KeyError: the motion has no such phase.
+        """
+        clock = self.clock("arm")
+        for step in reversed(self.record["steps"]):
+            if step["phase"] == phase:
+                return (
+                    int(clock.to_reference(int(step["start_ns"]))),
+                    int(clock.to_reference(int(step["end_ns"]))),
+                )
+        raise KeyError(f"{self.trial_id}: no step '{phase}'")
+
+    @property
+    def motion_phase(self) -> str:
+        """``slide`` or ``retract``: the phase in which slip is looked for."""
+        phases = {step["phase"] for step in self.record["steps"]}
+        return "slide" if "slide" in phases else "retract"
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a mock rig made this."""
+        return bool(self.record["simulated"])
+
+    def simulation_truth(self) -> dict[str, Any] | None:
+        """What really happened, on the time line; only for tests and error reports."""
+        truth = self.record.get("simulation_truth")
+        return dict(truth) if truth is not None else None

@@ -1,0 +1,166 @@
+"""A trial being written: it stands aside until it is whole, then becomes visible by one rename."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from storage.files import sha256, sync_file, sync_folder, write_json
+from storage.hdf5 import StreamFile
+from storage.streams import EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.video import VideoWriter
+
+DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
+CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
+
+
+class TrialWriter:
+    """A `storage.streams.Sink` that ends in exactly one of `commit` and `abandon`.
+
+    Args:
+        folder: the trial's folder aside; must not exist.
+        target: where it stands once committed.
+        frame_px: (width, height) of the frames, or None without a video.
+        spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
+            encode as fast as their camera delivers.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        target: Path,
+        frame_px: tuple[int, int] | None,
+        rate_hz: int,
+        *,
+        spool: bool = False,
+    ) -> None:
+        self.folder, self.target = folder, target
+        folder.mkdir(parents=True)
+        self._streams = StreamFile(folder / DATA)
+        self._frame_px = frame_px
+        self._rate_hz = rate_hz
+        self._spool = folder / "frames.raw" if spool and frame_px else None
+        self._spool_file = self._spool.open("wb") if self._spool else None
+        self._video = None
+        if frame_px is not None and not spool:
+            self._video = VideoWriter(folder / FRAMES, *frame_px, rate_hz)
+        self._sealed = False
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows written so far, by column."""
+        return dict(self._streams.counts)
+
+    def add_events(self, chunk: EventChunk) -> None:
+        """Append events."""
+        self._streams.add_events(chunk)
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses seen by the event camera."""
+        self._streams.add_pulses("event_pulses", chunk)
+
+    def add_arm_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses seen by the arm."""
+        self._streams.add_pulses("arm_pulses", chunk)
+
+    def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses sent by the sync box."""
+        self._streams.add_pulses("sync_pulses", chunk)
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        """Append arm poses."""
+        self._streams.add_poses(chunk)
+
+    def add_frames(self, chunk: FrameChunk) -> None:
+        """Append frames and their times."""
+        if self._frame_px is None or not len(chunk):
+            return
+        self._streams.add_frame_times(chunk)
+        if self._spool_file is not None:
+            self._spool_file.write(np.ascontiguousarray(chunk.images).data)
+        elif self._video is not None:
+            self._video.write(chunk.images)
+
+    def seal(self) -> Path:
+        """Finish data and video files, so that they can be read before the commit.
+
+        Returns:
+            The folder aside.
+        """
+        if self._sealed:
+            return self.folder
+        self._sealed = True
+        self._streams.finish()
+        if self._spool_file is not None and self._spool is not None and self._frame_px is not None:
+            self._spool_file.close()
+            self._encode_spool(self._spool, self._frame_px)
+        if self._video is not None:
+            self._video.close()
+        return self.folder
+
+    def _encode_spool(self, spool: Path, frame_px: tuple[int, int]) -> None:
+        width, height = frame_px
+        frames = np.memmap(spool, np.uint8, "r").reshape(-1, height, width) if (
+            spool.stat().st_size
+        ) else np.empty((0, height, width), np.uint8)
+        self._video = VideoWriter(self.folder / FRAMES, width, height, self._rate_hz)
+        for start in range(0, len(frames), 64):
+            self._video.write(frames[start : start + 64])
+        self._video.close()
+        del frames
+        spool.unlink()
+
+    def commit(self, record: Json, provenance: Json) -> Path:
+        """Write record and checksums, flush everything, and make the trial visible.
+
+        Returns:
+            The committed trial's folder.
+
+        Raises:
+            FileExistsError: the trial is there already; nothing was changed.
+        """
+        self.seal()
+        if self.target.exists():
+            raise FileExistsError(f"{self.target}: this trial is committed already")
+        self._finish_folder(record, provenance)
+        os.rename(self.folder, self.target)
+        sync_folder(self.target.parent)
+        return self.target
+
+    def set_aside(self, quarantine: Path, record: Json, provenance: Json) -> None:
+        """Keep a whole but unwanted attempt in `quarantine`, with its record."""
+        self.seal()
+        self._finish_folder(record, provenance)
+        quarantine.parent.mkdir(parents=True, exist_ok=True)
+        os.rename(self.folder, quarantine)
+        sync_folder(quarantine.parent)
+
+    def _finish_folder(self, record: Json, provenance: Json) -> None:
+        write_json(self.folder / RECORD, record)
+        write_json(self.folder / PROVENANCE, provenance)
+        sums = {}
+        for name in (DATA, FRAMES, RECORD):
+            path = self.folder / name
+            if path.exists():
+                sync_file(path)
+                sums[name] = {"sha256": sha256(path), "bytes": path.stat().st_size}
+        write_json(self.folder / CHECKSUMS, sums)
+        sync_folder(self.folder)
+
+    def abandon(self) -> None:
+        """Close what is open and leave the folder as it is, for quarantine."""
+        if not self._sealed:
+            self._sealed = True
+            self._streams.abandon()
+            if self._spool_file is not None:
+                self._spool_file.close()
+            if self._video is not None:
+                self._video.close()
+
+    def discard(self) -> None:
+        """Close what is open and delete it; for motions that are no trial."""
+        self.abandon()
+        shutil.rmtree(self.folder)
