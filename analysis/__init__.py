@@ -1,1 +1,1 @@
-"""placeholder"""
+"""What it means: pure functions from recordings to labels, spikes, detections and figures."""

@@ -19,7 +19,7 @@ from analysis.metrics import CLASSES, Labels, accuracy, check_labels
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Samples = npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]]
+Samples = npt.NDArray[Any]
 
 RIDGE = 1e-3
 """L2 penalty of the logistic regression on standardised weights, per mean log-likelihood."""

@@ -122,7 +122,7 @@ class FusedIAF(torch.autograd.Function):
         return spikes
 
     @staticmethod
-    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
         """Surrogate gradient by the currents."""
         (potential,) = ctx.saved_tensors
         out = torch.empty_like(potential)
@@ -153,7 +153,7 @@ def fused_layers(net: nn.Sequential, x: torch.Tensor) -> dict[str, torch.Tensor]
             constants = _constants(name, layer)
             current = y.contiguous().view(n, steps, -1)
             if current.requires_grad:
-                fired = FusedIAF.apply(current, *constants)
+                fired = FusedIAF.apply(current, *constants)  # type: ignore[no-untyped-call]
             else:
                 fired = current  # nobody else holds the currents: write over them
                 _fire(current.numpy(), np.float32(constants[0]), fired.numpy())

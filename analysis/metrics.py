@@ -22,7 +22,7 @@ NO_SLIP, INCIPIENT, GROSS = range(3)
 DEFAULT_MARGIN = 2.0
 """Spikes by which a winner must lead to count as decided (the paper's rule for a detection)."""
 
-Counts = npt.NDArray[np.integer[Any]] | npt.NDArray[np.floating[Any]]
+Counts = npt.NDArray[Any]
 Labels = npt.NDArray[np.integer[Any]]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]

@@ -61,8 +61,9 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
         )
         fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden, bias=False)
         fc2 = nn.Linear(settings.hidden, len(CLASSES), bias=False)
+    layers: tuple[Any, ...] = (conv1, conv2, fc1, fc2)
     with torch.no_grad():
-        for layer, scale in zip((conv1, conv2, fc1, fc2), settings.weight_scale, strict=True):
+        for layer, scale in zip(layers, settings.weight_scale, strict=True):
             layer.weight.mul_(scale)
     return nn.Sequential(
         OrderedDict(
@@ -122,7 +123,9 @@ def reset_states(net: nn.Sequential) -> None:
 
 def check_samples(net: nn.Sequential, shape: tuple[int, ...]) -> None:
     """A ValueError unless `shape` is (n, steps, channels, height, width) of this network."""
-    steps, channels = net.iaf1.num_timesteps, net.conv1.in_channels
+    iaf1: Any = net.iaf1
+    conv1: Any = net.conv1
+    steps, channels = iaf1.num_timesteps, conv1.in_channels
     if len(shape) != 5 or shape[1:3] != (steps, channels):
         raise ValueError(f"samples have the shape {shape}; expected (n, {steps}, {channels}, H, W)")
 

@@ -14,6 +14,7 @@ import os
 import pickle
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -133,7 +134,6 @@ def fit(
 
     Raises:
         ValueError: no samples, shapes that do not fit, a label that is no class.
-        FloatingPointError: the loss is no longer finite (the learning rate is too high).
     """
     net = build(network, windows, seed)
     train_y = _check(net, train_x, train_y, "training")
@@ -149,11 +149,6 @@ def fit(
         started = time.perf_counter()
         order = rng.permutation(len(train_x))
         loss, counts, rates = _one_epoch(net, optimizer, train_x, train_y, order, training.batch)
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"the loss is {loss} in epoch {epoch}; "
-                f"learning_rate = {training.learning_rate} is too high"
-            )
         record = _record(epoch, loss, counts, train_y, fused_counts(net, val_x), val_y, rates)
         history.append(record)
         seconds.append(time.perf_counter() - started)
@@ -228,11 +223,16 @@ def load(path: Path) -> Fitted:
     """Read a model file that `save` wrote. Nothing in it is executed.
 
     Raises:
-        FileNotFoundError: there is none.
+        OSError: there is none, or it cannot be read.
         ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
     """
+    data = path.read_bytes()
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            spoilt = archive.testzip()  # torch does not look at the checksums
+        if spoilt is not None:
+            raise ValueError(f"{spoilt} in it is damaged")
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"its format is not {FORMAT}")
         fitted = Fitted(
@@ -246,8 +246,6 @@ def load(path: Path) -> Fitted:
             warnings=tuple(content["warnings"]),
         )
         restore(fitted)
-    except FileNotFoundError:
-        raise
     except (
         ValueError,
         KeyError,
@@ -256,6 +254,7 @@ def load(path: Path) -> Fitted:
         RuntimeError,
         ValidationError,
         pickle.UnpicklingError,
+        zipfile.BadZipFile,
     ) as error:
         raise ValueError(f"{path}: not a model file of this program: {error}") from error
     return fitted

@@ -161,7 +161,7 @@ def _explain(state: int, columns: _Columns, width: int, height: int) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:  # pragma: no cover - compiled
+def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
     """0, or _UNSORTED, or one plus the index of the first event outside the sensor."""
     for i in range(1, t.size):
         if t[i] < t[i - 1]:
@@ -176,7 +176,7 @@ def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:  # pragma: n
 def _bin(
     x: Any, y: Any, p: Any, t: Any, starts: Any, step_us: int, polarity: int, of_x: Any, of_y: Any,
     out: Any,
-) -> int:  # fmt: skip # pragma: no cover - compiled
+) -> int:  # fmt: skip
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state
@@ -206,7 +206,7 @@ def _bin(
 def _total(
     x: Any, y: Any, p: Any, t: Any, starts: Any, length_us: int, polarity: int, of_x: Any,
     of_y: Any, out: Any,
-) -> int:  # fmt: skip # pragma: no cover - compiled
+) -> int:  # fmt: skip
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state

@@ -1,1 +1,1 @@
-"""placeholder"""
+"""What happens when: Prefect flows over the other packages, and the command line."""

@@ -1,1 +1,1 @@
-"""placeholder"""
+"""What does it: rig files, device capabilities, drivers, and the simulated rig."""

@@ -26,8 +26,8 @@ class PlateFrame:
 
     Attributes:
         origin: the plate's centre, mm, shape (3,).
-        axes: rows are the unit vectors x (right), y (up) and z (out of the plate, towards the
-            sensor), shape (3, 3).
+        axes: rows are the unit vectors x (right, as the outside camera sees the plate), y (up) and
+            z (into the plate), shape (3, 3). The tool's axes stand along them.
         zero_mm: depth at which the highest papilla touches, found by touching off.
     """
 
@@ -37,7 +37,7 @@ class PlateFrame:
 
     @staticmethod
     def taught(points_mm: Sequence[Sequence[float]]) -> PlateFrame:
-        """The frame through three touched points: centre, one to the right of it, one above it.
+        """The frame through three touched points: centre, one to its right, one above it.
 
         Raises:
             ValueError: the points are on one line, or closer than 5 mm to each other.
@@ -58,11 +58,11 @@ class PlateFrame:
         return PlateFrame(self.origin, self.axes, zero_mm)
 
     def pose(self, position: Position) -> Pose:
-        """The pose for a place in plate coordinates; the tool's z axis points into the plate."""
+        """The pose for a place in plate coordinates, the tool facing the plate."""
         x, y, z = self.axes
         depth = position.depth_mm + self.zero_mm
-        xyz = self.origin + position.x_mm * x + position.y_mm * y - depth * z
-        rotation = Rotation.from_matrix(np.column_stack([x, -y, -z]))
+        xyz = self.origin + position.x_mm * x + position.y_mm * y + depth * z
+        rotation = Rotation.from_matrix(np.column_stack([x, y, z]))
         rotvec = np.degrees(rotation.as_rotvec())
         return Pose(
             (float(xyz[0]), float(xyz[1]), float(xyz[2])),
@@ -72,4 +72,4 @@ class PlateFrame:
     def position(self, xyz_mm: Sequence[float]) -> Position:
         """The place in plate coordinates of a tool centre point in the base frame."""
         x, y, z = self.axes @ (np.asarray(xyz_mm, dtype=np.float64) - self.origin)
-        return Position(float(x), float(y), float(-z) - self.zero_mm)
+        return Position(float(x), float(y), float(z) - self.zero_mm)

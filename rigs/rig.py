@@ -170,6 +170,18 @@ class Rig:
         self.frame = self.frame.with_zero(zero)
         return zero
 
+    def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
+        """Let events, poses and pulses flow into `sink` without moving anything."""
+        if self.simulation is not None:
+            self.simulation.begin_trial(0)
+        try:
+            self._start_streams(0, rate_hz, False)
+            self._wait(seconds, sink)
+            self._stop_streams(sink, False)
+        finally:
+            self.sync.stop()
+            self.events.stop()
+
     def _creep(self, search_mm: float, speed_mm_s: float, limit: float) -> float:
         target = Position(0.0, 0.0, search_mm)
         self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])

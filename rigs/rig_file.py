@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -51,7 +52,7 @@ class RigLimits(StrictModel):
 
 
 class Skin(StrictModel):
-    """The sensor's papillae: one in the centre, rings of evenly spaced ones around it."""
+    """The sensor's papillae by ring, from the one in the centre outwards."""
 
     serial: str = Field(min_length=1, max_length=40)
     ring_counts: tuple[Annotated[int, Field(ge=1, le=60)], ...]
@@ -60,10 +61,8 @@ class Skin(StrictModel):
 
     def layout_mm(self) -> list[tuple[float, float]]:
         """Nominal (x, y) of every papilla from the centre, centre first, mm."""
-        import math
-
-        places = [(0.0, 0.0)]
-        for ring, count in enumerate(self.ring_counts, start=1):
+        places = []
+        for ring, count in enumerate(self.ring_counts):
             radius = ring * float(self.ring_spacing)
             for index in range(count):
                 angle = 2 * math.pi * index / count
@@ -119,6 +118,11 @@ class RigFile(StrictModel):
     @property
     def simulated(self) -> bool:
         """Whether everything that comes from this rig is a simulation."""
+        return self.driver == "mock"
+
+    @property
+    def has_plate(self) -> bool:
+        """Whether the plate hangs on a slider that can be raised, released and caught."""
         return self.driver == "mock"
 
     def frame_px(self, plan: Plan) -> tuple[int, int] | None:

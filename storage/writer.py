@@ -130,10 +130,11 @@ class TrialWriter:
         sync_folder(self.target.parent)
         return self.target
 
-    def set_aside(self, quarantine: Path, record: Json, provenance: Json) -> None:
-        """Keep a whole but unwanted attempt in `quarantine`, with its record."""
+    def set_aside(self, quarantine: Path, record: Json, provenance: Json, cause: Json) -> None:
+        """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
         self.seal()
         self._finish_folder(record, provenance)
+        write_json(self.folder / "cause.json", cause)
         quarantine.parent.mkdir(parents=True, exist_ok=True)
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)

@@ -79,6 +79,15 @@ def test_known_values() -> None:
     assert IDENTITY.to_reference(42) == IDENTITY.to_device(42) == 42
 
 
+@pytest.mark.parametrize("drift", [99_999_999, 50_000_001, -99_999_999, -33_333_333])
+def test_a_hair_below_the_half_is_rounded_down(drift: int) -> None:
+    # rest * drift = 499,999,999 modulo 1e9: a float division cannot tell that from the half
+    rest = 499_999_999 * pow(drift, -1, 10**9) % 10**9
+    times = 2**53 + np.arange(5, dtype=np.int64) * 10**9 + rest
+    clock = ClockMap(2**53, 0, drift)
+    assert clock.to_reference(times).tolist() == [half_up(exact(clock, int(t))) for t in times]
+
+
 def test_shapes_and_kinds() -> None:
     clock = ClockMap(0, 10, 0)
     assert clock.to_reference(np.zeros((2, 3), np.int64)).shape == (2, 3)

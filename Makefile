@@ -1,0 +1,32 @@
+# Every target sets up .venv once and is quick the next time.
+PYTHON ?= python3
+BIN := .venv/bin
+DONE := .venv/.installed
+
+.PHONY: setup demo test lint bench clean
+.DEFAULT_GOAL := setup
+
+setup: $(DONE)
+
+$(DONE): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $(DONE)
+
+demo: $(DONE)
+	$(BIN)/sliplab demo
+
+test: $(DONE)
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+lint: $(DONE)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(DONE)
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf .venv build *.egg-info

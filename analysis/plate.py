@@ -1,0 +1,177 @@
+"""Where the plate is: its ArUco marker in the outside video, and a video read in a single pass.
+
+In the gravity and disturbance trials the plate moves, and a papilla slips only when it moves on the
+plate; so the plate's own marker is the frame of reference. Finding it in a whole frame takes longer
+than following all papillae, so it is looked for where it last was, and in the whole frame only when
+it is not there. Decoding the video is dearer than either: `track_video` does it once for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.markers import Floats, Frame, MarkerTracker, MarkerTracks, checked_frame, stack_tracks
+
+MAX_BRIDGED = 5
+"""Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm
+from the straight line, and that grows with the square of the gap."""
+
+
+@dataclass(frozen=True)
+class PlateTrack:
+    """The plate's marker through a video.
+
+    Attributes:
+        xy: (n, 2) float64, its centre (the mean of the corners), pixels; the centre of the top left
+            pixel is (0, 0). Bridged linearly over short gaps, NaN in long ones and at the ends.
+        corners: (n, 4, 2) float64, clockwise in the picture from the marker's own top left.
+        ok: (n,) bool, True where it was seen, so False where it was bridged.
+    """
+
+    xy: Floats
+    corners: Floats
+    ok: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class VideoTracks:
+    """All that the labelling needs of one video."""
+
+    markers: MarkerTracks
+    plate: PlateTrack | None
+
+
+class PlateTracker:
+    """Follows one ArUco marker (dictionary 4x4_50) from frame to frame.
+
+    Args:
+        marker_id: the plate's marker; by default the largest one in the first frame that has one.
+    """
+
+    def __init__(self, marker_id: int | None = None) -> None:
+        self.marker_id = marker_id
+        settings = cv2.aruco.DetectorParameters()
+        settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        # a window of up to 0.4 of a cell: larger ones see the next edge, smaller ones more noise
+        settings.cornerRefinementWinSize = 7
+        settings.relativeCornerRefinmentWinSize = 0.4
+        settings.cornerRefinementMinAccuracy = 0.01
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        self._detector = cv2.aruco.ArucoDetector(dictionary, settings)
+        self._last: Floats | None = None
+        self._velocity = np.zeros(2)
+
+    def update(self, frame: Frame) -> tuple[bool, Floats, Floats]:
+        """The marker in the next frame.
+
+        Returns:
+            whether it was seen, its centre (2,) and its corners (4, 2) in pixels; NaN when unseen.
+
+        Raises:
+            TypeError: the frame is not 2-D uint8.
+        """
+        frame = checked_frame(frame)
+        corners = None if self._last is None else self._look_near(frame, self._last)
+        if corners is None:
+            corners = self._look(frame)
+        if corners is None:
+            self._velocity = np.zeros(2)
+            return False, np.full(2, np.nan), np.full((4, 2), np.nan)
+        centre: Floats = corners.mean(axis=0)
+        if self._last is not None:
+            self._velocity = centre - self._last.mean(axis=0)
+        self._last = corners
+        return True, centre, corners
+
+    def _look_near(self, frame: Frame, last: Floats) -> Floats | None:
+        box = last + self._velocity
+        low, high = box.min(axis=0), box.max(axis=0)
+        # quiet zone, and what a falling plate may gain on its last velocity
+        reach = max(16.0, 0.4 * float((high - low).max()))
+        left, top = np.maximum(np.floor(low - reach), 0).astype(int)
+        right, bottom = np.maximum(np.ceil(high + reach) + 1, 0).astype(int)
+        part = frame[top:bottom, left:right]
+        if min(part.shape) < 16:
+            return None
+        found = self._look(np.ascontiguousarray(part))
+        return None if found is None else found + np.array([left, top])
+
+    def _look(self, frame: Frame) -> Floats | None:
+        corners, ids, _ = self._detector.detectMarkers(frame)
+        if ids is None:
+            return None
+        quads = np.array(corners, np.float64).reshape(-1, 4, 2)
+        names = np.asarray(ids).ravel()
+        if self.marker_id is None:
+            areas = [cv2.contourArea(quad.astype(np.float32)) for quad in quads]
+            self.marker_id = int(names[int(np.argmax(areas))])
+        mine = np.flatnonzero(names == self.marker_id)
+        return quads[mine[0]] if len(mine) else None
+
+
+def track_plate(
+    frames: Iterable[Frame], marker_id: int | None = None, max_bridged: int = MAX_BRIDGED
+) -> PlateTrack:
+    """The plate's marker through a video; see `PlateTracker` and `bridge`."""
+    tracker = PlateTracker(marker_id)
+    return bridge([tracker.update(frame) for frame in frames], max_bridged)
+
+
+def track_video(
+    frames: Iterable[Frame],
+    layout_px: Floats,
+    with_plate: bool,
+    *,
+    threshold: int | None = None,
+    marker_id: int | None = None,
+    max_bridged: int = MAX_BRIDGED,
+) -> VideoTracks:
+    """Papillae and, if wanted, the plate in one pass over the frames.
+
+    Args:
+        frames: (h, w) uint8 frames in order; each is looked at once, and none is kept.
+        layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
+        with_plate: follow the plate's ArUco marker too.
+        threshold: see `MarkerTracker`.
+        marker_id: see `PlateTracker`.
+        max_bridged: see `bridge`.
+    """
+    markers = MarkerTracker(layout_px, threshold=threshold)
+    plate = PlateTracker(marker_id) if with_plate else None
+    rows: list[tuple[Floats, NDArray[np.bool_]]] = []
+    poses: list[tuple[bool, Floats, Floats]] = []
+    for frame in frames:
+        rows.append(markers.update(frame))
+        if plate is not None:
+            poses.append(plate.update(frame))
+    return VideoTracks(
+        stack_tracks(rows, len(layout_px)), None if plate is None else bridge(poses, max_bridged)
+    )
+
+
+def bridge(poses: list[tuple[bool, Floats, Floats]], max_bridged: int = MAX_BRIDGED) -> PlateTrack:
+    """The results of `PlateTracker.update` as one track, short gaps filled by straight lines.
+
+    Args:
+        poses: one result a frame; the frames equally spaced.
+        max_bridged: gaps of more frames than this stay NaN.
+    """
+    if not poses:
+        return PlateTrack(np.empty((0, 2)), np.empty((0, 4, 2)), np.empty(0, np.bool_))
+    ok = np.array([seen for seen, _, _ in poses], np.bool_)
+    # the centre is the corners' mean, bridged or not
+    columns = np.stack([corners for _, _, corners in poses]).reshape(len(poses), 8)
+    seen = np.flatnonzero(ok)
+    for before, after in pairwise(seen):
+        if 1 < after - before <= max_bridged + 1:
+            gap = np.arange(before + 1, after)
+            share = ((gap - before) / (after - before))[:, None]
+            columns[gap] = columns[before] * (1 - share) + columns[after] * share
+    corners = columns.reshape(-1, 4, 2)
+    return PlateTrack(corners.mean(axis=1), corners, ok)

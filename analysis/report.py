@@ -1,0 +1,80 @@
+"""The report as one self-contained HTML page, put together from sections."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture (SVG text) and what to see in it."""
+
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text; the first column names the row."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the report."""
+
+    title: str
+    text: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = field(default=())
+
+
+@dataclass(frozen=True)
+class Number:
+    """One headline number."""
+
+    name: str
+    value: str
+    note: str = ""
+
+
+def render(
+    campaigns: Sequence[str],
+    headline: Sequence[Number],
+    sections: Sequence[Section],
+    *,
+    simulated: bool,
+) -> str:
+    """The page as text; everything in it is escaped but the figures' SVG."""
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=select_autoescape(),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        campaigns=campaigns, headline=headline, sections=sections, simulated=simulated
+    )
+
+
+def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
+    """A number for people: fixed digits, a dash where there is none."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    text = str(value) if isinstance(value, int) else f"{value:.{digits}f}"
+    return f"{text} {unit}".rstrip()
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share as a percentage."""
+    return "–" if value is None else f"{100 * value:.{digits}f} %"

@@ -1,0 +1,91 @@
+"""Campaigns as the analysis steps see them: recordings, plan and settings read from the store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+from protocols import InputError, Plan, Trial, load_plan
+from protocols.settings import AnalysisSettings
+from storage.recording import Recording
+from storage.store import Campaign, Store, StoreError
+
+
+@dataclass(frozen=True)
+class Collected:
+    """One campaign with its plan, as the store's own copy of the protocol says it."""
+
+    campaign: Campaign
+
+    @property
+    def name(self) -> str:
+        """The campaign's name."""
+        return self.campaign.name
+
+    @cached_property
+    def info(self) -> dict[str, object]:
+        """What the campaign says of itself."""
+        return self.campaign.info
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The plan of the campaign."""
+        return load_plan(self.campaign.protocol_file, self.campaign.info.get("enabled", ()))
+
+    @property
+    def experiment(self) -> str:
+        """``kinematic``, ``gravity`` or ``disturbance``."""
+        return self.plan.protocol.collection.experiment
+
+    @property
+    def settings(self) -> AnalysisSettings:
+        """The `analysis:` section."""
+        return self.plan.protocol.analysis
+
+    @cached_property
+    def trials(self) -> list[tuple[Trial, Recording]]:
+        """Committed trials of the plan, in the plan's order."""
+        there = self.campaign.committed()
+        return [(t, self.campaign.recording(t.id)) for t in self.plan if t.id in there]
+
+    def of_split(self, split: str) -> Iterator[tuple[Trial, Recording]]:
+        """Committed trials of one part of the split."""
+        return ((trial, recording) for trial, recording in self.trials if trial.split == split)
+
+
+def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
+    """The campaigns of a store, or those named.
+
+    Raises:
+        StoreError: the store holds no campaign.
+        InputError: a name that the store does not have.
+    """
+    campaigns = {campaign.name: campaign for campaign in store.campaigns()}
+    if not campaigns:
+        raise StoreError(f"{store.folder}: holds no campaign yet; run `sliplab collect` first")
+    for name in names or ():
+        if name not in campaigns:
+            raise InputError(
+                "--campaign", "", name, f"is not in {store.folder}; there are {', '.join(campaigns)}"
+            )
+    return [Collected(campaigns[name]) for name in (names or campaigns)]
+
+
+def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
+    """The kinematic campaigns, whose trials train, choose and test the network.
+
+    Raises:
+        StoreError: there is none.
+        InputError: they disagree on how windows are made.
+    """
+    found = [item for item in campaigns if item.experiment == "kinematic"]
+    if not found:
+        raise StoreError("no kinematic campaign to train on; collect one first")
+    for other in found[1:]:
+        if other.settings.windows != found[0].settings.windows:
+            raise InputError(
+                other.campaign.protocol_file, "analysis.windows", None,
+                f"differ from those of campaign '{found[0].name}'; name one with --campaign",
+            )
+    return found

@@ -1,0 +1,423 @@
+"""The command line. Heavy libraries load inside the commands that use them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows import console
+from protocols.errors import InputError
+
+app = typer.Typer(
+    name="sliplab",
+    help="Run tactile slip experiments: plan, collect, label, train, evaluate, report.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
+StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+RigOption = Annotated[Path, typer.Option("--rig", help="A rig file (YAML).")]
+StoreOption = Annotated[Path, typer.Option("--store", help="The store's folder; made if missing.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
+]
+EnableOption = Annotated[
+    list[str] | None, typer.Option("--enable", help="Switch an optional level on: factor=level.")
+]
+CampaignOption = Annotated[
+    list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
+]
+
+
+def package_file(package: str, name: str) -> Path:
+    """A file that ships with a package."""
+    module = __import__(package)
+    return Path(module.__path__[0]) / name
+
+
+@app.command()
+def plan(
+    protocol: ProtocolArgument,
+    rig: Annotated[Path | None, typer.Option("--rig", help="A rig file, for bytes.")] = None,
+    enable: EnableOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
+    from protocols.plan import load_plan
+
+    found = load_plan(protocol, enable or ())
+    needed = None
+    if rig is not None:
+        from flows.estimate import plan_bytes
+        from rigs.rig_file import check_plan, load_rig_file
+
+        rig_file, _ = load_rig_file(rig)
+        check_plan(rig_file, found, str(rig))
+        needed = round(plan_bytes(rig_file, found))
+    if as_json:
+        rows = [
+            {
+                "index": trial.index, "id": trial.id, "role": trial.role, "block": trial.block,
+                "repetition": trial.repetition, "condition": found.describe(trial),
+                "split": trial.split, "seconds": found.seconds(trial),
+                "before": [
+                    {"kind": task.kind, "by_person": task.by_person, "prompt": task.prompt}
+                    for task in found.tasks_before(trial)
+                ],
+            }
+            for trial in found
+        ]
+        console.print_json(
+            {
+                "protocol": found.protocol.name, "trials": rows, "count": len(found),
+                "seconds": found.total_seconds, "bytes": needed,
+                "stretches": found.stretches(), "warnings": found.warnings(),
+            }
+        )
+        return
+    factors = list(found.protocol.collection.factors)
+    table = []
+    for trial in found:
+        known = found.describe(trial)
+        before = ", ".join(
+            f"{task.kind} (person)" if task.by_person else task.kind
+            for task in found.tasks_before(trial)
+        )
+        table.append(
+            [trial.index, trial.block, *(known[name] for name in factors), trial.repetition,
+             trial.split if trial.role == "measured" else trial.role,
+             f"{found.seconds(trial):.1f}", before]
+        )
+    columns = ["#", "block", *factors, "repetition", "split", "motion (s)", "before it"]
+    console.print_table(f"{protocol}: {found.protocol.title}", columns, table, limit=40)
+    console.print_pairs(
+        "In all",
+        {
+            "trials": len(found),
+            "motion": console.duration(found.total_seconds),
+            "disk": console.size(needed) if needed is not None else "give --rig to know",
+            "stretches without a person": ", ".join(
+                f"{last - first + 1} trials" for first, last in found.stretches()
+            ),
+        },
+    )
+    for warning in found.warnings():
+        console.say(f"note: {warning}")
+
+
+@app.command()
+def check(
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    store: StoreOption,
+    enable: EnableOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Look at everything that can be known before anything moves."""
+    _prepare(store)
+    from flows import preflight
+
+    found = preflight.check(protocol, rig, store, tuple(enable or ()))
+    if as_json:
+        console.print_json(preflight.as_json(found))
+    else:
+        rows = [["ok" if item.passed else "FAILED", item.name, item.finding] for item in found]
+        console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
+    if not all(item.passed for item in found):
+        raise typer.Exit(console.FAILED)
+
+
+@app.command()
+def collect(
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    store: StoreOption,
+    enable: EnableOption = None,
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
+    ] = None,
+    operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Anything worth keeping.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
+    _prepare(store)
+    from flows.collect import collect as run
+    from flows.collect import make_order
+
+    order = make_order(
+        protocol, rig, store, enable=tuple(enable or ()), campaign=campaign, operator=operator,
+        note=note,
+    )
+    for warning in order.plan.warnings():
+        console.say(f"note: {warning}")
+    result = run(order)
+    if not result["taken"]:
+        console.say("nothing to do: the store holds every trial that can be taken")
+    _finish(result, f"collected into {store}", as_json)
+    if result["missing"]:
+        raise typer.Exit(console.FAILED)
+
+
+@app.command()
+def label(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Find the true onsets of every trial from its video."""
+    _step(store, campaign, as_json, "label")
+
+
+@app.command()
+def train(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Train the spiking network on the labelled kinematic trials."""
+    _step(store, campaign, as_json, "train")
+
+
+@app.command()
+def evaluate(
+    store: StoreArgument,
+    campaign: CampaignOption = None,
+    margin: Annotated[
+        float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
+    ] = None,
+    smoothing: Annotated[
+        int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Score the network on trials it has never seen."""
+    _step(store, campaign, as_json, "evaluate", margin=margin, smoothing=smoothing)
+
+
+@app.command()
+def report(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Write report/index.html and report/summary.json."""
+    _step(store, campaign, as_json, "report")
+    console.say(f"report: {store / 'report' / 'index.html'}")
+
+
+@app.command()
+def study(
+    folder: Annotated[Path, typer.Argument(help="The study's store; made if missing.")],
+    rig: RigOption,
+    pilot: Annotated[bool, typer.Option("--pilot", help="The small protocols.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole chain: collect, label, train, evaluate, report."""
+    _prepare(folder)
+    from flows import study as chain
+
+    names = chain.PILOT if pilot else chain.FULL
+    protocols = [package_file("protocols", f"{name}.yaml") for name in names]
+    _chain(folder, protocols, rig, as_json)
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
+    as_json: JsonOption = False,
+) -> None:
+    """Run the pilot study on the simulated rig and say where the report is."""
+    _prepare(folder)
+    from flows import study as chain
+
+    protocols = [package_file("protocols", f"{name}.yaml") for name in chain.PILOT]
+    _chain(folder, protocols, package_file("rigs", "mock.yaml"), as_json)
+
+
+@app.command()
+def trials(
+    store: StoreArgument,
+    where: Annotated[
+        str | None, typer.Option("--where", help="Only rows for which this holds.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", help="Write a .csv or .json file instead.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The catalogue of committed trials as a table."""
+    from storage.catalogue import catalogue, query
+    from storage.store import Store
+
+    table = catalogue(Store.open(store))
+    if where is not None:
+        try:
+            table = query(table, where)
+        except ValueError as error:
+            raise InputError("--where", "", where, str(error)) from None
+    if output is not None:
+        from storage.files import write_text
+
+        kinds: dict[str, Callable[[], str]] = {
+            ".csv": lambda: table.to_csv(index=False),
+            ".json": lambda: table.to_json(orient="records"),
+        }
+        if output.suffix not in kinds:
+            raise InputError("--output", "", str(output), "must end in .csv or .json")
+        write_text(output, kinds[output.suffix]())
+        console.say(f"{len(table)} trials: {output}")
+    if as_json:
+        import json
+
+        console.print_json(
+            {"count": len(table), "trials": json.loads(table.to_json(orient="records"))}
+        )
+    elif output is None:
+        rows = [[_plain(value) for value in row] for row in table.itertuples(index=False)]
+        console.print_table(f"trials of {store}", list(table.columns), rows, limit=40)
+        console.say(f"{len(table)} trials")
+
+
+@app.command()
+def verify(store: StoreArgument, as_json: JsonOption = False) -> None:
+    """Check every checksum, count and clock of a store; changes nothing."""
+    from storage.store import Store
+    from storage.verify import verify as look
+
+    opened = Store.open(store)
+    total = sum(len(campaign.committed()) for campaign in opened.campaigns())
+    with console.bar("verify (trials)", total) as bar:
+        problems = look(opened, lambda name: bar.advance(1, name))
+    if as_json:
+        console.print_json(
+            {"trials": total, "ok": not problems, "problems": [vars(item) for item in problems]}
+        )
+    elif problems:
+        rows = [[item.path, item.what] for item in problems]
+        console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
+    else:
+        console.results.print(f"{total} trials, all as they were committed")
+    if problems:
+        raise typer.Exit(console.FAILED)
+
+
+def _plain(value: object) -> object:
+    """A catalogue cell for a table: no NaN where a factor does not apply."""
+    return None if isinstance(value, float) and value != value else value
+
+
+def _prepare(store: Path) -> None:
+    from flows.orchestration import prepare
+
+    prepare(store)
+
+
+def _step(
+    folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any
+) -> None:
+    """Run one analysis step on a store."""
+    from importlib import import_module
+
+    from storage.store import Store
+
+    store = Store.open(folder)
+    _prepare(folder)
+    from flows.campaigns import collected
+
+    result = getattr(import_module(f"flows.{step}"), step)(
+        store, collected(store, names), **options
+    )
+    if not result["done"]:
+        console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
+    _finish(result, f"{step} {folder}", as_json)
+
+
+def _chain(folder: Path, protocols: list[Path], rig: Path, as_json: bool) -> None:
+    """Run the whole chain and print what came out."""
+    from flows import study as chain
+    from flows.report import read_summary
+    from storage.store import Store
+
+    outcome = chain.study(chain.make_orders(folder, protocols, rig))
+    summary = read_summary(Store.open(folder))
+    page = folder / "report" / "index.html"
+    if as_json:
+        console.print_json(
+            {
+                "report": str(page), "collected": outcome.collected, "steps": outcome.steps,
+                "summary": summary,
+            }
+        )
+        return
+    from flows.sections import headline
+
+    simulated = " (simulated)" if summary["simulated"] else ""
+    rows = [[item.name, item.value, item.note] for item in headline(summary)]
+    for name, value in summary["kinematic"]["baselines"].items():
+        shown = "-" if value is None else f"{100 * value:.1f} %"
+        rows.append([f"baseline: {name.replace('_', ' ')}", shown, "argmax, same windows"])
+    argmax = summary["kinematic"]["accuracy"]["argmax"]
+    rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
+    console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
+    console.results.print(f"Report{simulated}: {page.resolve()}", soft_wrap=True)
+
+
+def _finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+    if as_json:
+        console.print_json(result)
+        return
+    shown = {
+        key: ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
+        for key, value in result.items()
+    }
+    console.print_pairs(title, shown)
+
+
+def _terminated(number: int, frame: object) -> None:
+    """SIGTERM stops as Ctrl-C does: the arm first."""
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point: maps errors to messages and exit codes."""
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        code = app(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else console.DONE)
+    except InputError as error:
+        console.say(f"error: {error.message}")
+        sys.exit(console.WRONG_INPUT)
+    except KeyboardInterrupt:
+        console.say("interrupted: every committed trial is kept; run the same command to go on")
+        sys.stderr.flush()
+        os._exit(console.INTERRUPTED)
+    except Exception as error:
+        sys.exit(_explain(error))
+
+
+def _explain(error: Exception) -> int:
+    """Print what went wrong; a fault of the program itself shows where."""
+    import click
+
+    if isinstance(error, click.exceptions.Exit):
+        return int(error.exit_code)
+    if isinstance(error, click.exceptions.Abort):
+        return console.INTERRUPTED
+    if isinstance(error, click.ClickException):
+        error.show()
+        return console.WRONG_INPUT
+    expected = {"StoreError", "RigError", "ArmFault", "Locked", "StopRequested"}
+    if type(error).__name__ not in expected:
+        console.messages.print_exception(max_frames=8)
+    console.say(f"error: {error or type(error).__name__}")
+    if type(error).__name__ == "ArmFault":
+        console.say("the arm was stopped and not unlocked: look at it, then run the command again")
+    return console.FAILED
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""What a plan will take on a rig: bytes on disk, from what the rig's streams were measured to need."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from protocols import InputError, Move, Plan, Trial
+from rigs.rig_file import RigFile
+
+RESERVE = 200_000_000
+"""Bytes that must stay free besides the plan's own: the disk is the user's, too."""
+
+
+def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
+    """Bytes one committed trial is expected to take."""
+    known = rig.estimates
+    seconds = plan.seconds(trial, recorded_only=True)
+    moved, at = 0.0, plan.program(trial).home
+    for step in plan.program(trial).steps:
+        if isinstance(step, Move):
+            moved += at.distance_mm(step.to) if step.recorded else 0.0
+            at = step.to
+    events = known.noise_events_per_s * seconds + known.signal_events_per_mm * moved
+    total = known.fixed_bytes + events * known.bytes_per_event
+    frame_px = rig.frame_px(plan)
+    if frame_px is not None:
+        area = frame_px[0] * frame_px[1] / (480 * 480)
+        each = known.bytes_per_frame * (1 + known.frame_area_share * (area - 1))
+        total += each * seconds * plan.protocol.collection.recording.sync_rate
+    return total
+
+
+def plan_bytes(rig: RigFile, plan: Plan, skip: set[str] | None = None) -> float:
+    """Bytes of all trials but those in `skip`."""
+    return sum(trial_bytes(rig, plan, t) for t in plan if not skip or t.id not in skip)
+
+
+def check_space(folder: Path, needed: float) -> int:
+    """Free bytes where `folder` is or will be.
+
+    Raises:
+        InputError: `needed` and a reserve do not fit.
+    """
+    there = folder.resolve()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if needed + RESERVE > free:
+        raise InputError(
+            "--store", "", str(folder),
+            f"the plan needs {needed / 1e9:.1f} GB and {RESERVE / 1e9:.1f} GB in reserve, the disk "
+            f"has {free / 1e9:.1f} GB free; make room or choose another folder",
+        )
+    return free

@@ -1,0 +1,256 @@
+"""Evaluation: what the trained network is worth on trials it has never seen."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+from prefect.utilities.annotations import quote
+
+from analysis import dataset, metrics, training
+from analysis.baselines import evaluate_baselines
+from analysis.detection import detect
+from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from flows import console
+from flows.campaigns import Collected, training_campaigns
+from flows.label import STEP as LABELS
+from flows.label import label_key
+from flows.timing import timed
+from flows.train import Model, load_samples, training_settings, wanted_models
+from protocols import Trial
+from protocols.settings import Detection
+from storage.derived import Derived, make_key
+from storage.files import read_json
+from storage.recording import Recording
+from storage.store import Store, StoreError
+
+STEP = "evaluation"
+COUNTS = "counts"
+VERSION = 1
+COUNTS_VERSION = 1
+NAME = "evaluation"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything an evaluation depends on, found before anything is computed."""
+
+    store: Store
+    campaigns: list[Collected]
+    model: Model
+    detection: dict[str, Detection]
+    trials: list[tuple[Collected, Trial, Recording, str]]
+    """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
+    key: str
+
+
+def choose_model(models: list[Model]) -> Model:
+    """The model with the best strict validation accuracy; ties go to the first seed.
+
+    Raises:
+        StoreError: a model is missing or stale.
+    """
+    for model in models:
+        if not model.fresh:
+            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
+    return max(models, key=lambda model: read_json(model.info_path)["validation"]["strict"])
+
+
+def make_job(
+    store: Store,
+    campaigns: list[Collected],
+    margin: float | None = None,
+    smoothing: int | None = None,
+) -> Job:
+    """Find what is to be evaluated, and by what detection settings.
+
+    Args:
+        margin, smoothing: instead of the protocols' own.
+    """
+    models = wanted_models(store, campaigns)
+    model = choose_model(models)
+    windows = training_settings(campaigns).windows.model_dump(mode="json")
+    change = {"margin": margin, "smoothing": smoothing}
+    change = {name: value for name, value in change.items() if value is not None}
+    detection, trials, inputs = {}, [], []
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        detection[item.name] = Detection.model_validate(
+            {**item.settings.detection.model_dump(), **change}
+        )
+        for trial, recording in item.trials:
+            if trial.split != "test":
+                continue
+            label = label_key(recording, item.settings.labelling)
+            if not labels.fresh(trial.id, label):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            counts = make_key(COUNTS, COUNTS_VERSION, [model.key, recording.checksum], windows)
+            trials.append((item, trial, recording, counts))
+            inputs.append([item.name, trial.id, label, counts])
+    used = {name: value.model_dump(mode="json") for name, value in detection.items()}
+    return Job(
+        store, campaigns, model, detection, trials,
+        make_key(STEP, VERSION, [model.key, inputs], used),
+    )
+
+
+@task(name="spike counts", cache_policy=NO_CACHE, persist_result=False)
+def count_spikes(wanted: Any) -> int:
+    """Run the network over all consecutive windows of every trial that needs it."""
+    job: Job = wanted.unquote()
+    windows = training_settings(job.campaigns).windows
+    work = [
+        (item, trial, recording, key)
+        for item, trial, recording, key in job.trials
+        if not Derived.of(job.store, COUNTS, item.name).fresh(trial.id, key)
+    ]
+    if work:
+        fitted = training.load(job.model.path)
+        with console.bar("evaluate (trials)", len(work)) as bar:
+            for item, trial, recording, key in work:
+                x, end_ns = dataset.trial_windows(recording, windows)
+                arrays = {"counts": training.predict_counts(fitted, x), "end_ns": end_ns}
+                Derived.of(job.store, COUNTS, item.name).write(trial.id, key, {}, arrays)
+                bar.advance(1, trial.id)
+    return len(work)
+
+
+@task(name="scores", cache_policy=NO_CACHE, persist_result=False)
+def score(wanted: Any) -> None:
+    """Windows, detections and label errors, kept as one result."""
+    job: Job = wanted.unquote()
+    result = {
+        "seed": job.model.seed,
+        "windows": _score_windows(job),
+        "trials": _score_trials(job),
+        "label_error_ms": _label_errors(job),
+        "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
+    }
+    result["experiments"] = _summaries(result["trials"])
+    Derived.of(job.store, STEP).write(NAME, job.key, result)
+
+
+def _score_windows(job: Job) -> dict[str, Any]:
+    """The chosen samples of the test trials: the network and the baselines beside it."""
+    settings = training_settings(job.campaigns)
+    train = load_samples(job.store, job.campaigns, "train")
+    test = load_samples(job.store, job.campaigns, "test")
+    counts = training.predict_counts(training.load(job.model.path), test.x)
+    margin = settings.detection.margin
+    by_trial = {
+        str(number): asdict(
+            metrics.accuracy(counts[test.trial == number], test.y[test.trial == number], margin)
+        )
+        for number in np.unique(test.trial).tolist()
+    }
+    baselines = evaluate_baselines(train.x, train.y, test.x, test.y)
+    return {
+        **metrics.score(counts, test.y, margin).as_dict(),
+        "by_trial": by_trial,
+        "baselines": {name: score.argmax for name, score in baselines.items()},
+        "samples": {"train": len(train), "test": len(test)},
+    }
+
+
+def _score_trials(job: Job) -> list[dict[str, Any]]:
+    """One row a trial: onsets, detections, latency."""
+    rows = []
+    for item, trial, _, _ in job.trials:
+        label = Derived.of(job.store, LABELS, item.name).read(trial.id)
+        found = trial_counts(job.store, item.name, trial.id)
+        settings = job.detection[item.name]
+        detections = detect(found["counts"], found["end_ns"], settings)
+        row: dict[str, Any] = {
+            "campaign": item.name,
+            "experiment": item.experiment,
+            "trial": trial.id,
+            "condition": item.plan.describe(trial),
+            "incipient_ns": label["incipient_ns"],
+            "gross_ns": label["gross_ns"],
+            "detected_incipient_ns": detections.incipient_ns,
+            "detected_gross_ns": detections.gross_ns,
+            "latency": None,
+        }
+        if label["incipient_ns"] is not None and label["gross_ns"] is not None:
+            row["latency"] = asdict(
+                score_trial(
+                    detections, label["incipient_ns"], label["gross_ns"],
+                    round(settings.false_early_ms * 1e6),
+                )
+            )
+        rows.append(row)
+    return rows
+
+
+def trial_counts(store: Store, campaign: str, trial_id: str) -> dict[str, npt.NDArray[Any]]:
+    """Spike counts int64 (n, 3) and window ends int64 ns (n,) of a scored trial."""
+    return Derived.of(store, COUNTS, campaign).arrays(trial_id)
+
+
+def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Latency and lead by experiment."""
+    result = {}
+    for experiment in ("kinematic", "gravity", "disturbance"):
+        ours = [row for row in rows if row["experiment"] == experiment]
+        scored = [TrialLatency(**row["latency"]) for row in ours if row["latency"] is not None]
+        result[experiment] = {
+            "trials": len(ours),
+            "without_onsets": len(ours) - len(scored),
+            "latency_ms": summarise_latency(scored),
+            "lead_ms": summarise_lead(scored),
+        }
+    return result
+
+
+def _label_errors(job: Job) -> dict[str, Any]:
+    """Labels against the simulation's truth, over every labelled simulated trial; ms."""
+    errors: dict[str, list[float]] = {"incipient": [], "gross": []}
+    for item in job.campaigns:
+        labels = Derived.of(job.store, LABELS, item.name)
+        for trial, recording in item.trials:
+            truth = recording.simulation_truth()
+            if truth is None:
+                continue
+            label = labels.read(trial.id)
+            for kind, values in errors.items():
+                found, true = label[f"{kind}_ns"], truth[f"{kind}_ns"]
+                if found is not None and true is not None:
+                    values.append((found - true) / 1e6)
+    summary: dict[str, Any] = {}
+    for kind, values in errors.items():
+        there = np.asarray(values)
+        summary[kind] = {
+            "n": len(values),
+            "median": float(np.median(there)) if len(there) else None,
+            "median_abs": float(np.median(np.abs(there))) if len(there) else None,
+            "max_abs": float(np.max(np.abs(there))) if len(there) else None,
+        }
+    return summary
+
+
+@flow(name="evaluate", validate_parameters=False, persist_result=False)
+def evaluate_flow(wanted: Any) -> None:
+    """Count spikes where needed, then score."""
+    job: Job = wanted.unquote()
+    with timed(job.store, "evaluate"):
+        count_spikes(quote(job))
+        score(quote(job))
+
+
+def evaluate(
+    store: Store,
+    campaigns: list[Collected],
+    margin: float | None = None,
+    smoothing: int | None = None,
+) -> dict[str, Any]:
+    """Evaluate if any input or setting changed."""
+    training_campaigns(campaigns)
+    job = make_job(store, campaigns, margin, smoothing)
+    stale = not Derived.of(store, STEP).fresh(NAME, job.key)
+    if stale:
+        evaluate_flow(quote(job))
+    return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}

@@ -1,0 +1,102 @@
+"""`sliplab check`: all that can be known before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from flows.collect import Order, make_order, pending_trials
+from flows.console import size
+from flows.estimate import check_space, plan_bytes
+from protocols import InputError
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at."""
+
+    name: str
+    passed: bool
+    finding: str
+
+
+def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:
+    """Look at protocol, rig file, space, devices and clocks; nothing moves.
+
+    Raises:
+        InputError: protocol or rig file cannot be used at all.
+    """
+    order = make_order(protocol, rig, store, enable=enable)
+    found = [
+        Check("protocol and limits", True, f"{len(order.plan)} trials within all limits"),
+        Check("campaign", True, f"{pending_trials(order)} of {len(order.plan)} still to take"),
+    ]
+    found += [Check("hint", True, text) for text in order.plan.warnings()]
+    needed = plan_bytes(order.rig, order.plan)
+    try:
+        free = check_space(store, needed)
+        found.append(Check("space", True, f"needs {size(needed)}, {size(free)} free"))
+    except InputError as error:
+        found.append(Check("space", False, error.expected))
+    found += _check_devices(order)
+    return found
+
+
+def _check_devices(order: Order) -> list[Check]:
+    from analysis.clocks import fit_clock
+    from rigs.build import build_rig
+    from storage.hdf5 import StreamReader
+    from storage.writer import DATA, TrialWriter
+
+    found: list[Check] = []
+
+    def attempt(name: str, action: Callable[[], str]) -> bool:
+        try:
+            found.append(Check(name, True, action()))
+        except Exception as error:
+            found.append(Check(name, False, str(error) or type(error).__name__))
+        return found[-1].passed
+
+    rig = build_rig(order.rig)
+
+    def arm() -> str:
+        rig.connect()
+        state = rig.arm.state()
+        if not state.healthy:
+            raise RuntimeError(f"is in {state.value}")
+        return state.value
+
+    def clocks() -> str:
+        rate = order.plan.protocol.collection.recording.sync_rate
+        with TemporaryDirectory() as folder:
+            aside = Path(folder) / "check"
+            writer = TrialWriter(aside, aside.with_name("none"), None, rate)
+            rig.listen(3.0, writer, rate)
+            with StreamReader(writer.seal() / DATA) as reader:
+                reference = reader.pulses("sync_pulses")
+                fits = {
+                    name: fit_clock(reader.pulses(f"{group}_pulses"), reference)
+                    for name, group in (("event camera", "event"), ("arm", "arm"))
+                }
+        return ", ".join(
+            f"{name} {fit.drift_ppm:+.1f} ppm, 95 % within {fit.uncertainty_ns / 1000:.1f} us"
+            for name, fit in fits.items()
+        )
+
+    try:
+        if attempt("arm", arm):
+            attempt("clocks", clocks)
+    finally:
+        rig.close()
+    return found
+
+
+def as_json(found: list[Check]) -> dict[str, Any]:
+    """The checks as one JSON object."""
+    return {
+        "passed": all(item.passed for item in found),
+        "checks": [vars(item) for item in found],
+    }

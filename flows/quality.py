@@ -1,0 +1,126 @@
+"""Is this trial good enough to keep? Clocks fitted, losses counted, gates applied.
+
+Runs on the sealed files of a trial that is not committed yet, so that a doubtful trial is taken
+again while the rig still stands there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.clocks import ClockFit, ClockRefused, fit_clock
+from protocols.model import Gates
+from rigs.rig import TrialRun
+from storage.hdf5 import StreamReader
+from storage.streams import I64
+from storage.writer import DATA
+
+GRADE = "hardware trigger"
+"""How frames are timed: by the sync box's own ticks."""
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Clock maps and gates of one attempt, as JSON data."""
+
+    clocks: dict[str, Any]
+    gates: dict[str, dict[str, Any]]
+    counts: dict[str, int]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every gate is passed."""
+        return all(bool(gate["passed"]) for gate in self.gates.values())
+
+    @property
+    def causes(self) -> str:
+        """The failed gates in words."""
+        failed = [
+            f"{name} = {gate['value']} (limit {gate['limit']})"
+            for name, gate in self.gates.items()
+            if not gate["passed"]
+        ]
+        return "; ".join(failed)
+
+
+def assess(folder: Path, run: TrialRun, gates: Gates, rate_hz: int, video: bool) -> Assessment:
+    """Fit the clocks of a sealed trial and hold it against the protocol's gates."""
+    with StreamReader(folder / DATA) as reader:
+        counts = reader.counts()
+        reference = reader.pulses("sync_pulses")
+        trains = {"events": reader.pulses("event_pulses"), "arm": reader.pulses("arm_pulses")}
+        frame_times, frame_numbers = reader.column("frames/t"), reader.column("frames/number")
+        if video:
+            trains["frames"] = frame_times[reader.column("frames/sync") > 0]
+        event_us = reader.events().t_us
+    clocks: dict[str, Any] = {"reference": "sync box", "grade": GRADE}
+    limit = float(gates.sync_uncertainty)
+    results: dict[str, dict[str, Any]] = {}
+    for device, pulses in trains.items():
+        name = f"sync_uncertainty_{device}_s"
+        try:
+            fit = fit_clock(pulses, reference)
+        except ClockRefused as refusal:
+            results[name] = {"value": str(refusal), "limit": limit, "passed": False}
+            continue
+        clocks[device] = _fit_json(fit)
+        value = fit.uncertainty_ns / 1e9
+        results[name] = {"value": value, "limit": limit, "passed": value <= limit}
+    if video:
+        lost = _frames_lost(frame_numbers, run, rate_hz)
+        results["frames_lost"] = {
+            "value": lost, "limit": gates.frames_lost, "passed": lost <= gates.frames_lost
+        }
+    gap = _event_gap(event_us, clocks, run)
+    gap_limit = float(gates.event_gap)
+    results["event_gap_s"] = {"value": gap, "limit": gap_limit, "passed": 0 <= gap <= gap_limit}
+    return Assessment(
+        clocks,
+        results,
+        {
+            "events": counts["events/t"],
+            "frames": counts["frames/t"],
+            "poses": counts["poses/t"],
+            "pulses": counts["sync_pulses/t"],
+        },
+    )
+
+
+def _fit_json(fit: ClockFit) -> dict[str, Any]:
+    data = asdict(fit)
+    data["map"] = fit.map.to_json()
+    return data
+
+
+def _frames_lost(numbers: I64, run: TrialRun, rate_hz: int) -> int:
+    """Frames missing between the first and the last, and against the recorded time."""
+    start, end = run.recorded_ns
+    expected = int((end - start) / 1e9 * rate_hz)
+    if not len(numbers):
+        return expected
+    gaps = int(numbers[-1]) + 1 - len(numbers)
+    return max(gaps, expected - 1 - len(numbers), 0)
+
+
+def _event_gap(event_us: I64, clocks: dict[str, Any], run: TrialRun) -> float:
+    """Longest silence of the event camera while the arm moved in contact, seconds.
+
+    -1 when it cannot be told, because a clock has no map or there are no events.
+    """
+    from storage.clockmap import ClockMap
+
+    if "events" not in clocks or "arm" not in clocks or not len(event_us):
+        return -1.0
+    moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
+    arm, events = (ClockMap.from_json(clocks[name]["map"]) for name in ("arm", "events"))
+    start, end = (
+        int(events.to_device(int(arm.to_reference(t)))) // 1000
+        for t in (moving.start_ns, moving.end_ns)
+    )
+    inside = event_us[(event_us >= start) & (event_us <= end)]
+    edges = np.concatenate([[start], inside, [end]])
+    return float(np.max(np.diff(edges))) / 1e6

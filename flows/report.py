@@ -1,0 +1,83 @@
+"""The report: `report/index.html` for people and `report/summary.json` for programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.utilities.annotations import quote
+
+from analysis import report as page
+from analysis import training
+from flows import evaluate, sections, timing
+from flows.campaigns import Collected
+from flows.summary import make_summary
+from flows.train import wanted_models
+from storage.derived import Derived, make_key
+from storage.files import read_json, write_json, write_text
+from storage.store import Store, StoreError
+
+STEP = "report"
+VERSION = 1
+
+
+def report_folder(store: Store) -> Path:
+    """Where the report stands."""
+    return store.folder / "report"
+
+
+def _key(store: Store, campaigns: list[Collected]) -> str:
+    """What the report is made of: the evaluation, and all that was collected.
+
+    Raises:
+        StoreError: there is no evaluation yet.
+    """
+    evaluated = Derived.of(store, evaluate.STEP).key(evaluate.NAME)
+    if evaluated is None:
+        raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+    collected = [
+        [item.name, item.plan.collection_hash, len(item.campaign.quarantined()),
+         [recording.checksum for _, recording in item.trials]]
+        for item in campaigns
+    ]
+    return make_key(STEP, VERSION, [evaluated, collected], None)
+
+
+@flow(name="report", validate_parameters=False, persist_result=False)
+def report_flow(wanted: Any) -> None:
+    """Write page and summary; the summary last, with the key."""
+    store, campaigns, key = wanted.unquote()
+    folder = report_folder(store)
+    folder.mkdir(parents=True, exist_ok=True)
+    with timing.timed(store, "report"):
+        evaluation = Derived.of(store, evaluate.STEP).read(evaluate.NAME)
+        model = evaluate.choose_model(wanted_models(store, campaigns))
+        fitted = training.load(model.path)
+        summary = make_summary(store, campaigns, evaluation)
+        html = page.render(
+            [item.name for item in campaigns],
+            sections.headline(summary),
+            sections.make_sections(store, campaigns, evaluation, summary, fitted),
+            simulated=summary["simulated"],
+        )
+        write_text(folder / "index.html", html)
+    summary["timing_s"] = timing.read(store)
+    write_json(folder / "summary.json", summary)
+    Derived.of(store, STEP).write(STEP, key, {})
+
+
+def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Write the report if anything it shows has changed."""
+    key = _key(store, campaigns)
+    stale = not Derived.of(store, STEP).fresh(STEP, key) or not (
+        report_folder(store) / "index.html"
+    ).exists()
+    if stale:
+        report_flow(quote((store, campaigns, key)))
+    return {"step": "report", "done": int(stale), "fresh": int(not stale)}
+
+
+def read_summary(store: Store) -> dict[str, Any]:
+    """The numbers of the last report."""
+    return read_json(report_folder(store) / "summary.json")

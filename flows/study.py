@@ -1,0 +1,51 @@
+"""The whole chain: collect every protocol, then label, train, evaluate and report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flows import console
+from flows.campaigns import collected
+from flows.collect import Order, collect, make_order
+from flows.evaluate import evaluate
+from flows.label import label
+from flows.report import report
+from flows.train import train
+from storage.store import Store
+
+FULL = ("kinematic", "gravity", "disturbance")
+PILOT = ("pilot", "pilot_gravity")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What every step of a study did."""
+
+    collected: list[dict[str, Any]]
+    steps: list[dict[str, Any]]
+
+
+def make_orders(folder: Path, protocols: list[Path], rig: Path) -> list[Order]:
+    """Check every protocol before the first one moves anything."""
+    return [make_order(protocol, rig, folder) for protocol in protocols]
+
+
+def study(orders: list[Order]) -> Outcome:
+    """Run what is missing or stale, step by step; a step with nothing to do says so."""
+    done = []
+    for order in orders:
+        result = collect(order)
+        done.append(result)
+        if not result["taken"]:
+            console.say(f"collect {order.campaign}: nothing to do")
+    store = Store.open(orders[0].store)
+    campaigns = collected(store, [order.campaign for order in orders])
+    steps = []
+    for step in (label, train, evaluate, report):
+        result = step(store, campaigns)
+        steps.append(result)
+        if not result["done"]:
+            console.say(f"{result['step']}: nothing to do")
+    return Outcome(done, steps)

@@ -1,0 +1,98 @@
+"""The numbers of a report as one JSON: keys that other programs may rely on (docs/summary.md)."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Any
+
+from flows import timing
+from flows.campaigns import Collected, training_campaigns
+from flows.estimate import plan_bytes
+from rigs.rig_file import load_rig_file
+from storage.store import Store
+
+_PACKAGES = (
+    "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
+    "opencv-contrib-python-headless",
+)
+
+
+def make_summary(
+    store: Store, campaigns: list[Collected], evaluation: dict[str, Any]
+) -> dict[str, Any]:
+    """Everything `summary.json` says; only `timing_s` differs between equal runs."""
+    windows, experiments = evaluation["windows"], evaluation["experiments"]
+    kinematic = {
+        "accuracy": windows["accuracy"],
+        "confusion": windows["confusion"],
+        "precision": windows["precision"],
+        "recall": windows["recall"],
+        "baselines": windows["baselines"],
+        "samples": windows["samples"],
+        **experiments["kinematic"],
+    }
+    first = next((recording for item in campaigns for _, recording in item.trials), None)
+    return {
+        "simulated": store.simulated,
+        "kinematic": kinematic,
+        "gravity": experiments["gravity"],
+        "disturbance": experiments["disturbance"],
+        "labels": {"error_ms": evaluation["label_error_ms"]},
+        "detection": evaluation["detection"],
+        "sync": _sync(campaigns, first),
+        "quality": _quality(campaigns),
+        "planned": {item.name: _planned(item) for item in campaigns},
+        "timing_s": timing.read(store),
+        "versions": {name: version(name) for name in _PACKAGES},
+        "protocols": {
+            item.name: {
+                "collection": item.plan.collection_hash,
+                "analysis": item.plan.analysis_hash,
+            }
+            for item in campaigns
+        },
+        "seeds": {
+            "network": list(training_campaigns(campaigns)[0].settings.training.seeds),
+            "chosen": evaluation["seed"],
+            "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
+        },
+    }
+
+
+def _sync(campaigns: list[Collected], first: Any) -> dict[str, Any]:
+    worst = [
+        recording.record["clocks"]["events"]["uncertainty_ns"] / 1e3
+        for item in campaigns
+        for _, recording in item.trials
+    ]
+    return {
+        "grade": None if first is None else first.record["clocks"]["grade"],
+        "worst_uncertainty_us": max(worst, default=None),
+    }
+
+
+def _quality(campaigns: list[Collected]) -> dict[str, Any]:
+    return {
+        "planned": sum(len(item.plan) for item in campaigns),
+        "committed": sum(len(item.trials) for item in campaigns),
+        "retaken": sum(sum(item.campaign.failed_attempts().values()) for item in campaigns),
+        "quarantined": sum(len(item.campaign.quarantined()) for item in campaigns),
+    }
+
+
+def _planned(item: Collected) -> dict[str, Any]:
+    """The plan's seconds and bytes beside what the committed trials really took."""
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml")
+    done = {trial.id for trial, _ in item.trials}
+    missing = {trial.id for trial in item.plan} - done
+    return {
+        "seconds": sum(item.plan.seconds(trial) for trial, _ in item.trials),
+        "seconds_collected": sum(r.record["motion_s"] for _, r in item.trials),
+        "bytes": round(plan_bytes(rig, item.plan, missing)),
+        "bytes_collected": sum(
+            path.stat().st_size
+            for _, r in item.trials
+            for path in r.folder.iterdir()
+            if path.name != "provenance.json"
+        ),
+    }

@@ -1,0 +1,159 @@
+"""Training: the network of every seed, from the labelled trials of the kinematic campaigns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+from prefect.utilities.annotations import quote
+
+from analysis import dataset, training
+from analysis.dataset import SampleSet
+from flows import console
+from flows.campaigns import Collected, training_campaigns
+from flows.label import STEP as LABELS
+from flows.label import label_key
+from flows.timing import timed
+from protocols.hashing import hash_integer
+from protocols.settings import AnalysisSettings
+from storage.derived import Derived, make_key
+from storage.files import read_json, write_json
+from storage.store import Store, StoreError
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network on disk."""
+
+    seed: int
+    path: Path
+    key: str
+
+    @property
+    def info_path(self) -> Path:
+        """The JSON beside the model file; written last, it decides."""
+        return self.path.with_suffix(".json")
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the file was made with `key`."""
+        try:
+            return self.path.exists() and read_json(self.info_path)["key"] == self.key
+        except (OSError, ValueError, KeyError):
+            return False
+
+
+def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
+    """The settings that the network is made by: those of the first kinematic campaign."""
+    return training_campaigns(campaigns)[0].settings
+
+
+def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
+    """The models that the settings ask for, with the keys they must have.
+
+    Raises:
+        StoreError: a trial has no fresh label yet.
+    """
+    used = training_campaigns(campaigns)
+    settings = used[0].settings
+    inputs = []
+    for item in used:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.trials:
+            key = label_key(recording, item.settings.labelling)
+            if not labels.fresh(trial.id, key):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            if trial.split in {"train", "validation"}:
+                inputs.append([item.name, trial.id, trial.split, key])
+    parameters = {
+        name: getattr(settings, name).model_dump(mode="json")
+        for name in ("windows", "samples", "network")
+    }
+    parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
+    models = []
+    for seed in settings.training.seeds:
+        key = make_key("train", VERSION, inputs, {**parameters, "seed": seed,
+                                                  "dataset": dataset.VERSION})
+        models.append(Model(seed, store.folder / "models" / f"seed{seed}.pt", key))
+    return models
+
+
+def load_samples(store: Store, campaigns: list[Collected], split: str) -> SampleSet:
+    """The samples of all trials of one split of the kinematic campaigns."""
+    parts = []
+    used = training_campaigns(campaigns)
+    windows = used[0].settings.windows
+    for item in used:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.of_split(split):
+            seed = hash_integer("samples", trial.id)
+            parts.append(
+                dataset.trial_samples(
+                    recording, labels.read(trial.id), trial.index, windows,
+                    item.settings.samples, seed,
+                )
+            )
+    return SampleSet.join(parts, windows)
+
+
+@task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
+def train_one(job: Any) -> int:
+    """Train one network and keep it."""
+    model, train, validation, settings = job.unquote()
+    total = settings.training.epochs
+    with console.bar(f"train seed {model.seed} (epochs)", total) as bar:
+        fitted = training.fit(
+            train.x, train.y, validation.x, validation.y, settings.network, settings.windows,
+            settings.training, model.seed,
+            on_epoch=lambda record: bar.advance(
+                1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict"
+            ),
+        )
+    for warning in fitted.warnings:
+        console.say(f"warning: {warning}")
+    model.path.parent.mkdir(parents=True, exist_ok=True)
+    training.save(model.path, fitted)
+    info = {
+        "key": model.key,
+        "seed": model.seed,
+        "samples": {"train": len(train), "validation": len(validation)},
+        "chosen_epoch": fitted.chosen_epoch,
+        "validation": {
+            "argmax": fitted.chosen.val_argmax,
+            "strict": fitted.chosen.val_strict,
+            "margin": fitted.chosen.val_margin,
+        },
+        "warnings": list(fitted.warnings),
+    }
+    write_json(model.info_path, info)
+    return model.seed
+
+
+@flow(name="train", validate_parameters=False, persist_result=False)
+def train_flow(wanted: Any) -> int:
+    """Train the seeds that are stale, one after the other."""
+    store, campaigns, models = wanted.unquote()
+    settings = training_settings(campaigns)
+    with timed(store, "train"):
+        train = load_samples(store, campaigns, "train")
+        validation = load_samples(store, campaigns, "validation")
+        for name, part in (("training", train), ("validation", validation)):
+            if not len(part):
+                raise StoreError(f"there are no {name} samples; collect more trials")
+        for model in models:
+            train_one(quote((model, train, validation, settings)))
+    return len(models)
+
+
+def train(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Train what is missing or stale."""
+    models = wanted_models(store, campaigns)
+    stale = [model for model in models if not model.fresh]
+    if stale:
+        train_flow(quote((store, campaigns, stale)))
+    return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}

@@ -1,0 +1,128 @@
+"""The simulated arm: follows straight lines exactly and reports its poses on its own clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
+from rigs.mock.clocks import JITTER_BLOCK, Jitter
+from rigs.mock.path import Leg
+from rigs.mock.sync import MockSyncBox, SyncInput
+from rigs.mock.world import World
+from rigs.scene.randomness import generator
+from storage.streams import PoseChunk, PulseChunk
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+BACKLOG_NS = 120_000_000_000
+"""Poses older than this are dropped if nobody reads them."""
+
+
+class MockArm:
+    """An arm without ramps: each segment runs at its speed from its first nanosecond."""
+
+    def __init__(self, world: World, box: MockSyncBox) -> None:
+        self._world = world
+        self._input = SyncInput(world, box, "arm")
+        self._connected = False
+        self._period_ns = round(1e9 / world.settings.arm.pose_rate_hz)
+        self._legs: list[Leg] = []
+        self._begin()
+        world.on_begin.append(self._begin)
+
+    def _begin(self) -> None:
+        world = self._world
+        self._legs = []
+        self._first = -(-world.clocks.arm.to_reference(world.now_ns) // self._period_ns)
+        self._read = self._first
+        self._late = Jitter(world.seed, "arm reception", 50.0)
+
+    def connect(self) -> None:
+        """Open the connection."""
+        self._connected = True
+        self._input.skip()
+
+    def state(self) -> ArmState:
+        """The arm's state now."""
+        if not self._connected:
+            return ArmState.DISCONNECTED
+        if not self._world.arm_state.healthy:
+            return self._world.arm_state
+        moving = self._world.path.moving(self._world.now_ns)
+        return ArmState.MOVING if moving else ArmState.READY
+
+    def pose(self) -> Pose:
+        """Where the tool centre point is now."""
+        state = self._world.path.states(np.array([self._world.now_ns], np.int64))[0].tolist()
+        return Pose((state[0], state[1], state[2]), (state[3], state[4], state[5]))
+
+    def now_ns(self) -> int:
+        """The controller's clock now."""
+        return self._world.clocks.arm.to_reference(self._world.now_ns)
+
+    def start(self, path: Sequence[Segment]) -> None:
+        """Begin to follow `path`. Raises ArmFault, or RigError if moving."""
+        state = self.state()
+        if not state.healthy:
+            raise ArmFault("arm", f"cannot move: {state.value}")
+        self._legs = self._world.start_arm(path)
+
+    def progress(self) -> Progress:
+        """How far the path begun last has come; `done` once it ended or was stopped."""
+        world, clock = self._world, self._world.clocks.arm
+        finished = tuple(
+            (clock.to_reference(leg.start_ns), clock.to_reference(leg.end_ns))
+            for leg in self._legs
+            if leg.end_ns <= world.now_ns and leg in world.path.legs
+        )
+        return Progress(self.state(), finished, not world.path.moving(world.now_ns))
+
+    def read_poses(self) -> PoseChunk:
+        """Poses since the last call, one a controller cycle."""
+        world, settings = self._world, self._world.settings.arm
+        clock, latency = world.clocks.arm, settings.latency_us * 1000
+        oldest = clock.to_reference(max(world.now_ns - BACKLOG_NS, 0))
+        first = max(self._read, -(-oldest // self._period_ns))
+        end = clock.to_reference(world.now_ns) // self._period_ns + 1
+        cycles = np.arange(first, max(end, first), dtype=np.int64)
+        true = clock.to_device(cycles * self._period_ns)
+        host = true + latency + np.abs(self._late.ns(cycles - self._first))
+        here = int(np.searchsorted(host, world.now_ns, side="right"))
+        self._read = first + here
+        cycles, true, host = cycles[:here], true[:here], host[:here]
+        state = world.path.states(true)
+        xyz = state[:, :3] + self._noise(cycles - self._first) * (settings.pose_noise_um * 1e-3)
+        return PoseChunk(cycles * self._period_ns, host, xyz, state[:, 3:6].copy())
+
+    def read_pulses(self) -> PulseChunk:
+        """Sync pulses seen by the digital input, controller clock."""
+        stamp = self._world.clocks.arm.to_reference(self._input.edges_ns())
+        grid = self._world.settings.arm.input_sampling_us * 1000
+        return PulseChunk(-(-stamp // grid) * grid if grid else stamp)
+
+    def stop(self) -> None:
+        """Stop now."""
+        self._world.halt_arm(self._world.now_ns, self._world.arm_state)
+
+    def clear_protective_stop(self) -> None:
+        """What a person does at the teach pendant; no rig may do it by itself."""
+        self._world.arm_state = ArmState.READY
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._connected = False
+
+    def _noise(self, numbers: I64) -> F64:
+        result = np.empty((len(numbers), 3))
+        blocks = numbers // JITTER_BLOCK
+        for block in np.unique(blocks).tolist():
+            draw = generator(self._world.seed, "pose noise", block).standard_normal(
+                (JITTER_BLOCK, 3)
+            )
+            here = blocks == block
+            result[here] = draw[numbers[here] % JITTER_BLOCK]
+        return result

@@ -1,0 +1,91 @@
+"""Where the simulated arm is at any time: the legs that it was told to follow, and rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rigs.capabilities import Pose, Segment
+from rigs.mock.geometry import ContactPlane
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+TURN_DEG_PER_S = 30.0
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One straight move; `state` vectors are xyz, rotation vector, then the sensor's five."""
+
+    start_ns: int
+    end_ns: int
+    start: F64
+    end: F64
+
+    def at(self, t_ns: I64) -> F64:
+        """States at times within the leg, shape (n, 11)."""
+        share = (t_ns - self.start_ns) / (self.end_ns - self.start_ns)
+        result: F64 = self.start + share[:, None] * (self.end - self.start)
+        return result
+
+
+class ArmPath:
+    """Legs in order of time, with rest between and after them."""
+
+    def __init__(self, plane: ContactPlane, pose: Pose) -> None:
+        self._plane = plane
+        self._rest = self._state(pose)
+        self.legs: list[Leg] = []
+
+    def restart(self, now_ns: int) -> None:
+        """Forget the legs; the arm stands where it is at `now_ns`."""
+        self._rest = self.states(np.array([now_ns], np.int64))[0]
+        self.legs = []
+
+    def follow(self, segments: Sequence[Segment], now_ns: int) -> list[Leg]:
+        """Append legs that begin at `now_ns`; returns them."""
+        state, begin, legs = self.states(np.array([now_ns], np.int64))[0], now_ns, []
+        for segment in segments:
+            target = self._state(segment.to)
+            travel = math.dist(state[:3], target[:3]) / segment.speed_mm_s
+            turn = math.dist(state[3:6], target[3:6]) / TURN_DEG_PER_S
+            end = begin + round(max(travel, turn) * 1e9)
+            legs.append(Leg(begin, end, state, target))
+            state, begin = target, end
+        self.legs += legs
+        return legs
+
+    def cut(self, now_ns: int) -> None:
+        """Stand still from `now_ns` on."""
+        kept = [leg for leg in self.legs if leg.start_ns < now_ns]
+        if kept and kept[-1].end_ns > now_ns:
+            leg = kept[-1]
+            here = leg.at(np.array([now_ns], np.int64))[0]
+            kept[-1] = Leg(leg.start_ns, now_ns, leg.start, here)
+        self.legs = kept
+
+    def states(self, t_ns: I64) -> F64:
+        """xyz (mm), rotation vector (deg) and sensor vector at rising times, shape (n, 11)."""
+        result = np.empty((len(t_ns), 11))
+        result[:] = self._rest
+        if self.legs:
+            starts = np.array([leg.start_ns for leg in self.legs], np.int64)
+            which = np.searchsorted(starts, t_ns, side="right") - 1
+            for index in np.unique(which[which >= 0]).tolist():
+                leg, here = self.legs[index], which == index
+                inside = here & (t_ns < leg.end_ns)
+                result[here] = leg.end
+                if leg.end_ns > leg.start_ns:
+                    result[inside] = leg.at(t_ns[inside])
+        return result
+
+    def moving(self, now_ns: int) -> bool:
+        """Whether a leg is yet to end."""
+        return bool(self.legs) and self.legs[-1].end_ns > now_ns
+
+    def _state(self, pose: Pose) -> F64:
+        return np.concatenate([pose.xyz_mm, pose.rotvec_deg, self._plane.sensor(pose)])

@@ -1,0 +1,84 @@
+"""The virtual clock, the sliding plate and the person at the simulated rig."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from protocols.program import PlateAction
+from rigs.capabilities import ArmState, RigError
+from rigs.mock.world import World
+
+_MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
+
+
+class VirtualClock:
+    """The host's clock of a simulated rig: it stands still unless somebody waits.
+
+    It starts at 0 with every trial, so that host times in a recording depend on the trial alone.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def now_ns(self) -> int:
+        """True nanoseconds since the trial began."""
+        return self._world.now_ns
+
+    def wait(self, seconds: float) -> None:
+        """Let `seconds` of virtual time pass."""
+        if not seconds >= 0.0:
+            raise ValueError(f"seconds = {seconds}: must not be negative")
+        self._world.pass_time(round(seconds * 1e9))
+
+
+class MockPlate:
+    """The plate on its slider."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def act(self, action: PlateAction, seconds: float) -> None:
+        """Raise and hold, release over `seconds`, or catch."""
+        self._world.act(action, seconds)
+
+    def mass_kg(self) -> float:
+        """Mass mounted now."""
+        return self._world.mass_kg
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One thing that the operator was asked to do."""
+
+    task: str
+    prompt: str
+    expected: str
+
+
+class SimulatedOperator:
+    """Does at once what it is asked, and says so.
+
+    `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
+    stop at the pendant. Everything else is only confirmed.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.asked: list[Asked] = []
+
+    def ask(self, task: str, prompt: str, expected: str) -> bool:
+        """Do it, and confirm.
+
+        Raises:
+            RigError: a changeover whose expected mass cannot be read.
+        """
+        self.asked.append(Asked(task, prompt, expected))
+        if task == "changeover":
+            match = _MASS.fullmatch(expected)
+            if match is None or float(match[1]) <= 0.0:
+                raise RigError("operator", f"cannot mount {expected!r}; expected such as 0.205 kg")
+            self._world.mass_kg = float(match[1]) * (0.001 if match[2] == "g" else 1.0)
+        elif task == "protective_stop":
+            self._world.arm_state = ArmState.READY
+        return True

@@ -1,0 +1,110 @@
+"""The papillae as springs: geometry and stiffness of the soft skin, from its measures.
+
+A dozen and a half columns on a compliant base carry everything that a slip experiment shows; no
+finite elements are needed. Young's modulus and the base's stiffnesses are fitted guesses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rigs.scene.randomness import generator
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SkinGeometry:
+    """What a skin is made as. Lengths mm, modulus MPa (N/mm2), base stiffnesses N/m."""
+
+    ring_counts: tuple[int, ...] = (1, 6, 12)
+    heights_mm: tuple[float, ...] = (10.1, 9.0, 7.9)
+    spacing_mm: float = 5.6
+    radius_mm: float = 2.0
+    youngs_modulus_mpa: float = 0.6
+    poisson_ratio: float = 0.49
+    bending: float = 12.0
+    base_normal_n_per_m: float = 150.0
+    base_tangential_n_per_m: float = 200.0
+    height_scatter_mm: float = 0.0
+    position_scatter_mm: float = 0.0
+    friction_scatter: float = 0.0
+
+
+@dataclass(frozen=True)
+class Skin:
+    """n papillae as made; ring by ring from the centre, counterclockwise from +x."""
+
+    layout_mm: F64
+    """Places in the sensor's plane, shape (n, 2)."""
+    gap_mm: F64
+    """How much deeper than the highest tip the sensor must go to touch, shape (n,)."""
+    ring: I64
+    """Layer, 0 is the centre, shape (n,)."""
+    normal_n_per_mm: F64
+    tangential_n_per_mm: F64
+    friction_factor: F64
+    """This tip's friction over the mean, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.ring)
+
+
+def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
+    """A skin with the fabrication scatter that belongs to `seed`.
+
+    The skin without scatter looks the same after a turn by 60 degrees if every ring's count can
+    be divided by 6.
+    """
+    places, heights, ring = [], [], []
+    for layer, count in enumerate(geometry.ring_counts):
+        for index in range(count):
+            angle = 2 * math.pi * index / count
+            radius = layer * geometry.spacing_mm
+            places.append((radius * math.cos(angle), radius * math.sin(angle)))
+            heights.append(geometry.heights_mm[layer])
+            ring.append(layer)
+    n = len(ring)
+    rng = generator(seed, "skin")
+    height = np.array(heights) + geometry.height_scatter_mm * rng.uniform(-1.0, 1.0, n)
+    wander = np.clip(rng.standard_normal((n, 2)), -2.0, 2.0)
+    grip = np.clip(rng.standard_normal(n), -2.0, 2.0)
+    return Skin(
+        layout_mm=np.array(places) + geometry.position_scatter_mm * wander,
+        gap_mm=height.max() - height,
+        ring=np.array(ring, np.int64),
+        normal_n_per_mm=normal_stiffness(geometry, height),
+        tangential_n_per_mm=tangential_stiffness(geometry, height),
+        friction_factor=1.0 + geometry.friction_scatter * grip,
+    )
+
+
+def normal_stiffness(geometry: SkinGeometry, height_mm: F64) -> F64:
+    """Stiffness along the papilla, N/mm: 1/k = h / (E A) + 1/k_base."""
+    area = math.pi * geometry.radius_mm**2
+    return 1.0 / (
+        height_mm / (geometry.youngs_modulus_mpa * area) + 1000.0 / geometry.base_normal_n_per_m
+    )
+
+
+def tangential_stiffness(geometry: SkinGeometry, height_mm: F64) -> F64:
+    """Stiffness across the papilla, N/mm: Timoshenko bending and shear, and the base, in series.
+
+    1/k = h^3 / (c E I) + h / (kappa G A) + 1/k_base with I = pi r^4 / 4,
+    kappa = 6 (1 + nu) / (7 + 6 nu) (Cowper 1966, circular section), G = E / (2 (1 + nu)).
+    """
+    nu, modulus = geometry.poisson_ratio, geometry.youngs_modulus_mpa
+    inertia = math.pi * geometry.radius_mm**4 / 4
+    area = math.pi * geometry.radius_mm**2
+    kappa = 6 * (1 + nu) / (7 + 6 * nu)
+    shear = modulus / (2 * (1 + nu))
+    return 1.0 / (
+        height_mm**3 / (geometry.bending * modulus * inertia)
+        + height_mm / (kappa * shear * area)
+        + 1000.0 / geometry.base_tangential_n_per_m
+    )

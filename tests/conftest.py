@@ -1,0 +1,29 @@
+"""Shared by all tests: where the shipped files are, and small protocols to change."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import settings
+
+ROOT = Path(__file__).parents[1]
+settings.register_profile("sliplab", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("sliplab")
+
+SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
+
+
+@pytest.fixture
+def root() -> Path:
+    """The checkout."""
+    return ROOT
+
+
+@pytest.fixture
+def small() -> dict[str, Any]:
+    """The pilot protocol as data, to be changed at will."""
+    return copy.deepcopy(SMALL)

@@ -1,0 +1,77 @@
+"""Quantities are exact decimals in one unit a kind."""
+
+from decimal import Decimal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocols.quantity import UNITS, canonical, parse, parse_or_ref, to_decimal
+
+decimals = st.decimals(
+    min_value=-1000, max_value=1000, places=4, allow_nan=False, allow_infinity=False
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("2.4 mm", "mm", "2.4"),
+        ("2.40mm", "mm", "2.4"),
+        ("0.24 cm", "mm", "2.4"),
+        ("2400 um", "mm", "2.4"),
+        ("1e1 mm", "mm", "10"),
+        (" 50 ms ", "s", "0.05"),
+        ("205 g", "kg", "0.205"),
+        ("125 %", "percent", "125"),
+        ("-.5 mm", "mm", "-0.5"),
+    ],
+)
+def test_one_quantity_however_it_is_written(text: str, unit: str, value: str) -> None:
+    assert canonical(parse(text, unit)) == value
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        (2.4, "has no unit"),
+        ("2.4", "number with a unit"),
+        ("2.4 kg", "where one of these belongs: mm, um, cm, m"),
+        ("nan mm", "number with a unit"),
+        ("inf mm", "number with a unit"),
+        ("1e999 mm", "at most 1e9"),
+        ("two mm", "number with a unit"),
+        (True, "number with a unit"),
+        (None, "number with a unit"),
+    ],
+)
+def test_what_is_no_length_is_refused(raw: object, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        parse(raw, "mm")
+
+
+@pytest.mark.parametrize("raw", [Decimal("NaN"), float("inf"), Decimal("-Infinity"), "x", True])
+def test_numbers_must_be_finite_numbers(raw: object) -> None:
+    with pytest.raises(ValueError, match="must be a"):
+        to_decimal(raw)
+
+
+@given(decimals)
+def test_canonical_text_stands_for_one_value(value: Decimal) -> None:
+    text = canonical(value)
+    assert Decimal(text) == value
+    assert text == canonical(Decimal(text)) == canonical(value * Decimal("1.000"))
+    assert "E" not in text
+    assert text != "-0"
+
+
+@given(decimals, st.sampled_from(sorted(UNITS)))
+def test_units_convert_exactly(value: Decimal, unit: str) -> None:
+    base, factor = UNITS[unit]
+    assert parse(f"{value} {unit}", base) == value * factor
+
+
+def test_a_reference_is_a_factors_name() -> None:
+    assert str(parse_or_ref("$depth", "mm")) == "$depth"
+    with pytest.raises(ValueError, match="factor's name"):
+        parse_or_ref("$Depth!", "mm")
