@@ -62,6 +62,9 @@ class PlateTracker:
         settings.cornerRefinementWinSize = 7
         settings.relativeCornerRefinmentWinSize = 0.4
         settings.cornerRefinementMinAccuracy = 0.01
+        # on a dark ground the white quiet zone is a square, too, one module outside the marker;
+        # at OpenCV's default of 0.125 it is taken for the marker's own outline and nothing is found
+        settings.minMarkerDistanceRate = 0.05
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         self._detector = cv2.aruco.ArucoDetector(dictionary, settings)
         self._last: Floats | None = None

@@ -109,7 +109,7 @@ class Training(StrictModel):
     """How the network is fitted."""
 
     epochs: int = Field(default=12, ge=1, le=10_000)
-    batch: int = Field(default=64, ge=1, le=4096)
+    batch: int = Field(default=32, ge=1, le=4096)
     learning_rate: float = Field(default=2e-3, gt=0, le=1)
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""

@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
-from rigs.mock.devices import build_mock
+from typing import Any
+
+from rigs.mock.devices import MockDevices, build_mock
 from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig
 from rigs.rig_file import RigFile
+
+
+class _MockSimulation:
+    """The simulated world, asked on the arm controller's clock."""
+
+    def __init__(self, devices: MockDevices) -> None:
+        self._devices = devices
+
+    def begin_trial(self, seed: int) -> None:
+        """Draw what varies by trial from `seed`."""
+        self._devices.begin_trial(seed)
+
+    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
+        """What really happened after that moment."""
+        clock = self._devices.world.clocks.arm
+        return self._devices.truth(int(clock.to_device(reference_arm_ns)))
 
 
 def build_rig(file: RigFile) -> Rig:
@@ -22,6 +40,7 @@ def build_rig(file: RigFile) -> Rig:
         operator=devices.operator,
         frame=PlateFrame.taught((plane.centre, plane.right, plane.above)),
         poll_s=float(file.poll),
+        touch_mm=file.calibration.touch_depth,
         plate=devices.plate,
-        simulation=devices.world,
+        simulation=_MockSimulation(devices),
     )

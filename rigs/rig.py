@@ -7,9 +7,12 @@ protective stop.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
 from rigs.capabilities import (
@@ -30,6 +33,8 @@ from rigs.plate_frame import PlateFrame
 from storage.streams import Json, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
+TOUCH_HALF_PX = 30
+"""Half the side of the square in which touching off looks for the centre papilla."""
 _MOVE_GRACE_S = 10.0
 
 
@@ -59,8 +64,7 @@ class Rig:
 
     Attributes:
         poll_s: how often streams are read and stop requests looked at.
-        code_seed: of the sync box's pulse code; the trial's own seed changes it from trial to
-            trial so that no two trials can be mistaken for each other.
+        touch_mm: how deep the centre papilla is when touching off notices it.
         simulation: the world behind a simulated rig, None on a real one.
     """
 
@@ -73,6 +77,7 @@ class Rig:
     operator: Operator
     frame: PlateFrame
     poll_s: float
+    touch_mm: float = 0.0
     plate: Plate | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
@@ -138,10 +143,11 @@ class Rig:
                 self._move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
 
     def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
-        """Find depth zero: creep in until the event rate says that a papilla touches.
+        """Find depth zero: creep in until the event rate says that the centre papilla touches.
 
-        The rate of 0.5 s standing still is the noise; a touch is a count in 50 ms above
-        its mean by eight standard deviations (Poisson) and ten events.
+        Only events round the image's centre count. Their rate in 0.5 s of standing still is the
+        noise; a touch is a count in 50 ms above its mean by eight standard deviations (Poisson)
+        and ten events. A skin is noticed only some way in: `touch_mm` of the rig's calibration.
 
         Args:
             search_mm: hard limit beyond the taught plane.
@@ -161,7 +167,7 @@ class Rig:
             self.events.start()
             try:
                 self._wait(0.5)
-                quiet = len(self.events.read()) * 0.1  # per 50 ms
+                quiet = self._central_events() * 0.1  # per 50 ms
                 limit = quiet + 8 * quiet**0.5 + 10
                 zero = self._creep(search_mm, speed_mm_s, limit)
             finally:
@@ -185,16 +191,26 @@ class Rig:
     def _creep(self, search_mm: float, speed_mm_s: float, limit: float) -> float:
         target = Position(0.0, 0.0, search_mm)
         self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])
+        recent: deque[int] = deque(maxlen=5)  # of 10 ms each
         while not self.arm.progress().done:
-            self._wait(0.05)
+            self._wait(0.01)
             depth = self.frame.position(self.arm.pose().xyz_mm).depth_mm
-            if len(self.events.read()) > limit:
+            recent.append(self._central_events())
+            if sum(recent) > limit:
                 self.arm.stop()
-                return depth - speed_mm_s * 0.025  # it happened in the middle of those 50 ms
+                middle = depth - speed_mm_s * 0.025  # of those 50 ms
+                return middle - self.touch_mm
         raise RigError(
             "arm", f"touching off met nothing within {search_mm:g} mm of the taught plane; "
             "teach the contact plane again"
         )
+
+    def _central_events(self) -> int:
+        """New events where the event camera sees the centre papilla."""
+        chunk = self.events.read()
+        x = np.abs(chunk.x.astype(np.int64) - self.events.width // 2)
+        y = np.abs(chunk.y.astype(np.int64) - self.events.height // 2)
+        return int(np.count_nonzero((x < TOUCH_HALF_PX) & (y < TOUCH_HALF_PX)))
 
     def _step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
         start = self.arm.now_ns()

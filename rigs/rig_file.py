@@ -40,6 +40,8 @@ class Calibration(StrictModel):
     """What was measured on this rig."""
 
     contact_plane: ContactPlane
+    touch_depth: Millimetre = 0.0
+    """How deep the centre papilla is when touching off notices it, found once with a gauge."""
 
 
 class RigLimits(StrictModel):

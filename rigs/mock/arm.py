@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
-from rigs.mock.clocks import JITTER_BLOCK, Jitter
+from rigs.mock.clocks import Jitter, Noise
 from rigs.mock.path import Leg
 from rigs.mock.sync import MockSyncBox, SyncInput
 from rigs.mock.world import World
-from rigs.scene.randomness import generator
 from storage.streams import PoseChunk, PulseChunk
-
-F64 = npt.NDArray[np.float64]
-I64 = npt.NDArray[np.int64]
 
 BACKLOG_NS = 120_000_000_000
 """Poses older than this are dropped if nobody reads them."""
@@ -39,6 +34,7 @@ class MockArm:
         self._legs = []
         self._first = -(-world.clocks.arm.to_reference(world.now_ns) // self._period_ns)
         self._read = self._first
+        self._noise = Noise(world.seed, "pose noise", 3)
         self._late = Jitter(world.seed, "arm reception", 50.0)
 
     def connect(self) -> None:
@@ -95,7 +91,7 @@ class MockArm:
         self._read = first + here
         cycles, true, host = cycles[:here], true[:here], host[:here]
         state = world.path.states(true)
-        xyz = state[:, :3] + self._noise(cycles - self._first) * (settings.pose_noise_um * 1e-3)
+        xyz = state[:, :3] + self._noise.of(cycles - self._first) * (settings.pose_noise_um * 1e-3)
         return PoseChunk(cycles * self._period_ns, host, xyz, state[:, 3:6].copy())
 
     def read_pulses(self) -> PulseChunk:
@@ -115,14 +111,3 @@ class MockArm:
     def close(self) -> None:
         """Give the connection back."""
         self._connected = False
-
-    def _noise(self, numbers: I64) -> F64:
-        result = np.empty((len(numbers), 3))
-        blocks = numbers // JITTER_BLOCK
-        for block in np.unique(blocks).tolist():
-            draw = generator(self._world.seed, "pose noise", block).standard_normal(
-                (JITTER_BLOCK, 3)
-            )
-            here = blocks == block
-            result[here] = draw[numbers[here] % JITTER_BLOCK]
-        return result

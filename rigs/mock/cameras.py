@@ -197,7 +197,7 @@ def _optics(settings: MockSettings) -> FrameOptics:
     camera, plate = settings.frame_camera, settings.scene.plate
     return FrameOptics(
         px_per_mm=camera.px_per_mm,
-        tip_radius_mm=settings.scene.skin.radius_mm,
+        tip_radius_mm=settings.frame_camera.tip_radius_mm,
         tip_level=camera.tip_level,
         ground_level=camera.ground_level,
         noise=camera.noise,

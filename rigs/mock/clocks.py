@@ -15,6 +15,7 @@ from rigs.mock.settings import Clocks
 from rigs.scene.randomness import generator
 from storage.clockmap import ClockMap
 
+F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 HOUR_NS = 3_600_000_000_000
 JITTER_BLOCK = 4096
@@ -44,24 +45,39 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
     return TrialClocks(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
 
 
-class Jitter:
-    """Random offsets of numbered instants, the same in whatever pieces they are asked for."""
+class Noise:
+    """Normal numbers that belong to numbered instants, in whatever pieces they are asked for."""
 
-    def __init__(self, seed: int, purpose: str, sigma_us: float) -> None:
-        self._seed, self._purpose, self._sigma_us = seed, purpose, sigma_us
-        self._blocks: dict[int, I64] = {}
+    def __init__(self, seed: int, purpose: str, width: int) -> None:
+        self._seed, self._purpose, self._width = seed, purpose, width
+        self._blocks: dict[int, F64] = {}
 
-    def ns(self, numbers: I64) -> I64:
-        """Offsets of the instants `numbers` (not negative), cut at four sigma, shape (n,)."""
-        if self._sigma_us == 0.0 or not len(numbers):
-            return np.zeros(len(numbers), np.int64)
+    def of(self, numbers: I64) -> F64:
+        """Standard normal, cut at four, for the instants `numbers` (not negative), (n, width)."""
+        result = np.empty((len(numbers), self._width))
+        if not len(numbers):
+            return result
         block, inside = np.divmod(numbers, JITTER_BLOCK)
-        result = np.empty(len(numbers), np.int64)
-        for index in np.unique(block).tolist():
+        for index in range(int(block.min()), int(block.max()) + 1):
             if index not in self._blocks:
-                draw = generator(self._seed, self._purpose, index).standard_normal(JITTER_BLOCK)
-                scaled = np.clip(draw, -4.0, 4.0) * (self._sigma_us * 1000)
-                self._blocks = {index: np.rint(scaled).astype(np.int64)}
+                if len(self._blocks) > 1:
+                    self._blocks.pop(min(self._blocks))
+                rng = generator(self._seed, self._purpose, index)
+                draw = rng.standard_normal((JITTER_BLOCK, self._width))
+                self._blocks[index] = np.clip(draw, -4.0, 4.0)
             here = block == index
             result[here] = self._blocks[index][inside[here]]
         return result
+
+
+class Jitter:
+    """Random offsets of numbered instants."""
+
+    def __init__(self, seed: int, purpose: str, sigma_us: float) -> None:
+        self._noise, self._sigma_ns = Noise(seed, purpose, 1), sigma_us * 1000
+
+    def ns(self, numbers: I64) -> I64:
+        """Offsets of the instants `numbers` (not negative), cut at four sigma, shape (n,)."""
+        if self._sigma_ns == 0.0:
+            return np.zeros(len(numbers), np.int64)
+        return np.rint(self._noise.of(numbers)[:, 0] * self._sigma_ns).astype(np.int64)

@@ -53,7 +53,8 @@ class Skin(StrictModel):
     def _layers(self) -> Skin:
         if len(self.ring_counts) != len(self.heights_mm):
             raise KeyedError(
-                "scene.skin.heights_mm", list(self.heights_mm),
+                "scene.skin.heights_mm",
+                list(self.heights_mm),
                 f"must hold one height for each of the {len(self.ring_counts)} layers",
             )
         return self
@@ -107,7 +108,8 @@ class Contact(StrictModel):
     def _turn(self) -> Contact:
         if math.hypot(*self.nominal_rotvec_deg) > 360.0:
             raise KeyedError(
-                "scene.contact.nominal_rotvec_deg", list(self.nominal_rotvec_deg),
+                "scene.contact.nominal_rotvec_deg",
+                list(self.nominal_rotvec_deg),
                 "is a rotation vector in degrees, at most 360 long",
             )
         return self
@@ -161,6 +163,9 @@ class FrameCamera(StrictModel):
     px_per_mm: Positive = 12.0
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     exposure_us: Annotated[int, Field(ge=10, le=100_000)] = 2000
+    tip_radius_mm: Positive = 1.0
+    """Of the white spot on each papilla's top. The tips of this scene do not push each other aside,
+    so a spot as wide as its papilla (2 mm) would run into its neighbour's."""
     tip_level: Annotated[int, Field(ge=0, le=240)] = 200
     ground_level: Annotated[int, Field(ge=15, le=255)] = 25
     noise: Annotated[float, Field(ge=0, le=3)] = 1.5

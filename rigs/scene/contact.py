@@ -151,9 +151,7 @@ class Scratch(NamedTuple):
 
 def new_scratch(n: int) -> Scratch:
     """Room for one step."""
-    return Scratch(
-        np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2))
-    )
+    return Scratch(np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2)))
 
 
 @njit(cache=True, nogil=True)

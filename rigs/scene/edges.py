@@ -34,11 +34,16 @@ def level_at(distance, contrast, edge):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def rim_of(level, contrast, edge):  # type: ignore[no-untyped-def]
-    """Distance from the rim at which a level is met; far away if it never is."""
-    if level <= 0.0:
-        return _FAR
-    if level >= contrast:
-        return -_FAR
+    """Distance from the rim at which a level is met; far away if it never is.
+
+    The two flat levels are met where the edge ends, so that what a disc does to a pixel in
+    coming is undone, event by event, when it goes.
+    """
+    rounding = 1e-9 * contrast
+    if level <= rounding:
+        return CUT * edge if level >= -rounding else _FAR
+    if level >= contrast - rounding:
+        return -CUT * edge if level <= contrast + rounding else -_FAR
     share = _TAIL + level / contrast * (1.0 - 2.0 * _TAIL)
     return edge * np.log((1.0 - share) / share)
 
@@ -50,7 +55,7 @@ def reset_pixels(discs, contrast, edge, threshold, on, off, last, level, fired):
     for y in range(height):
         for x in range(width):
             on[y, x] = rim_of(threshold[y, x], contrast, edge)
-            off[y, x] = last[y, x] = _FAR
+            off[y, x], last[y, x] = _FAR, CUT * edge
             level[y, x] = 0.0
             fired[y, x] = -np.inf
     for i in range(discs.shape[0]):
@@ -136,6 +141,7 @@ def _visit(  # type: ignore[no-untyped-def]
         hole_right = int(np.ceil(mid_x + hole))
         dy = y - cy
         ey = dy - vy
+        next_on, next_off = on[y], off[y]
         x = left - 1
         while x < right:
             x += 1
@@ -146,9 +152,9 @@ def _visit(  # type: ignore[no-untyped-def]
             dx = x - cx
             ex = dx - vx
             square0, square1 = dx * dx + dy * dy, ex * ex + ey * ey
-            near0 = max(r0 + on[y, x] + bend, 0.0)
-            near1 = max(r0 + growth + on[y, x] + bend, 0.0)
-            far0, far1 = r0 + off[y, x], r0 + growth + off[y, x]
+            near, far = r0 + next_on[x] + bend, r0 + next_off[x]
+            near0, near1 = max(near, 0.0), max(near + growth, 0.0)
+            far0, far1 = far, far + growth
             if (
                 square0 > near0 * near0 and square1 > near1 * near1
                 and square0 < far0 * far0 and square1 < far1 * far1
@@ -196,20 +202,20 @@ def _visit(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _most(start, end, edge, levels):  # type: ignore[no-untyped-def]
-    """An upper bound of the events of one chord."""
-    side = 2.0 * (max(start[2], end[2]) + CUT * edge) + 3.0
-    side += np.hypot(end[0] - start[0], end[1] - start[1])
-    hole = min(start[2], end[2]) - CUT * edge - 2.0
-    hole -= 0.5 * np.hypot(end[0] - start[0], end[1] - start[1])
-    area = side * side - (3.0 * hole * hole if hole > 0.0 else 0.0)
-    return int(area) * levels
+def _most(start, end, contrast, edge, lowest):  # type: ignore[no-untyped-def]
+    """An upper bound of the events of one chord; `lowest` threshold of all pixels."""
+    speed = np.hypot(end[0] - start[0], end[1] - start[1])
+    side = 2.0 * (max(start[2], end[2]) + CUT * edge) + speed + 3.0
+    hole = max(min(start[2], end[2]) - CUT * edge - 0.5 * speed - 2.0, 0.0)
+    # the profile is steepest at the rim: a quarter of the contrast over its scale
+    change = min(0.26 * contrast / edge * (speed + abs(end[2] - start[2])), contrast)
+    return int(side * side - 3.0 * hole * hole) * 2 * (int(change / lowest) + 2)
 
 
 @njit(cache=True, nogil=True)
 def trace(  # type: ignore[no-untyped-def]
     path, first_step, step_ns, block, chord_px, contrast, edge, refractory, threshold,
-    on, off, last, level, fired, noise_t, noise_x, noise_y, noise_p,
+    lowest, on, off, last, level, fired, noise_t, noise_x, noise_y, noise_p,
 ):  # fmt: skip
     """Signal and noise of all discs along `path`, sorted by time.
 
@@ -218,14 +224,14 @@ def trace(  # type: ignore[no-untyped-def]
         first_step: number of the first row on the global grid; blocks of `block` steps are cut
             there, and nothing crosses their borders.
         refractory: ns.
+        lowest: the lowest threshold of all.
         threshold, on, off, last, level, fired: the pixels' state, (height, width), written.
         noise_t, noise_x, noise_y, noise_p: noise of the same span of time, sorted.
 
     Returns:
         true time (ns, int64), column, row (uint16), polarity (uint8), each (k,).
     """
-    levels = 2 * int(contrast / threshold.min()) + 4
-    capacity = 1 << 16
+    capacity = 1 << 14
     out_t = np.empty(capacity, np.int64)
     out_x, out_y = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16)
     out_p = np.empty(capacity, np.uint8)
@@ -252,7 +258,7 @@ def trace(  # type: ignore[no-untyped-def]
                     still = still and path[a, i, c] == path[b, i, c]
                 if still:
                     continue
-                room = n + _most(path[a, i], path[b, i], edge, levels)
+                room = n + _most(path[a, i], path[b, i], contrast, edge, lowest)
                 if room > capacity:
                     capacity = 2 * room
                     out_t = _larger(out_t, capacity)

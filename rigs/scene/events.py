@@ -59,6 +59,7 @@ class MarkerSensor:
         spread = np.clip(generator(seed, "thresholds").standard_normal(shape), -3.0, 3.0)
         threshold = optics.threshold + optics.threshold_sigma * spread
         self.threshold: F64 = np.maximum(threshold, 0.1 * optics.threshold)
+        self._lowest = float(self.threshold.min())
         # rim distances (px, outwards positive) of the next event of either sign, and of the last
         self._next_on, self._next_off, self._last = np.empty((3, *shape))
         self._level = np.empty(shape)
@@ -105,7 +106,8 @@ class MarkerSensor:
         noise = self._noise(first_step * step_ns, last_step * step_ns)
         return trace(
             self.path(loads), first_step, step_ns, optics.block_steps, optics.chord_px,
-            optics.contrast, optics.edge_px, optics.refractory_us * 1e3, self.threshold,
+            optics.contrast, optics.edge_px, optics.refractory_us * 1e3,
+            self.threshold, self._lowest,
             self._next_on, self._next_off, self._last, self._level, self._fired_ns, *noise,
         )  # fmt: skip
 

@@ -7,6 +7,7 @@ at: over the whole picture it would cost more than everything else.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +21,9 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 
-_TILE = 256
+_SHIFTS = 128
+_GOLDEN = 0x9E3779B97F4A7C15
+_MASK = 0xFFFFFFFFFFFFFFFF
 _MARGIN_PX = 6.0
 _MODULES = 6
 
@@ -45,7 +48,10 @@ class PlateView:
     def __init__(self, optics: FrameOptics, width: int, height: int) -> None:
         self.optics, self.width, self.height = optics, width, height
         self._patch = _marker_patch(optics)
-        self._tile = np.zeros((_TILE, _TILE), np.int8)
+        reach = optics.px_per_mm * optics.tip_radius_mm + _MARGIN_PX
+        size = _SHIFTS + max(2 * math.ceil(reach) + 2, self._patch.shape[0] + 2)
+        self._noise = np.zeros((size, size), np.int8)
+        self._dark = self._bright = np.zeros((size, size), np.uint8)
         self._seed: int | None = None
         self._key = 0
 
@@ -56,9 +62,7 @@ class PlateView:
         result[..., 1] = 0.5 * (self.height - 1) - self.optics.px_per_mm * place_mm[..., 1]
         return result
 
-    def draw(
-        self, images: U8, tips_mm: F64, plate_mm: F64 | None, number: I64, seed: int
-    ) -> None:
+    def draw(self, images: U8, tips_mm: F64, plate_mm: F64 | None, number: I64, seed: int) -> None:
         """Fill `images`, (k, height, width), uint8.
 
         Args:
@@ -69,25 +73,26 @@ class PlateView:
         if seed != self._seed:
             self._seed, self._key = seed, key(seed, "frame noise")
             # one tile a trial: a picture only ever shows shifted pieces of it
-            draw = generator(seed, "frame noise").standard_normal((_TILE, _TILE))
+            draw = generator(seed, "frame noise").standard_normal(self._noise.shape)
             grey = np.rint(np.clip(draw, -4.0, 4.0) * self.optics.noise)
-            self._tile = grey.astype(np.int8)
+            self._noise = grey.astype(np.int8)
+            self._dark = (self.optics.ground_level + grey).astype(np.uint8)
+            self._bright = (self.optics.tip_level + grey).astype(np.uint8)
         optics = self.optics
         radius = optics.px_per_mm * optics.tip_radius_mm
         centres = self.centre_px(tips_mm)
         for index in range(len(images)):
-            frame_key = np.uint64(self._key) ^ np.uint64(int(number[index]) * 0x9E3779B97F4A7C15
-                                                         & 0xFFFFFFFFFFFFFFFF)
+            frame_key = np.uint64(self._key ^ (int(number[index]) * _GOLDEN & _MASK))
             draw_discs(
                 images[index], centres[index], radius, optics.ground_level, optics.tip_level,
-                _MARGIN_PX, self._tile, frame_key,
+                _MARGIN_PX, self._dark, self._bright, frame_key,
             )  # fmt: skip
             if plate_mm is not None:
                 self._stick(images[index], float(plate_mm[index]), frame_key)
 
     def _stick(self, image: U8, plate_mm: float, frame_key: np.uint64) -> None:
         optics = self.optics
-        place = np.array(optics.marker_centre_mm) + [0.0, plate_mm]
+        place = np.array(optics.marker_centre_mm) + np.array([0.0, plate_mm])
         column, row = self.centre_px(place).tolist()
         side = self._patch.shape[0]
         # the patch has whole pixels; its true side has not
@@ -107,7 +112,7 @@ class PlateView:
             self._patch, inverse, (right - left, bottom - top),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
-        add_noise(piece, self._tile, frame_key)
+        add_noise(piece, self._noise, frame_key)
         image[top:bottom, left:right] = piece
 
 
@@ -132,62 +137,61 @@ def _mix(value):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def add_noise(image, tile, frame_key):  # type: ignore[no-untyped-def]
-    """Add a shifted piece of the noise `tile` (int8) to `image` in place."""
-    turn = _mix(frame_key)
-    down, along = int(turn & np.uint64(255)), int((turn >> np.uint64(8)) & np.uint64(255))
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            image[y, x] += tile[(y + down) & 255, (x + along) & 255]
+def _shift(frame_key, index):  # type: ignore[no-untyped-def]
+    """Where in the noise tile a piece of a picture begins: row and column, 0 to 127."""
+    turn = _mix(frame_key + np.uint64(index))
+    return int(turn & np.uint64(127)), int((turn >> np.uint64(8)) & np.uint64(127))
 
 
 @njit(cache=True, nogil=True)
-def draw_discs(image, centres, radius, ground, level, margin, tile, frame_key):  # type: ignore[no-untyped-def]
+def add_noise(image, noise, frame_key):  # type: ignore[no-untyped-def]
+    """Add a shifted piece of the tile `noise` (int8) to `image` in place."""
+    down, along = _shift(frame_key, 0)
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            image[y, x] += noise[y + down, x + along]
+
+
+@njit(cache=True, nogil=True)
+def draw_discs(image, centres, radius, ground, level, margin, dark, bright, frame_key):  # type: ignore[no-untyped-def]
     """Discs with anti-aliased rims and noise in squares round them, on an even ground.
 
-    A rim pixel's share of the disc is taken as its distance from the rim, which is within 0.3 %
-    of the true area for discs of more than 10 px; noise comes from a shifted `tile`, int8.
+    `dark` and `bright` are the noise tile on the ground's level and on the discs', so that most
+    pixels are copied. A rim pixel's share of the disc is taken from its distance to the rim.
     """
     height, width = image.shape
     image[:] = ground
+    reach, outer, inner = radius + margin, radius + 0.5, radius - 0.5
     for i in range(centres.shape[0]):
         cx, cy = centres[i, 0], centres[i, 1]
-        turn = _mix(frame_key + np.uint64(i + 1))
-        down, along = int(turn & np.uint64(127)), int((turn >> np.uint64(8)) & np.uint64(127))
-        left, right = max(int(cx - radius - margin), 0), min(int(cx + radius + margin) + 2, width)
-        top = max(int(cy - radius - margin), 0)
-        bottom = min(int(cy + radius + margin) + 2, height)
-        for y in range(top, bottom):
-            noise = tile[(y - top + down) & 255]
-            row = image[y]
-            for x in range(left, right):
-                row[x] = ground + noise[(x - left + along) & 255]
+        down, along = _shift(frame_key, i + 1)
+        # the noise sticks to the disc's square wherever the picture cuts it off
+        down -= int(np.floor(cy - reach))
+        along -= int(np.floor(cx - reach))
+        left, right = max(int(np.floor(cx - reach)), 0), min(int(cx + reach) + 1, width)
+        for y in range(max(int(np.floor(cy - reach)), 0), min(int(cy + reach) + 1, height)):
+            if left < right:
+                image[y, left:right] = dark[y + down, left + along : right + along]
     for i in range(centres.shape[0]):
         cx, cy = centres[i, 0], centres[i, 1]
-        turn = _mix(frame_key + np.uint64(i + 1))
-        down, along = int(turn & np.uint64(127)), int((turn >> np.uint64(8)) & np.uint64(127))
-        left = max(int(cx - radius - margin), 0)
-        top = max(int(cy - radius - margin), 0)
-        outer, inner = radius + 0.5, radius - 0.5
+        down, along = _shift(frame_key, i + 1)
+        down -= int(np.floor(cy - reach))
+        along -= int(np.floor(cx - reach))
         for y in range(max(int(np.ceil(cy - outer)), 0), min(int(cy + outer) + 1, height)):
             across = (y - cy) * (y - cy)
             wide = np.sqrt(max(outer * outer - across, 0.0))
             full = np.sqrt(max(inner * inner - across, 0.0))
-            noise = tile[(y - top + down) & 255]
-            row = image[y]
-            first, last = max(int(np.ceil(cx - wide)), 0), min(int(cx + wide), width - 1)
-            flat_from, flat_to = int(np.ceil(cx - full)), int(cx + full)
+            first, last = max(int(np.ceil(cx - wide)), 0), min(int(np.floor(cx + wide)), width - 1)
+            flat_from, flat_to = int(np.ceil(cx - full)), int(np.floor(cx + full))
             if full == 0.0:
                 flat_from, flat_to = last + 1, last
-            for x in range(first, min(flat_from, last + 1)):
-                share = min(outer - np.sqrt((x - cx) * (x - cx) + across), 1.0)
-                row[x] = int(ground + share * (level - ground) + 0.5) + noise[
-                    (x - left + along) & 255
-                ]
-            for x in range(max(flat_from, first), min(flat_to, last) + 1):
-                row[x] = level + noise[(x - left + along) & 255]
-            for x in range(max(flat_to + 1, flat_from, first), last + 1):
-                share = min(outer - np.sqrt((x - cx) * (x - cx) + across), 1.0)
-                row[x] = int(ground + share * (level - ground) + 0.5) + noise[
-                    (x - left + along) & 255
-                ]
+            left, right = max(flat_from, first), min(flat_to, last) + 1
+            if left < right:
+                image[y, left:right] = bright[y + down, left + along : right + along]
+            for side in range(2):
+                begin = first if side == 0 else max(flat_to + 1, flat_from, first)
+                end = min(flat_from, last + 1) if side == 0 else last + 1
+                for x in range(begin, end):
+                    share = min(outer - np.sqrt((x - cx) * (x - cx) + across), 1.0)
+                    noise = np.int64(dark[y + down, x + along]) - ground
+                    image[y, x] = int(ground + share * (level - ground) + 0.5) + noise

@@ -61,7 +61,7 @@ def _solve(tips, scratch, h, mass, speed, weight, stiction):  # type: ignore[no-
         following = v - f / (inertia - slope * h)
         if not low < following < high:
             following = 0.5 * (low + high)
-        if following == v or following == low or following == high:
+        if following in (v, low, high):
             return following
         if abs(following - v) <= 1e-15 * abs(v):
             return following

@@ -94,7 +94,8 @@ def test_equal_classes_share_the_majority() -> None:
 
 def test_a_total_below_all_seen_is_called_as_its_neighbour() -> None:
     low, high, table = fit_rate_thresholds(np.array([5.0, 6, 9, 10]), np.array([0, 0, 1, 1]))
-    assert table[np.searchsorted([low, high], [0, 7, 8, 99])].argmax(axis=1).tolist() == [0, 0, 1, 1]
+    votes = table[np.searchsorted([low, high], [0, 7, 8, 99])]
+    assert votes.argmax(axis=1).tolist() == [0, 0, 1, 1]
 
 
 def test_logistic_is_at_its_minimum_and_repeats() -> None:
@@ -133,5 +134,5 @@ def test_wrong_input_is_named() -> None:
         evaluate_baselines(x[:0], y[:0], x, y)
     with pytest.raises(ValueError, match="differ in number"):
         evaluate_baselines(x, y[:1], x, y)
-    with pytest.raises(ValueError, match="expected 0..2"):
+    with pytest.raises(ValueError, match=r"expected 0\.\.2"):
         evaluate_baselines(x, y + 2, x, y)

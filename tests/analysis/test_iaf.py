@@ -1,5 +1,6 @@
 """The fast path gives Sinabs' spikes exactly and Sinabs' gradients to rounding."""
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,6 +16,15 @@ from protocols.settings import Network, Windows
 SMALL = Network(conv1_channels=3, conv2_channels=4, hidden=8)
 TINY = Windows(length_ms=10, crop_px=120)
 FULL = Windows()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """These nets are too small to share: beside other work, waiting threads cost the most."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def sparse(n: int, windows: Windows, seed: int, share: float) -> np.ndarray:

@@ -47,11 +47,7 @@ def test_a_silent_network_is_a_third_right_whatever_the_class(true: int) -> None
     assert (found.argmax, found.strict, found.margin) == (1 / 3, 0.0, 0.0)
 
 
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 2), *[st.integers(0, 4)] * 3), min_size=1, max_size=40
-    )
-)
+@given(st.lists(st.tuples(st.integers(0, 2), *[st.integers(0, 4)] * 3), min_size=1, max_size=40))
 def test_the_order_of_the_classes_changes_no_accuracy_at_all(rows: list[tuple[int, ...]]) -> None:
     data = np.array(rows)
     labels, counts = data[:, 0], data[:, 1:]
@@ -64,9 +60,7 @@ def test_the_order_of_the_classes_changes_no_accuracy_at_all(rows: list[tuple[in
         np.testing.assert_array_equal(moved, table[list(order)][:, [*order, 3]])
 
 
-@given(
-    st.lists(st.tuples(st.integers(0, 2), *[st.integers(0, 30)] * 3), min_size=1, max_size=40)
-)
+@given(st.lists(st.tuples(st.integers(0, 2), *[st.integers(0, 30)] * 3), min_size=1, max_size=40))
 def test_strict_and_margin_only_take_away(rows: list[tuple[int, ...]]) -> None:
     data = np.array(rows)
     found = accuracy(data[:, 1:], data[:, 0], margin=2)

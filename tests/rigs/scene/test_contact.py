@@ -93,14 +93,10 @@ def test_slip_starts_at_mu_n_over_k_on_a_straight_path_whatever_the_step() -> No
 @pytest.mark.parametrize("depth", [2.4, 2.8, 3.4])
 @pytest.mark.parametrize("direction", range(0, 360, 45))
 def test_slip_runs_from_the_outer_layer_to_the_centre(depth: float, direction: int) -> None:
-    geometry = SkinGeometry(
-        height_scatter_mm=0.08, position_scatter_mm=0.05, friction_scatter=0.05
-    )
+    geometry = SkinGeometry(height_scatter_mm=0.08, position_scatter_mm=0.05, friction_scatter=0.05)
     skin = make_skin(geometry, seed=3)
     field = friction_field(skin, MU, 0.05, 0.5, seed=9)
-    springs = make_springs(
-        skin, friction=field, static_excess=0.03, relaxation_share=0.2
-    )
+    springs = make_springs(skin, friction=field, static_excess=0.03, relaxation_share=0.2)
     tips = pressed(springs, depth)
     angle = math.radians(direction)
     track, _ = run(
@@ -158,9 +154,7 @@ def test_static_friction_drops_by_its_excess() -> None:
 
 def test_huge_stiffness_and_long_steps_stay_finite_and_inside_the_cone() -> None:
     springs = springs_of(ideal_skin())
-    stiff = springs._replace(
-        tangential=springs.tangential * 1e9, normal=springs.normal * 1e9
-    )
+    stiff = springs._replace(tangential=springs.tangential * 1e9, normal=springs.normal * 1e9)
     tips = new_tips(19)
     run(stiff, tips, at(0, 0, 2.8, 3), h=0.01)
     track, load = run(stiff, tips, line((0, 0, 2.8), (15, 4, 2.8), 1500), h=0.01)
@@ -229,7 +223,7 @@ def test_leaving_and_touching_again_resets_the_slider() -> None:
     assert np.all(tips.mode == FREE)
     run(springs, tips, line((3, 0, -1.0), (3, 0, 2.8), 500))
     assert np.all(tips.force == 0.0)
-    assert tips.place == pytest.approx(springs.layout + [3, 0])
+    assert tips.place == pytest.approx(springs.layout + np.array([3, 0]))
 
 
 def test_a_turn_by_90_degrees_follows_the_tractrix_at_first_order() -> None:
@@ -256,12 +250,8 @@ def test_turning_the_scene_turns_the_result() -> None:
         tips = pressed(springs)
         for start, end in ((0 + 0j, 6 + 1j), (6 + 1j, 5 + 4j)):
             a, b = start * spin, end * spin
-            run(
-                springs, tips, line((a.real, a.imag, 2.8), (b.real, b.imag, 2.8), 1500)
-            )
-        results.append(
-            (springs.layout @ [1, 1j], tips.place @ [1, 1j], tips.force @ [1, 1j], spin)
-        )
+            run(springs, tips, line((a.real, a.imag, 2.8), (b.real, b.imag, 2.8), 1500))
+        results.append((springs.layout @ [1, 1j], tips.place @ [1, 1j], tips.force @ [1, 1j], spin))
     (layout, place, force, _), (_, turned_place, turned_force, spin) = results
     partner = [int(np.abs(layout - spot * spin).argmin()) for spot in layout]
     assert turned_place[partner] == pytest.approx(place * spin, abs=1e-9)

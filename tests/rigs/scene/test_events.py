@@ -1,0 +1,236 @@
+"""Event times against closed forms, and what must not depend on how a trial is cut up."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigs.scene.edges import CUT, level_at, rim_of
+from rigs.scene.events import EventOptics, Events, MarkerSensor
+
+STEP_NS = 1_000_000
+ONE = np.zeros((1, 2))
+QUIET = {"noise_hz": 0.0, "threshold_sigma": 0.0, "refractory_us": 0.0}
+
+
+def loads_for(centre_px: np.ndarray, optics: EventOptics, growth_px: np.ndarray | None = None):
+    """Loads (m, 3) that put one marker `centre_px` (m, 2; y down) off the picture's centre."""
+    scale = optics.px_per_mm * optics.shift_mm_per_n
+    loads = np.zeros((len(centre_px), 3))
+    loads[:, 0] = -centre_px[:, 0] / scale
+    loads[:, 1] = centre_px[:, 1] / scale
+    if growth_px is not None:
+        loads[:, 2] = growth_px / (optics.px_per_mm * optics.growth_mm_per_n)
+    return loads
+
+
+def straight(optics: EventOptics, v: tuple[float, float], steps: int) -> np.ndarray:
+    return loads_for(np.arange(steps + 1)[:, None] * 1e-3 * np.array(v), optics)
+
+
+def sense(sensor: MarkerSensor, loads: np.ndarray, first_step: int = 0, seed: int = 1) -> Events:
+    sensor.reset(loads[0], seed)
+    return sensor.sense(loads, first_step, STEP_NS)
+
+
+def expected_crossings(
+    optics: EventOptics, x: int, y: int, v: tuple[float, float], t_end: float
+) -> list[tuple[float, int]]:
+    """Times (s) and polarities at one pixel, by fine bisection of its own log intensity."""
+    cx, cy = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
+    radius = optics.px_per_mm * optics.radius_mm
+
+    def level(t: float) -> float:
+        away = math.hypot(x - cx - v[0] * t, y - cy - v[1] * t) - radius
+        share = 1 / (1 + math.exp(min(away / optics.edge_px, 600.0)))
+        tail = 1 / (1 + math.exp(CUT))
+        if abs(away) >= CUT * optics.edge_px:
+            return 0.0 if away > 0 else optics.contrast
+        return optics.contrast * (share - tail) / (1 - 2 * tail)
+
+    found, reference, t, dt = [], level(0.0), 0.0, t_end / 4000
+    while t < t_end:
+        for sign in (1, -1):
+            target = reference + sign * optics.threshold
+            if sign * (level(t + dt) - target) >= 0:
+                low, high = t, t + dt
+                for _ in range(60):
+                    mid = 0.5 * (low + high)
+                    low, high = (low, mid) if sign * (level(mid) - target) >= 0 else (mid, high)
+                found.append((high, int(sign > 0)))
+                reference = target
+                t -= dt  # this interval again: there may be more
+                break
+        t += dt
+    return found
+
+
+def test_the_profile_and_its_inverse() -> None:
+    for level in np.linspace(0.01, 2.07, 50):
+        assert level_at(rim_of(level, 2.08, 0.8), 2.08, 0.8) == pytest.approx(level, rel=1e-12)
+    assert level_at(0.0, 2.08, 0.8) == pytest.approx(1.04)
+    assert level_at(4.0, 2.08, 0.8) == 0.0
+    assert level_at(-4.0, 2.08, 0.8) == 2.08
+    assert rim_of(0.0, 2.08, 0.8) == 4.0
+    assert rim_of(2.08, 2.08, 0.8) == -4.0
+    assert rim_of(-0.01, 2.08, 0.8) > 1e5
+    assert rim_of(2.09, 2.08, 0.8) < -1e5
+
+
+@pytest.mark.parametrize("v", [(37.0, 0.0), (0.0, -21.0), (13.0, 29.0), (-2.0, 0.7)])
+def test_a_disc_that_moves_straight_fires_at_the_closed_form_times(v: tuple[float, float]) -> None:
+    optics = EventOptics(**QUIET)
+    steps = 500
+    t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), straight(optics, v, steps))
+    assert np.all(np.diff(t_ns) >= 0)
+    pixels = sorted(set(zip(x.tolist(), y.tolist(), strict=True)))
+    total = 0
+    for px, py in pixels[:: max(len(pixels) // 40, 1)]:
+        here = (x == px) & (y == py)
+        expected = expected_crossings(optics, px, py, v, steps * 1e-3)
+        assert p[here].tolist() == [sign for _, sign in expected]
+        assert t_ns[here] == pytest.approx([t * 1e9 for t, _ in expected], abs=1000)
+        total += len(expected)
+    assert total > 40
+
+
+def test_a_growing_disc_fires_where_its_rim_is() -> None:
+    optics = EventOptics(**QUIET)
+    grown = np.linspace(0.0, 3.0, 301)
+    loads = loads_for(np.zeros((301, 2)), optics, grown)
+    t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), loads)
+    assert len(t_ns) > 1000
+    assert np.all(p == 1)
+    away = np.hypot(x - 319.5, y - 239.5) - 16.8 - t_ns * 1e-9 * 10.0
+    level = np.array([level_at(d, optics.contrast, optics.edge_px) for d in away])
+    start = np.array([
+        level_at(d, optics.contrast, optics.edge_px)
+        for d in np.hypot(x - 319.5, y - 239.5) - 16.8
+    ])  # fmt: skip
+    share = (level - start) / optics.threshold
+    assert np.abs(share - np.rint(share)).max() < 1e-4
+
+
+def test_standing_still_makes_no_signal() -> None:
+    optics = EventOptics(**QUIET)
+    loads = loads_for(np.full((200, 2), 3.3), optics)
+    assert len(sense(MarkerSensor(optics, ONE, 1), loads)[0]) == 0
+
+
+def test_a_threshold_above_the_contrast_makes_no_signal() -> None:
+    optics = EventOptics(threshold=2.1, contrast=2.08, **{**QUIET, "threshold_sigma": 0.0})
+    assert len(sense(MarkerSensor(optics, ONE, 1), straight(optics, (40, 10), 500))[0]) == 0
+
+
+def test_a_pixel_tangent_to_the_rim_has_both_crossings_or_none() -> None:
+    # the rim of one threshold passes above a pixel's row at exactly its distance
+    optics = EventOptics(**QUIET)
+    rim = rim_of(optics.threshold, optics.contrast, optics.edge_px)
+    for offset in (-1e-9, 0.0, 1e-9, 1e-4):
+        above = 0.5 * (optics.height - 1) - 100 - (16.8 + rim) + offset
+        path = np.column_stack([
+            np.linspace(-60, 60, 241), np.full(241, above - 0.5 * (optics.height - 1)),
+        ])  # fmt: skip
+        t_ns, x, y, p = sense(MarkerSensor(optics, ONE, 1), loads_for(path, optics))
+        here = (y == round(above + 16.8 + rim)) & (x == 320)
+        assert sorted(p[here].tolist()) in ([], [0, 1])
+        assert np.all((t_ns >= 0) & (t_ns <= 240 * STEP_NS))
+
+
+def test_going_there_and_back_leaves_every_pixel_as_it_was() -> None:
+    optics = EventOptics(**QUIET)
+    out = np.linspace(0, 30, 301)[:, None] * np.array([1.0, 0.4])
+    sensor = MarkerSensor(optics, ONE, 1)
+    _, x, y, p = sense(sensor, loads_for(np.vstack([out, out[-2::-1]]), optics))
+    balance = np.zeros((optics.height, optics.width), int)
+    np.add.at(balance, (y, x), np.where(p == 1, 1, -1))
+    # a pixel that began on the edge may have one event outstanding: it needs a whole threshold
+    rows, columns = np.mgrid[: optics.height, : optics.width]
+    away = np.abs(np.hypot(columns - 319.5, rows - 239.5) - 16.8)
+    assert len(p) > 10_000
+    assert np.all(balance[away >= 4.0] == 0)
+    assert np.abs(balance).max() <= 1
+
+
+def winding(optics: EventOptics, layout: np.ndarray, steps: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    kicks = rng.standard_normal((steps + 1, len(layout) * 3)) * 2e-4
+    kicks[: steps // 4] = 0.0
+    loads = np.cumsum(kicks, axis=0)
+    loads[:, 2::3] = np.abs(loads[:, 2::3])
+    return loads
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 100), first=st.integers(0, 70), data=st.data())
+def test_chunks_do_not_matter(seed: int, first: int, data: st.DataObject) -> None:
+    optics = EventOptics(width=160, height=120, noise_hz=1.0)
+    layout = np.array([[-2.5, 0.0], [2.0, 1.0]])
+    loads = winding(optics, layout, 600, seed)
+    sensor = MarkerSensor(optics, layout, 7)
+    whole = sense(sensor, loads, first)
+    sensor.reset(loads[0], 1)
+    # a camera hands over whole blocks of the global grid; the last one may be short
+    ends = [k for k in range(1, 600) if (first + k) % optics.block_steps == 0]
+    cuts = sorted({0, 600, *data.draw(st.sets(st.sampled_from(ends)))})
+    parts = [
+        sensor.sense(loads[a : b + 1], first + a, STEP_NS)
+        for a, b in zip(cuts, cuts[1:], strict=False)
+    ]
+    assert len(whole[0]) > 500
+    for column, pieces in zip(whole, zip(*parts, strict=True), strict=True):
+        assert np.array_equal(column, np.concatenate(pieces))
+    assert [column.dtype for column in whole] == [np.int64, np.uint16, np.uint16, np.uint8]
+
+
+def test_the_refractory_period_is_kept() -> None:
+    optics = EventOptics(noise_hz=0.0, refractory_us=500.0)
+    t_ns, x, y, _ = sense(MarkerSensor(optics, ONE, 1), straight(optics, (2000.0, 0.0), 40))
+    pixel = y.astype(np.int64) * optics.width + x
+    order = np.lexsort((t_ns, pixel))
+    gaps = np.diff(t_ns[order])[np.diff(pixel[order]) == 0]
+    assert len(gaps) > 100
+    assert gaps.min() >= 499_999
+
+
+def test_noise_has_its_rate_and_belongs_to_its_seed() -> None:
+    optics = EventOptics(noise_hz=0.1)
+    sensor = MarkerSensor(optics, ONE, 1)
+    loads = np.zeros((3001, 3))
+    t_ns, x, _, p = sense(sensor, loads, seed=4)
+    mean = 0.1 * 640 * 480 * 3
+    assert len(t_ns) == pytest.approx(mean, abs=5 * math.sqrt(mean))
+    assert p.mean() == pytest.approx(0.75, abs=0.01)
+    assert x.mean() == pytest.approx(319.5, abs=5)
+    assert np.all(np.diff(t_ns) >= 0)
+    again, other = sense(sensor, loads, seed=4), sense(sensor, loads, seed=5)
+    assert np.array_equal(t_ns, again[0])
+    assert not np.array_equal(t_ns[:100], other[0][:100])
+
+
+def test_chord_error_of_event_times_is_of_second_order() -> None:
+    times = []
+    fine = EventOptics(**QUIET, chord_px=1e-9, block_steps=1)
+    t = np.arange(129)
+    arc = 20 * np.column_stack([np.sin(t / 60), 1 - np.cos(t / 60)])
+    for block in (1, 4, 8):
+        optics = EventOptics(**QUIET, chord_px=1e3, block_steps=block)
+        t_ns, x, y, p = sense(MarkerSensor(fine, ONE, 1), loads_for(arc, fine))
+        u_ns, u, v, q = sense(MarkerSensor(optics, ONE, 1), loads_for(arc, optics))
+        keep = {key: k for k, key in enumerate(_keys(x, y, p))}
+        pairs = [(keep[key], k) for k, key in enumerate(_keys(u, v, q)) if key in keep]
+        error = [abs(int(t_ns[a]) - int(u_ns[b])) for a, b in pairs]
+        times.append(float(np.median(error)))
+    assert times[0] == 0.0
+    assert times[2] / times[1] == pytest.approx(4.0, rel=0.4)
+
+
+def _keys(x: np.ndarray, y: np.ndarray, p: np.ndarray) -> list[tuple[int, ...]]:
+    seen: dict[tuple[int, ...], int] = {}
+    keys = []
+    for pixel in zip(x.tolist(), y.tolist(), p.tolist(), strict=True):
+        seen[pixel] = seen.get(pixel, 0) + 1
+        keys.append((*pixel, seen[pixel]))
+    return keys

@@ -1,0 +1,86 @@
+"""The HDF5 file of a trial gives back what was put in, in the layout that others read."""
+
+from pathlib import Path
+
+import h5py
+import hdf5plugin  # noqa: F401  (registers the filters)
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.hdf5 import StreamFile, StreamReader
+from storage.streams import EventChunk
+from tests.storage.trials import events
+
+
+def write(path: Path, whole: EventChunk, pieces: int) -> None:
+    """Write events in pieces of equal size."""
+    file = StreamFile(path)
+    for rows in np.array_split(np.arange(len(whole)), pieces):
+        file.add_events(EventChunk(whole.x[rows], whole.y[rows], whole.p[rows], whole.t_us[rows]))
+    file.finish()
+
+
+@pytest.mark.parametrize("count", [0, 1, 65_535, 65_536, 65_537, 200_000])
+def test_events_come_back_however_they_were_chunked(count: int, tmp_path: Path) -> None:
+    whole = events(count)
+    for pieces in (1, 7):
+        write(tmp_path / f"{pieces}.h5", whole, pieces)
+        with StreamReader(tmp_path / f"{pieces}.h5") as reader:
+            found = reader.events()
+        for name in ("x", "y", "p", "t_us"):
+            assert np.array_equal(getattr(found, name), getattr(whole, name))
+
+
+def test_the_same_data_are_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.h5", "b.h5"):
+        write(tmp_path / name, events(70_000), 5)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_the_layout_is_that_of_dsec(tmp_path: Path) -> None:
+    whole = events(5000)
+    write(tmp_path / "t.h5", whole, 3)
+    with h5py.File(tmp_path / "t.h5") as file:
+        times = file["events/t"][:]
+        assert np.array_equal(times + file["t_offset"][()], whole.t_us)
+        marks = file["ms_to_idx"][:]
+        for ms, index in enumerate(marks):
+            assert index == np.searchsorted(times, ms * 1000)
+        assert file["events/t"].attrs["unit"].startswith("us")
+
+
+@given(st.integers(-50_000, 300_000), st.integers(-50_000, 300_000))
+def test_a_window_is_what_a_mask_would_give(start: int, end: int) -> None:
+    whole = events(2000, seed=3)
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "t.h5"
+        write(path, whole, 2)
+        low, high = 5_000_000 + start, 5_000_000 + end
+        with StreamReader(path) as reader:
+            found = reader.events(low, high)
+    mask = (whole.t_us >= low) & (whole.t_us < high)
+    assert np.array_equal(found.t_us, whole.t_us[mask])
+    assert np.array_equal(found.x, whole.x[mask])
+
+
+def test_times_that_run_backwards_are_refused(tmp_path: Path) -> None:
+    file = StreamFile(tmp_path / "t.h5")
+    file.add_events(events(10))
+    with pytest.raises(ValueError, match="backwards"):
+        file.add_events(events(10))
+    file.abandon()
+
+
+def test_times_near_two_to_the_62_stay_apart(tmp_path: Path) -> None:
+    start = 2**62 // 1000
+    whole = EventChunk(
+        np.zeros(3, np.uint16), np.zeros(3, np.uint16), np.zeros(3, np.uint8),
+        np.array([start, start + 1, start + 2], np.int64),
+    )
+    write(tmp_path / "t.h5", whole, 1)
+    with StreamReader(tmp_path / "t.h5") as reader:
+        assert np.array_equal(reader.events().t_us, whole.t_us)
