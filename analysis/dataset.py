@@ -90,8 +90,13 @@ def trial_samples(
     """
     start, end = recorded_span(recording)
     chosen = choose_windows(
-        start, end, label["incipient_ns"], label["gross_ns"], windows.length_ms * 1_000_000,
-        samples.per_class, seed,
+        start,
+        end,
+        label["incipient_ns"],
+        label["gross_ns"],
+        windows.length_ms * 1_000_000,
+        samples.per_class,
+        seed,
     )
     starts = np.concatenate([chosen[key] for key in sorted(chosen)])
     classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])

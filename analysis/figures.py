@@ -21,7 +21,12 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
-    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666",
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#666666",
 )
 CLASS_COLOURS = (BLUE, ORANGE, RED)
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
@@ -53,8 +58,14 @@ def _svg(figure: Any, simulated: bool) -> str:
 
 
 def collected_grid(
-    rows: Sequence[object], columns: Sequence[object], counts: Array, planned: Array,
-    row_name: str, column_name: str, *, simulated: bool,
+    rows: Sequence[object],
+    columns: Sequence[object],
+    counts: Array,
+    planned: Array,
+    row_name: str,
+    column_name: str,
+    *,
+    simulated: bool,
 ) -> str:
     """Collected of planned trials for each pair of levels, counts of shape (rows, columns)."""
     with plt.rc_context(_STYLE):
@@ -73,8 +84,15 @@ def collected_grid(
 
 
 def trial_overview(
-    frame_s: Array, displacement_px: Array, event_s: Array, event_cell: Array, onsets_s: Sequence[
-        float | None], motion_s: float, threshold_px: float, *, simulated: bool,
+    frame_s: Array,
+    displacement_px: Array,
+    event_s: Array,
+    event_cell: Array,
+    onsets_s: Sequence[float | None],
+    motion_s: float,
+    threshold_px: float,
+    *,
+    simulated: bool,
 ) -> str:
     """Marker displacements, event rate and event raster of one trial over time.
 
@@ -128,7 +146,12 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
         for (i, j), value in np.ndenumerate(matrix):
             axes.text(
-                j, i, f"{100 * share[i, j]:.1f} %\n{value}", ha="center", va="center", fontsize=8,
+                j,
+                i,
+                f"{100 * share[i, j]:.1f} %\n{value}",
+                ha="center",
+                va="center",
+                fontsize=8,
                 color="white" if share[i, j] > 0.6 else "black",
             )
         axes.set_xticks(range(4), [*CLASS_WORDS, "undecided"])
@@ -141,8 +164,13 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
 
 
 def outputs(
-    end_s: Array, counts: Array, smoothed: Array, onsets_s: Sequence[float | None],
-    detected_s: Sequence[float | None], *, simulated: bool,
+    end_s: Array,
+    counts: Array,
+    smoothed: Array,
+    onsets_s: Sequence[float | None],
+    detected_s: Sequence[float | None],
+    *,
+    simulated: bool,
 ) -> str:
     """Raw and smoothed output spikes of consecutive windows of one trial, with both onsets.
 
@@ -152,7 +180,8 @@ def outputs(
     with plt.rc_context(_STYLE):
         figure, axes = plt.subplots(2, 1, figsize=(7.6, 4.2), sharex=True, sharey=True)
         for panel, values, name in (
-            (axes[0], counts, "raw"), (axes[1], smoothed, "smoothed"),
+            (axes[0], counts, "raw"),
+            (axes[1], smoothed, "smoothed"),
         ):
             for index, colour in enumerate(CLASS_COLOURS):
                 panel.plot(end_s, values[:, index], color=colour, lw=0.9, label=CLASS_WORDS[index])
@@ -172,7 +201,11 @@ def outputs(
 
 
 def distributions(
-    groups: Mapping[str, Sequence[float]], label: str, *, simulated: bool, zero: str = "",
+    groups: Mapping[str, Sequence[float]],
+    label: str,
+    *,
+    simulated: bool,
+    zero: str = "",
 ) -> str:
     """Every value of each group as a dot, the median as a bar."""
     with plt.rc_context(_STYLE):
@@ -208,7 +241,10 @@ def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simu
         right.plot(epochs, [row["train_argmax"] for row in history], color=BLUE)
         right.plot(epochs, [row["val_argmax"] for row in history], color=ORANGE)
         right.plot(
-            epochs, [row["val_strict"] for row in history], color=ORANGE, ls=":",
+            epochs,
+            [row["val_strict"] for row in history],
+            color=ORANGE,
+            ls=":",
             label="validation, strict",
         )
         right.set_ylabel("accuracy (share)")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.plate import track_video
 from analysis.onsets import Onsets, displacements, paper_onsets
+from analysis.plate import track_video
 from protocols.settings import Labelling
 from storage.recording import Recording
 

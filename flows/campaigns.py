@@ -67,7 +67,10 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     for name in names or ():
         if name not in campaigns:
             raise InputError(
-                "--campaign", "", name, f"is not in {store.folder}; there are {', '.join(campaigns)}"
+                "--campaign",
+                "",
+                name,
+                f"is not in {store.folder}; there are {', '.join(campaigns)}",
             )
     return [Collected(campaigns[name]) for name in (names or campaigns)]
 
@@ -85,7 +88,9 @@ def training_campaigns(campaigns: list[Collected]) -> list[Collected]:
     for other in found[1:]:
         if other.settings.windows != found[0].settings.windows:
             raise InputError(
-                other.campaign.protocol_file, "analysis.windows", None,
+                other.campaign.protocol_file,
+                "analysis.windows",
+                None,
                 f"differ from those of campaign '{found[0].name}'; name one with --campaign",
             )
     return found

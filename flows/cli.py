@@ -38,6 +38,10 @@ CampaignOption = Annotated[
 ]
 
 
+FULL = ("kinematic", "gravity", "disturbance")
+PILOT = ("pilot", "pilot_gravity")
+
+
 def package_file(package: str, name: str) -> Path:
     """A file that ships with a package."""
     module = __import__(package)
@@ -66,9 +70,14 @@ def plan(
     if as_json:
         rows = [
             {
-                "index": trial.index, "id": trial.id, "role": trial.role, "block": trial.block,
-                "repetition": trial.repetition, "condition": found.describe(trial),
-                "split": trial.split, "seconds": found.seconds(trial),
+                "index": trial.index,
+                "id": trial.id,
+                "role": trial.role,
+                "block": trial.block,
+                "repetition": trial.repetition,
+                "condition": found.describe(trial),
+                "split": trial.split,
+                "seconds": found.seconds(trial),
                 "before": [
                     {"kind": task.kind, "by_person": task.by_person, "prompt": task.prompt}
                     for task in found.tasks_before(trial)
@@ -78,9 +87,13 @@ def plan(
         ]
         console.print_json(
             {
-                "protocol": found.protocol.name, "trials": rows, "count": len(found),
-                "seconds": found.total_seconds, "bytes": needed,
-                "stretches": found.stretches(), "warnings": found.warnings(),
+                "protocol": found.protocol.name,
+                "trials": rows,
+                "count": len(found),
+                "seconds": found.total_seconds,
+                "bytes": needed,
+                "stretches": found.stretches(),
+                "warnings": found.warnings(),
             }
         )
         return
@@ -93,9 +106,15 @@ def plan(
             for task in found.tasks_before(trial)
         )
         table.append(
-            [trial.index, trial.block, *(known[name] for name in factors), trial.repetition,
-             trial.split if trial.role == "measured" else trial.role,
-             f"{found.seconds(trial):.1f}", before]
+            [
+                trial.index,
+                trial.block,
+                *(known[name] for name in factors),
+                trial.repetition,
+                trial.split if trial.role == "measured" else trial.role,
+                f"{found.seconds(trial):.1f}",
+                before,
+            ]
         )
     columns = ["#", "block", *factors, "repetition", "split", "motion (s)", "before it"]
     console.print_table(f"{protocol}: {found.protocol.title}", columns, table, limit=40)
@@ -123,7 +142,6 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Look at everything that can be known before anything moves."""
-    _prepare(store)
     from flows import preflight
 
     found = preflight.check(protocol, rig, store, tuple(enable or ()))
@@ -150,16 +168,22 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    _prepare(store)
-    from flows.collect import collect as run
-    from flows.collect import make_order
+    from flows.orders import make_order
 
     order = make_order(
-        protocol, rig, store, enable=tuple(enable or ()), campaign=campaign, operator=operator,
+        protocol,
+        rig,
+        store,
+        enable=tuple(enable or ()),
+        campaign=campaign,
+        operator=operator,
         note=note,
     )
     for warning in order.plan.warnings():
         console.say(f"note: {warning}")
+    _prepare(store)
+    from flows.collect import collect as run
+
     result = run(order)
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
@@ -217,10 +241,7 @@ def study(
     as_json: JsonOption = False,
 ) -> None:
     """Run the whole chain: collect, label, train, evaluate, report."""
-    _prepare(folder)
-    from flows import study as chain
-
-    names = chain.PILOT if pilot else chain.FULL
+    names = PILOT if pilot else FULL
     protocols = [package_file("protocols", f"{name}.yaml") for name in names]
     _chain(folder, protocols, rig, as_json)
 
@@ -231,10 +252,7 @@ def demo(
     as_json: JsonOption = False,
 ) -> None:
     """Run the pilot study on the simulated rig and say where the report is."""
-    _prepare(folder)
-    from flows import study as chain
-
-    protocols = [package_file("protocols", f"{name}.yaml") for name in chain.PILOT]
+    protocols = [package_file("protocols", f"{name}.yaml") for name in PILOT]
     _chain(folder, protocols, package_file("rigs", "mock.yaml"), as_json)
 
 
@@ -310,15 +328,15 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and value != value else value
 
 
-def _prepare(store: Path) -> None:
+def _prepare(folder: Path) -> None:
+    """Make the store and point Prefect at it; everything that imports Prefect comes after."""
     from flows.orchestration import prepare
+    from storage.store import Store
 
-    prepare(store)
+    prepare(Store.create(folder).folder)
 
 
-def _step(
-    folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any
-) -> None:
+def _step(folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
     """Run one analysis step on a store."""
     from importlib import import_module
 
@@ -338,17 +356,23 @@ def _step(
 
 def _chain(folder: Path, protocols: list[Path], rig: Path, as_json: bool) -> None:
     """Run the whole chain and print what came out."""
-    from flows import study as chain
+    from flows.orders import make_order
+
+    orders = [make_order(protocol, rig, folder) for protocol in protocols]
+    _prepare(folder)
     from flows.report import read_summary
+    from flows.study import study as run
     from storage.store import Store
 
-    outcome = chain.study(chain.make_orders(folder, protocols, rig))
+    outcome = run(orders)
     summary = read_summary(Store.open(folder))
     page = folder / "report" / "index.html"
     if as_json:
         console.print_json(
             {
-                "report": str(page), "collected": outcome.collected, "steps": outcome.steps,
+                "report": str(page),
+                "collected": outcome.collected,
+                "steps": outcome.steps,
                 "summary": summary,
             }
         )

@@ -48,7 +48,9 @@ def check_space(folder: Path, needed: float) -> int:
     free = shutil.disk_usage(there).free
     if needed + RESERVE > free:
         raise InputError(
-            "--store", "", str(folder),
+            "--store",
+            "",
+            str(folder),
             f"the plan needs {needed / 1e9:.1f} GB and {RESERVE / 1e9:.1f} GB in reserve, the disk "
             f"has {free / 1e9:.1f} GB free; make room or choose another folder",
         )

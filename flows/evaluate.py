@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.utilities.annotations import quote
 
 from analysis import dataset, metrics, training
 from analysis.baselines import evaluate_baselines
@@ -19,6 +18,7 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
+from flows.orchestration import Parcel
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
 from protocols import Trial
@@ -93,15 +93,19 @@ def make_job(
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
     return Job(
-        store, campaigns, model, detection, trials,
+        store,
+        campaigns,
+        model,
+        detection,
+        trials,
         make_key(STEP, VERSION, [model.key, inputs], used),
     )
 
 
 @task(name="spike counts", cache_policy=NO_CACHE, persist_result=False)
-def count_spikes(wanted: Any) -> int:
+def count_spikes(wanted: Parcel[Job]) -> int:
     """Run the network over all consecutive windows of every trial that needs it."""
-    job: Job = wanted.unquote()
+    job = wanted.content
     windows = training_settings(job.campaigns).windows
     work = [
         (item, trial, recording, key)
@@ -120,17 +124,18 @@ def count_spikes(wanted: Any) -> int:
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(wanted: Any) -> None:
+def score(wanted: Parcel[Job]) -> None:
     """Windows, detections and label errors, kept as one result."""
-    job: Job = wanted.unquote()
+    job = wanted.content
+    rows = _score_trials(job)
     result = {
         "seed": job.model.seed,
         "windows": _score_windows(job),
-        "trials": _score_trials(job),
+        "trials": rows,
+        "experiments": _summaries(rows),
         "label_error_ms": _label_errors(job),
         "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
     }
-    result["experiments"] = _summaries(result["trials"])
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 
 
@@ -178,7 +183,9 @@ def _score_trials(job: Job) -> list[dict[str, Any]]:
         if label["incipient_ns"] is not None and label["gross_ns"] is not None:
             row["latency"] = asdict(
                 score_trial(
-                    detections, label["incipient_ns"], label["gross_ns"],
+                    detections,
+                    label["incipient_ns"],
+                    label["gross_ns"],
                     round(settings.false_early_ms * 1e6),
                 )
             )
@@ -233,12 +240,12 @@ def _label_errors(job: Job) -> dict[str, Any]:
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
-def evaluate_flow(wanted: Any) -> None:
+def evaluate_flow(wanted: Parcel[Job]) -> None:
     """Count spikes where needed, then score."""
-    job: Job = wanted.unquote()
+    job = wanted.content
     with timed(job.store, "evaluate"):
-        count_spikes(quote(job))
-        score(quote(job))
+        count_spikes(Parcel(job))
+        score(Parcel(job))
 
 
 def evaluate(
@@ -252,5 +259,5 @@ def evaluate(
     job = make_job(store, campaigns, margin, smoothing)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
-        evaluate_flow(quote(job))
+        evaluate_flow(Parcel(job))
     return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}

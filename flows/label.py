@@ -10,11 +10,11 @@ from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.utilities.annotations import quote
 
 from analysis import labelling
 from flows import console
 from flows.campaigns import Collected
+from flows.orchestration import Parcel
 from flows.timing import timed
 from protocols.settings import Labelling
 from storage.derived import Derived, make_key
@@ -24,15 +24,17 @@ from storage.store import Store
 STEP = "labels"
 CHUNK = 64
 
+Work = tuple[Path, str, str, Labelling]
+"""Recording's folder, campaign, key, settings."""
+Chunk = tuple[Store, list[Work], ProcessPoolExecutor, console.Bar]
+
 
 def label_key(recording: Recording, settings: Labelling) -> str:
     """The key of a trial's label."""
-    return make_key(
-        STEP, labelling.VERSION, recording.checksum, settings.model_dump(mode="json")
-    )
+    return make_key(STEP, labelling.VERSION, recording.checksum, settings.model_dump(mode="json"))
 
 
-def stale_labels(store: Store, campaigns: list[Collected]) -> list[tuple[Path, str, str, Labelling]]:
+def stale_labels(store: Store, campaigns: list[Collected]) -> list[Work]:
     """(recording folder, campaign, key, settings) of every label that has to be made."""
     work = []
     for item in campaigns:
@@ -51,9 +53,9 @@ def _label_one(folder: Path, settings: Labelling) -> tuple[dict[str, Any], dict[
 
 
 @task(name="label trials", cache_policy=NO_CACHE, persist_result=False)
-def label_chunk(chunk: Any) -> int:
+def label_chunk(chunk: Parcel[Chunk]) -> int:
     """Label some trials on all cores; each is kept as soon as it is there."""
-    store, work, pool, bar = chunk.unquote()
+    store, work, pool, bar = chunk.content
     futures = {pool.submit(_label_one, item[0], item[3]): item for item in work}
     for future in as_completed(futures):
         folder, campaign, key, _ = futures[future]
@@ -64,9 +66,9 @@ def label_chunk(chunk: Any) -> int:
 
 
 @flow(name="label", validate_parameters=False, persist_result=False)
-def label_flow(wanted: Any) -> int:
+def label_flow(wanted: Parcel[tuple[Store, list[Work]]]) -> int:
     """Label what is stale, in core-sized chunks."""
-    store, work = wanted.unquote()
+    store, work = wanted.content
     workers = max(1, min(len(work), os.cpu_count() or 1))
     with (
         timed(store, "label"),
@@ -75,7 +77,7 @@ def label_flow(wanted: Any) -> int:
     ):
         try:
             for start in range(0, len(work), CHUNK):
-                label_chunk(quote((store, work[start : start + CHUNK], pool, bar)))
+                label_chunk(Parcel((store, work[start : start + CHUNK], pool, bar)))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -87,5 +89,5 @@ def label(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     total = sum(len(item.trials) for item in campaigns)
     work = stale_labels(store, campaigns)
     if work:
-        label_flow(quote((store, work)))
+        label_flow(Parcel((store, work)))
     return {"step": "label", "done": len(work), "fresh": total - len(work)}

@@ -8,6 +8,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Parcel(Generic[T]):
+    """Carries any object into a flow or task without Prefect validating, walking or storing it."""
+
+    def __init__(self, content: T) -> None:
+        self.content = content
+
 
 _DEFAULTS = {
     "DO_NOT_TRACK": "1",
@@ -22,8 +33,9 @@ _DEFAULTS = {
 
 
 def prepare(store: Path) -> None:
-    """Point Prefect at the store's own home, unless the user has set one."""
-    home = store.resolve() / "prefect"
+    """Point Prefect at the store's own home, unless the user has set one; the store must exist."""
+    home = store.resolve() / ".prefect"
+    home.mkdir(exist_ok=True)
     os.environ.setdefault("PREFECT_HOME", str(home))
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)

@@ -8,10 +8,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from flows.collect import Order, make_order, pending_trials
 from flows.console import size
 from flows.estimate import check_space, plan_bytes
+from flows.orders import Order, make_order, pending_trials
 from protocols import InputError
+from storage.store import Store
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,14 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         InputError: protocol or rig file cannot be used at all.
     """
     order = make_order(protocol, rig, store, enable=enable)
+    pending = pending_trials(order.plan, Store(store).campaign(order.campaign))
     found = [
         Check("protocol and limits", True, f"{len(order.plan)} trials within all limits"),
-        Check("campaign", True, f"{pending_trials(order)} of {len(order.plan)} still to take"),
+        Check("campaign", True, f"{len(pending)} of {len(order.plan)} still to take"),
     ]
     found += [Check("hint", True, text) for text in order.plan.warnings()]
-    needed = plan_bytes(order.rig, order.plan)
+    done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
+    needed = plan_bytes(order.rig, order.plan, done)
     try:
         free = check_space(store, needed)
         found.append(Check("space", True, f"needs {size(needed)}, {size(free)} free"))

@@ -73,7 +73,9 @@ def assess(folder: Path, run: TrialRun, gates: Gates, rate_hz: int, video: bool)
     if video:
         lost = _frames_lost(frame_numbers, run, rate_hz)
         results["frames_lost"] = {
-            "value": lost, "limit": gates.frames_lost, "passed": lost <= gates.frames_lost
+            "value": lost,
+            "limit": gates.frames_lost,
+            "passed": lost <= gates.frames_lost,
         }
     gap = _event_gap(event_us, clocks, run)
     gap_limit = float(gates.event_gap)

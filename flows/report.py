@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from prefect.utilities.annotations import quote
 
 from analysis import report as page
 from analysis import training
 from flows import evaluate, sections, timing
 from flows.campaigns import Collected
+from flows.orchestration import Parcel
 from flows.summary import make_summary
 from flows.train import wanted_models
 from storage.derived import Derived, make_key
@@ -37,17 +37,21 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
     if evaluated is None:
         raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
     collected = [
-        [item.name, item.plan.collection_hash, len(item.campaign.quarantined()),
-         [recording.checksum for _, recording in item.trials]]
+        [
+            item.name,
+            item.plan.collection_hash,
+            len(item.campaign.quarantined()),
+            [recording.checksum for _, recording in item.trials],
+        ]
         for item in campaigns
     ]
     return make_key(STEP, VERSION, [evaluated, collected], None)
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)
-def report_flow(wanted: Any) -> None:
+def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
     """Write page and summary; the summary last, with the key."""
-    store, campaigns, key = wanted.unquote()
+    store, campaigns, key = wanted.content
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
     with timing.timed(store, "report"):
@@ -70,11 +74,12 @@ def report_flow(wanted: Any) -> None:
 def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     """Write the report if anything it shows has changed."""
     key = _key(store, campaigns)
-    stale = not Derived.of(store, STEP).fresh(STEP, key) or not (
-        report_folder(store) / "index.html"
-    ).exists()
+    stale = (
+        not Derived.of(store, STEP).fresh(STEP, key)
+        or not (report_folder(store) / "index.html").exists()
+    )
     if stale:
-        report_flow(quote((store, campaigns, key)))
+        report_flow(Parcel((store, campaigns, key)))
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
 
 

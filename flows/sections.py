@@ -29,16 +29,28 @@ def headline(summary: dict[str, Any]) -> list[Number]:
     latency = summary["kinematic"]["latency_ms"]["incipient"]
     lead = summary["gravity"]["lead_ms"]
     return [
-        Number("trials committed", str(summary["quality"]["committed"]),
-               f"of {summary['quality']['planned']} planned"),
+        Number(
+            "trials committed",
+            str(summary["quality"]["committed"]),
+            f"of {summary['quality']['planned']} planned",
+        ),
         Number("window accuracy", percent(accuracy["strict"]), f"strict, n = {accuracy['n']}"),
-        Number("incipient latency", number(latency["median"], 0, "ms"),
-               f"median of {latency['n']}; {latency['missed']} missed, "
-               f"{latency['false_early']} false early"),
-        Number("gravity lead", number(lead["median"], 0, "ms"),
-               f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}"),
-        Number("clock uncertainty", number(summary["sync"]["worst_uncertainty_us"], 1, "µs"),
-               f"worst trial, {summary['sync']['grade']}"),
+        Number(
+            "incipient latency",
+            number(latency["median"], 0, "ms"),
+            f"median of {latency['n']}; {latency['missed']} missed, "
+            f"{latency['false_early']} false early",
+        ),
+        Number(
+            "gravity lead",
+            number(lead["median"], 0, "ms"),
+            f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}",
+        ),
+        Number(
+            "clock uncertainty",
+            number(summary["sync"]["worst_uncertainty_us"], 1, "µs"),
+            f"worst trial, {summary['sync']['grade']}",
+        ),
     ]
 
 
@@ -52,7 +64,7 @@ def make_sections(
     """All sections, in order."""
     simulated = bool(summary["simulated"])
     example = _example(campaigns, evaluation)
-    found = [_collected(campaigns, summary, simulated)]
+    found: list[Section | None] = [_collected(campaigns, summary, simulated)]
     if example is not None:
         found.append(_one_trial(store, *example, simulated))
     found += [
@@ -66,9 +78,7 @@ def make_sections(
     return [section for section in found if section is not None]
 
 
-def _collected(
-    campaigns: list[Collected], summary: dict[str, Any], simulated: bool
-) -> Section:
+def _collected(campaigns: list[Collected], summary: dict[str, Any], simulated: bool) -> Section:
     pictures = []
     for item in campaigns:
         factors = item.plan.protocol.collection.factors
@@ -97,7 +107,7 @@ def _collected(
         pictures.append(
             Figure(
                 figures.collected_grid(
-                    *levels, counts, planned, *axes, simulated=simulated
+                    levels[0], levels[1], counts, planned, axes[0], axes[1], simulated=simulated
                 ),
                 f"Campaign {item.name}: trials committed of trials planned, by {names[0]} and "
                 f"{names[1]}; the other factors and repetitions are counted together.",
@@ -108,15 +118,26 @@ def _collected(
         known = summary["planned"][item.name]
         rows.append(
             [
-                item.name, item.experiment, str(len(item.plan)), str(len(item.trials)),
-                number(known["seconds"] / 60, 2), number(known["seconds_collected"] / 60, 2),
-                number(known["bytes"] / 1e6, 1), number(known["bytes_collected"] / 1e6, 1),
+                item.name,
+                item.experiment,
+                str(len(item.plan)),
+                str(len(item.trials)),
+                number(known["seconds"] / 60, 2),
+                number(known["seconds_collected"] / 60, 2),
+                number(known["bytes"] / 1e6, 1),
+                number(known["bytes_collected"] / 1e6, 1),
             ]
         )
     quality = summary["quality"]
     columns = [
-        "campaign", "experiment", "planned", "committed", "planned (min)", "taken (min)",
-        "planned (MB)", "taken (MB)",
+        "campaign",
+        "experiment",
+        "planned",
+        "committed",
+        "planned (min)",
+        "taken (min)",
+        "planned (MB)",
+        "taken (MB)",
     ]
     return Section(
         "What was collected",
@@ -203,8 +224,12 @@ def _network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Sec
     accuracy = windows["accuracy"]
     beside = windows["baselines"]
     rows = [
-        ["spiking network", percent(accuracy["argmax"]), percent(accuracy["strict"]),
-         percent(accuracy["margin"])],
+        [
+            "spiking network",
+            percent(accuracy["argmax"]),
+            percent(accuracy["strict"]),
+            percent(accuracy["margin"]),
+        ],
         ["logistic regression on the event count", percent(beside["logistic"]), "", ""],
         ["event-rate threshold", percent(beside["rate_threshold"]), "", ""],
         ["majority class", percent(beside["majority"]), "", ""],
@@ -213,9 +238,7 @@ def _network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Sec
         [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
         for name, word in zip(windows["precision"], figures.CLASS_WORDS, strict=True)
     ]
-    trials = [
-        row["argmax"] for row in windows["by_trial"].values() if row["argmax"] is not None
-    ]
+    trials = [row["argmax"] for row in windows["by_trial"].values() if row["argmax"] is not None]
     return Section(
         "The network on windows of 30 ms" if fitted.windows.length_ms == 30 else "The network",
         [
@@ -234,7 +257,8 @@ def _network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Sec
             ),
             Figure(
                 figures.training_curves(
-                    [vars(record) for record in fitted.history], fitted.chosen_epoch,
+                    [vars(record) for record in fitted.history],
+                    fitted.chosen_epoch,
                     simulated=simulated,
                 ),
                 "Training; the dashed line is the epoch with the best strict validation accuracy, "
@@ -311,9 +335,7 @@ def _latency(evaluation: dict[str, Any], summary: dict[str, Any], simulated: boo
     )
 
 
-def _lead(
-    evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool
-) -> Section | None:
+def _lead(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -> Section | None:
     experiments = [name for name in ("gravity", "disturbance") if summary[name]["trials"]]
     if not experiments:
         return None
@@ -346,7 +368,11 @@ def _lead(
                 "Each dot is a trial, by configuration; the bar is the median.",
             )
         ],
-        [Table(["experiment", *_names(), "detected first"], table, "Milliseconds; n counts trials.")],
+        [
+            Table(
+                ["experiment", *_names(), "detected first"], table, "Milliseconds; n counts trials."
+            )
+        ],
     )
 
 
@@ -363,8 +389,13 @@ def _labels(summary: dict[str, Any]) -> Section | None:
     if not errors["incipient"]["n"]:
         return None
     rows = [
-        [f"{kind} onset", str(values["n"]), number(values["median"], 2),
-         number(values["median_abs"], 2), number(values["max_abs"], 2)]
+        [
+            f"{kind} onset",
+            str(values["n"]),
+            number(values["median"], 2),
+            number(values["median_abs"], 2),
+            number(values["max_abs"], 2),
+        ]
         for kind, values in errors.items()
     ]
     return Section(
@@ -376,7 +407,8 @@ def _labels(summary: dict[str, Any]) -> Section | None:
         (),
         [
             Table(
-                ["label", "trials", "median (ms)", "median distance (ms)", "largest (ms)"], rows,
+                ["label", "trials", "median (ms)", "median distance (ms)", "largest (ms)"],
+                rows,
                 "Label minus simulation truth; one frame is 10 ms.",
             )
         ],

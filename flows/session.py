@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import Any
 
 from flows.quality import Assessment, assess
 from protocols import Plan, Task, Trial
@@ -45,17 +44,9 @@ class Session:
     on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
     taken: int = 0
     retaken: int = 0
-    set_aside: list[str] = field(default_factory=list)
     _before: Trial | None = None
     _warm: bool = False
     _zero_slot: int | None = None
-
-    def pending(self) -> list[Trial]:
-        """Trials that are neither committed nor set aside, in the plan's order."""
-        done = self.campaign.committed()
-        failed = self.campaign.failed_attempts()
-        retakes = self.plan.protocol.collection.gates.retakes
-        return [t for t in self.plan if t.id not in done and failed.get(t.id, 0) <= retakes]
 
     def take(self, trials: list[Trial]) -> None:
         """Take `trials`, with what has to be done before each."""
@@ -78,7 +69,9 @@ class Session:
         if upkeep.warm_up is not None and not self._warm:
             warm_up = upkeep.warm_up
             self.rig.press(
-                float(warm_up.depth), float(warm_up.speed), float(warm_up.clearance),
+                float(warm_up.depth),
+                float(warm_up.speed),
+                float(warm_up.clearance),
                 warm_up.presses,
             )
             self._warm = True
@@ -105,18 +98,26 @@ class Session:
         attempt = self.campaign.failed_attempts().get(trial.id, 0)
         while True:
             writer = self.campaign.begin(
-                trial.id, frame_px, collection.recording.sync_rate,
+                trial.id,
+                frame_px,
+                collection.recording.sync_rate,
                 spool=self.rig_file.frame_camera.spool,
             )
             started = datetime.now(UTC)
             try:
                 run = self.rig.run_trial(
-                    self.plan.program(trial), writer, hash_integer(trial.seed, attempt), frame_px,
+                    self.plan.program(trial),
+                    writer,
+                    hash_integer(trial.seed, attempt),
+                    frame_px,
                     collection.recording.sync_rate,
                 )
                 folder = writer.seal()
                 found = assess(
-                    folder, run, collection.gates, collection.recording.sync_rate,
+                    folder,
+                    run,
+                    collection.gates,
+                    collection.recording.sync_rate,
                     frame_px is not None,
                 )
             except BaseException as error:
@@ -133,7 +134,6 @@ class Session:
             self._reject(trial, attempt, writer, found, provenance, run, frame_px)
             attempt += 1
             if attempt > collection.gates.retakes:
-                self.set_aside.append(trial.id)
                 self.on_trial(trial, "set aside")
                 return
             self.retaken += 1
@@ -224,19 +224,3 @@ def _cause(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "stopped by a person"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-
-
-def summary(session: Session) -> dict[str, Any]:
-    """What the campaign holds now: planned = committed + missing."""
-    committed = session.campaign.committed() & {trial.id for trial in session.plan}
-    return {
-        "campaign": session.campaign.name,
-        "planned": len(session.plan),
-        "committed": len(committed),
-        "taken": session.taken,
-        "retaken": session.retaken,
-        "quarantined": len(session.campaign.quarantined()),
-        "set_aside": sorted(session.set_aside),
-        "missing": len(session.plan) - len(committed),
-        "simulated": session.rig_file.simulated,
-    }

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from flows import console
 from flows.campaigns import collected
-from flows.collect import Order, collect, make_order
+from flows.collect import collect
 from flows.evaluate import evaluate
 from flows.label import label
+from flows.orders import Order
 from flows.report import report
 from flows.train import train
 from storage.store import Store
-
-FULL = ("kinematic", "gravity", "disturbance")
-PILOT = ("pilot", "pilot_gravity")
 
 
 @dataclass(frozen=True)
@@ -25,11 +22,6 @@ class Outcome:
 
     collected: list[dict[str, Any]]
     steps: list[dict[str, Any]]
-
-
-def make_orders(folder: Path, protocols: list[Path], rig: Path) -> list[Order]:
-    """Check every protocol before the first one moves anything."""
-    return [make_order(protocol, rig, folder) for protocol in protocols]
 
 
 def study(orders: list[Order]) -> Outcome:

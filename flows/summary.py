@@ -12,7 +12,15 @@ from rigs.rig_file import load_rig_file
 from storage.store import Store
 
 _PACKAGES = (
-    "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
+    "sliplab",
+    "numpy",
+    "numba",
+    "scipy",
+    "torch",
+    "sinabs",
+    "prefect",
+    "pandas",
+    "h5py",
     "opencv-contrib-python-headless",
 )
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.utilities.annotations import quote
 
 from analysis import dataset, training
 from analysis.dataset import SampleSet
@@ -16,6 +15,7 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
+from flows.orchestration import Parcel
 from flows.timing import timed
 from protocols.hashing import hash_integer
 from protocols.settings import AnalysisSettings
@@ -77,8 +77,9 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
     models = []
     for seed in settings.training.seeds:
-        key = make_key("train", VERSION, inputs, {**parameters, "seed": seed,
-                                                  "dataset": dataset.VERSION})
+        key = make_key(
+            "train", VERSION, inputs, {**parameters, "seed": seed, "dataset": dataset.VERSION}
+        )
         models.append(Model(seed, store.folder / "models" / f"seed{seed}.pt", key))
     return models
 
@@ -94,22 +95,32 @@ def load_samples(store: Store, campaigns: list[Collected], split: str) -> Sample
             seed = hash_integer("samples", trial.id)
             parts.append(
                 dataset.trial_samples(
-                    recording, labels.read(trial.id), trial.index, windows,
-                    item.settings.samples, seed,
+                    recording,
+                    labels.read(trial.id),
+                    trial.index,
+                    windows,
+                    item.settings.samples,
+                    seed,
                 )
             )
     return SampleSet.join(parts, windows)
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Any) -> int:
+def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]]) -> int:
     """Train one network and keep it."""
-    model, train, validation, settings = job.unquote()
+    model, train, validation, settings = job.content
     total = settings.training.epochs
     with console.bar(f"train seed {model.seed} (epochs)", total) as bar:
         fitted = training.fit(
-            train.x, train.y, validation.x, validation.y, settings.network, settings.windows,
-            settings.training, model.seed,
+            train.x,
+            train.y,
+            validation.x,
+            validation.y,
+            settings.network,
+            settings.windows,
+            settings.training,
+            model.seed,
             on_epoch=lambda record: bar.advance(
                 1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict"
             ),
@@ -135,9 +146,9 @@ def train_one(job: Any) -> int:
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)
-def train_flow(wanted: Any) -> int:
+def train_flow(wanted: Parcel[tuple[Store, list[Collected], list[Model]]]) -> int:
     """Train the seeds that are stale, one after the other."""
-    store, campaigns, models = wanted.unquote()
+    store, campaigns, models = wanted.content
     settings = training_settings(campaigns)
     with timed(store, "train"):
         train = load_samples(store, campaigns, "train")
@@ -146,7 +157,7 @@ def train_flow(wanted: Any) -> int:
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
         for model in models:
-            train_one(quote((model, train, validation, settings)))
+            train_one(Parcel((model, train, validation, settings)))
     return len(models)
 
 
@@ -155,5 +166,5 @@ def train(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     models = wanted_models(store, campaigns)
     stale = [model for model in models if not model.fresh]
     if stale:
-        train_flow(quote((store, campaigns, stale)))
+        train_flow(Parcel((store, campaigns, stale)))
     return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}

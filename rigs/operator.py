@@ -21,8 +21,12 @@ class ConsoleOperator:
                 "operator", f"'{prompt}' needs a person, and there is no terminal to ask on"
             )
         while True:
-            print(f"\n{task}: {prompt}\nType '{expected}' when it is done, or 'stop': ", end="",
-                  file=sys.stderr, flush=True)
+            print(
+                f"\n{task}: {prompt}\nType '{expected}' when it is done, or 'stop': ",
+                end="",
+                file=sys.stderr,
+                flush=True,
+            )
             answer = sys.stdin.readline()
             if not answer or answer.strip() == "stop":
                 return False

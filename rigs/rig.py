@@ -201,8 +201,9 @@ class Rig:
                 middle = depth - speed_mm_s * 0.025  # of those 50 ms
                 return middle - self.touch_mm
         raise RigError(
-            "arm", f"touching off met nothing within {search_mm:g} mm of the taught plane; "
-            "teach the contact plane again"
+            "arm",
+            f"touching off met nothing within {search_mm:g} mm of the taught plane; "
+            "teach the contact plane again",
         )
 
     def _central_events(self) -> int:
@@ -319,4 +320,3 @@ def advice(state: ArmState) -> str:
         ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm on the pendant",
         ArmState.DISCONNECTED: "check power and network of the arm's controller",
     }.get(state, "run the same command again")
-

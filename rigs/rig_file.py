@@ -171,7 +171,9 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
             ):
                 if value > limit + 1e-9:
                     raise InputError(
-                        file, f"limits.{what}", f"{limit:g} {unit}",
+                        file,
+                        f"limits.{what}",
+                        f"{limit:g} {unit}",
                         f"trial {trial.id} of {plan.file} needs {value:g} {unit} "
                         f"in its phase '{step.phase}'",
                     )

@@ -59,7 +59,11 @@ class StreamFile:
         for name, (dtype, shape, unit) in COLUMNS.items():
             rows = EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
             data = self._file.create_dataset(
-                name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(rows, *shape),
+                name,
+                (0, *shape),
+                dtype,
+                maxshape=(None, *shape),
+                chunks=(rows, *shape),
                 **hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
             )
             data.attrs["unit"] = unit
@@ -92,9 +96,7 @@ class StreamFile:
         if not len(chunk):
             return
         first, last = int(chunk.t_us[0]), int(chunk.t_us[-1])
-        if (self._last_us is not None and first < self._last_us) or np.any(
-            np.diff(chunk.t_us) < 0
-        ):
+        if (self._last_us is not None and first < self._last_us) or np.any(np.diff(chunk.t_us) < 0):
             raise ValueError(f"event times run backwards at {first} us")
         if self._offset is None:
             self._offset = first
@@ -157,7 +159,10 @@ class StreamReader:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
     ) -> None:
         self._file.close()
 

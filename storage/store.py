@@ -99,9 +99,7 @@ class Campaign:
         aside = self.folder / "incoming" / safe_name(trial_id)
         if aside.exists():
             self.quarantine(aside, "interrupted")
-        return TrialWriter(
-            aside, self.folder / "trials" / trial_id, frame_px, rate_hz, spool=spool
-        )
+        return TrialWriter(aside, self.folder / "trials" / trial_id, frame_px, rate_hz, spool=spool)
 
     def sweep(self) -> int:
         """Quarantine what a killed program left aside; returns how many folders."""

@@ -85,13 +85,17 @@ def _contents(folder: Path) -> list[Problem]:
             if np.any(np.diff(reader.column(name)) < 0):
                 problems.append(Problem(str(folder / DATA), f"{name} runs backwards"))
     found = {
-        "events": counts["events/t"], "frames": counts["frames/t"], "poses": counts["poses/t"],
+        "events": counts["events/t"],
+        "frames": counts["frames/t"],
+        "poses": counts["poses/t"],
         "pulses": counts["sync_pulses/t"],
     }
     for name, count in found.items():
         if count != record["counts"][name]:
             problems.append(
-                Problem(str(folder / DATA), f"{count} {name}, the record says {record['counts'][name]}")
+                Problem(
+                    str(folder / DATA), f"{count} {name}, the record says {record['counts'][name]}"
+                )
             )
     if recording.has_video and count_frames(folder / FRAMES) != found["frames"]:
         problems.append(Problem(str(folder / FRAMES), f"does not hold {found['frames']} frames"))

@@ -103,9 +103,11 @@ class TrialWriter:
 
     def _encode_spool(self, spool: Path, frame_px: tuple[int, int]) -> None:
         width, height = frame_px
-        frames = np.memmap(spool, np.uint8, "r").reshape(-1, height, width) if (
-            spool.stat().st_size
-        ) else np.empty((0, height, width), np.uint8)
+        frames = (
+            np.memmap(spool, np.uint8, "r").reshape(-1, height, width)
+            if (spool.stat().st_size)
+            else np.empty((0, height, width), np.uint8)
+        )
         self._video = VideoWriter(self.folder / FRAMES, width, height, self._rate_hz)
         for start in range(0, len(frames), 64):
             self._video.write(frames[start : start + 64])

@@ -9,7 +9,7 @@ from rigs.capabilities import RigError
 from rigs.mock.clocks import Jitter
 from rigs.mock.history import History
 from rigs.mock.settings import MockSettings
-from rigs.mock.sync import MockSyncBox, SyncInput
+from rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from rigs.mock.world import World
 from rigs.scene.events import EventOptics, MarkerSensor
 from rigs.scene.frames import FrameOptics, PlateView
@@ -81,7 +81,7 @@ class MockEventCamera:
         t_ns = self._input.edges_ns()
         if not self._running and self._until_ns == 0:
             return PulseChunk(np.empty(0, np.int64))
-        kept = (t_ns >= self._begun_ns) & (t_ns <= self._until_ns)
+        kept = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
         for begin, end in self._world.faults.gaps_ns(self._world.recording_ns):
             kept &= (t_ns < begin) | (t_ns >= end)
         stamp = self._world.clocks.event_camera.to_reference(t_ns[kept])

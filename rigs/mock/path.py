@@ -17,7 +17,7 @@ I64 = npt.NDArray[np.int64]
 TURN_DEG_PER_S = 30.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Leg:
     """One straight move; `state` vectors are xyz, rotation vector, then the sensor's five."""
 

@@ -86,10 +86,10 @@ class Plate(StrictModel):
     gravity_m_s2: Positive = 9.81
     marker_id: Annotated[int, Field(ge=0, le=49)] = 0
     """Identity in OpenCV's DICT_4X4_50."""
-    marker_side_mm: Positive = 7.5
+    marker_side_mm: Positive = 6.6
     """Side of the black square; the white quiet zone of one module comes on top."""
-    marker_centre_mm: tuple[Finite, Finite] = (16.0, 16.0)
-    """In plate coordinates; clear of the skin and inside a region of 43 mm."""
+    marker_centre_mm: tuple[Finite, Finite] = (15.8, 15.8)
+    """In plate coordinates; clear of the skin and inside a region of 42 mm."""
 
 
 class Contact(StrictModel):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rigs.capabilities import RigError
 from rigs.mock.world import World
 from storage.clockmap import ClockMap
 
@@ -32,11 +33,16 @@ def truth_of(
         centre's; `first_slip_ns` and `slip_per_papilla_ns`, when tips physically began to slide;
         `reference_ns`; `threshold_mm`; and `simulated`, which is true. Between steps of the
         scene's grid the displacement is taken as linear.
+
+    Raises:
+        RigError: the reference is older than the history that is kept (minutes).
     """
     world.advance()
     n = len(world.skin)
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
-    first = max(reference_true_ns // world.step_ns, world.track.base)
+    first = reference_true_ns // world.step_ns
+    if first < world.track.base:
+        raise RigError("simulation", "the trial is too long: its beginning is forgotten")
     rows = world.track.rows(first, world.track.end)
     share = min(max(reference_true_ns / world.step_ns - first, 0.0), 1.0)
     start = rows[0] + share * (rows[min(1, len(rows) - 1)] - rows[0])

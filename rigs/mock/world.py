@@ -42,8 +42,8 @@ I64 = npt.NDArray[np.int64]
 CLEARANCE_MM = 60.0
 MOST_TURNED_DEG = 20.0
 NEAR_MM = 5.0
-TRACK_LIMIT_STEPS = 600_000
-"""Steps of history kept at most; a trial is a few tens of thousands."""
+TRACK_LIMIT_STEPS = 300_000
+"""Steps of history kept at least, twice as many at most; a trial is a few tens of thousands."""
 _CHUNK = 8192
 
 

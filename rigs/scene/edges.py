@@ -116,9 +116,55 @@ def _root(dx, dy, vx, vy, rim, growth, low, high, falling):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True)
+def _fire(  # type: ignore[no-untyped-def]
+    x, y, start, vx, vy, growth, t0, dt, contrast, edge, refractory, threshold,
+    on, off, last, level, fired, out_t, out_x, out_y, out_p, n,
+):  # fmt: skip
+    """Events of one pixel while a disc goes straight by; returns how many there are in all."""
+    dx, dy, r0 = x - start[0], y - start[1], start[2]
+    ex, ey = dx - vx, dy - vy
+    speed = np.hypot(vx, vy)
+    along, distance1 = dx * vx + dy * vy, np.hypot(ex, ey)
+    # the time at which the pixel is deepest in the disc
+    turn = 1.0
+    if -along - growth * np.hypot(dx, dy) >= 0.0:
+        turn = 0.0
+    elif -(ex * vx + ey * vy) - growth * distance1 > 0.0 and speed > abs(growth):
+        ratio = growth / speed
+        aside = abs(dx * vy - dy * vx) / speed
+        past = aside * ratio / np.sqrt(1.0 - ratio * ratio)
+        turn = min(max((past + along / speed) / speed, 0.0), 1.0)
+    deepest = np.hypot(dx - turn * vx, dy - turn * vy) - r0 - turn * growth
+    step = threshold[y, x]
+    at = 0.0
+    while on[y, x] >= deepest:
+        at = _root(dx, dy, vx, vy, r0 + on[y, x], growth, at, turn, True)
+        level[y, x] += step
+        off[y, x], last[y, x] = last[y, x], on[y, x]
+        on[y, x] = rim_of(level[y, x] + step, contrast, edge)
+        when = t0 + at * dt
+        if when - fired[y, x] >= refractory:
+            fired[y, x] = when
+            out_t[n], out_x[n], out_y[n], out_p[n] = np.int64(when), x, y, 1
+            n += 1
+    at = turn
+    while off[y, x] <= distance1 - r0 - growth:
+        at = _root(dx, dy, vx, vy, r0 + off[y, x], growth, at, 1.0, False)
+        level[y, x] -= step
+        on[y, x], last[y, x] = last[y, x], off[y, x]
+        off[y, x] = rim_of(level[y, x] - step, contrast, edge)
+        when = t0 + at * dt
+        if when - fired[y, x] >= refractory:
+            fired[y, x] = when
+            out_t[n], out_x[n], out_y[n], out_p[n] = np.int64(when), x, y, 0
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
 def _visit(  # type: ignore[no-untyped-def]
     start, end, t0, dt, contrast, edge, refractory, threshold, on, off, last, level, fired,
-    out_t, out_x, out_y, out_p, n,
+    may, out_t, out_x, out_y, out_p, n,
 ):  # fmt: skip
     """Events of one disc that goes straight from `start` to `end` (column, row, radius)."""
     height, width = threshold.shape
@@ -137,67 +183,35 @@ def _visit(  # type: ignore[no-untyped-def]
         hole = np.sqrt(max(inner * inner - across * across, 0.0))
         left = max(int(np.ceil(mid_x - wide)), 0)
         right = min(int(np.floor(mid_x + wide)), width - 1)
-        hole_left = int(np.floor(mid_x - hole))
-        hole_right = int(np.ceil(mid_x + hole))
+        hole_left, hole_right = int(np.floor(mid_x - hole)), int(np.ceil(mid_x + hole))
+        whole = hole_right - hole_left < 8
         dy = y - cy
         ey = dy - vy
-        next_on, next_off = on[y], off[y]
-        x = left - 1
-        while x < right:
-            x += 1
-            if hole > 0.0 and hole_left < x < hole_right:
-                x = hole_right
-                if x > right:
-                    break
-            dx = x - cx
-            ex = dx - vx
-            square0, square1 = dx * dx + dy * dy, ex * ex + ey * ey
-            near, far = r0 + next_on[x] + bend, r0 + next_off[x]
-            near0, near1 = max(near, 0.0), max(near + growth, 0.0)
-            far0, far1 = far, far + growth
-            if (
-                square0 > near0 * near0 and square1 > near1 * near1
-                and square0 < far0 * far0 and square1 < far1 * far1
-            ):  # fmt: skip
+        dy2, ey2 = dy * dy, ey * ey
+        for part in range(1 if whole else 2):
+            first = left if part == 0 else max(hole_right, left)
+            past = right + 1 if whole or part == 1 else min(hole_left, right) + 1
+            if first >= past:
                 continue
-            # the time at which the pixel is deepest in the disc
-            turn = 1.0
-            slope0 = -(dx * vx + dy * vy) - growth * np.sqrt(square0)
-            slope1 = -(ex * vx + ey * vy) - growth * np.sqrt(square1)
-            if slope0 >= 0.0:
-                turn = 0.0
-            elif slope1 > 0.0 and speed > abs(growth):
-                ratio = growth / speed
-                aside = abs(dx * vy - dy * vx) / speed
-                past = aside * ratio / np.sqrt(1.0 - ratio * ratio)
-                turn = min(max((past + (dx * vx + dy * vy) / speed) / speed, 0.0), 1.0)
-            tx, ty = dx - turn * vx, dy - turn * vy
-            deepest = np.sqrt(tx * tx + ty * ty) - r0 - turn * growth
-            at = 0.0
-            while on[y, x] >= deepest:
-                at = _root(dx, dy, vx, vy, r0 + on[y, x], growth, at, turn, True)
-                level[y, x] += threshold[y, x]
-                off[y, x] = last[y, x]
-                last[y, x] = on[y, x]
-                on[y, x] = rim_of(level[y, x] + threshold[y, x], contrast, edge)
-                when = t0 + at * dt
-                if when - fired[y, x] >= refractory:
-                    fired[y, x] = when
-                    out_t[n], out_x[n], out_y[n], out_p[n] = np.int64(when), x, y, 1
-                    n += 1
-            leaves = np.sqrt(square1) - r0 - growth
-            at = turn
-            while off[y, x] <= leaves:
-                at = _root(dx, dy, vx, vy, r0 + off[y, x], growth, at, 1.0, False)
-                level[y, x] -= threshold[y, x]
-                on[y, x] = last[y, x]
-                last[y, x] = off[y, x]
-                off[y, x] = rim_of(level[y, x] - threshold[y, x], contrast, edge)
-                when = t0 + at * dt
-                if when - fired[y, x] >= refractory:
-                    fired[y, x] = when
-                    out_t[n], out_x[n], out_y[n], out_p[n] = np.int64(when), x, y, 0
-                    n += 1
+            next_on, next_off = on[y, first:past], off[y, first:past]
+            offset = first - cx
+            # which pixels may fire at all: without branches, so that it runs on whole vectors
+            for k in range(past - first):
+                dx = offset + k
+                ex = dx - vx
+                square0, square1 = dx * dx + dy2, ex * ex + ey2
+                near, far0 = next_on[k] + (r0 + bend), next_off[k] + r0
+                near0, near1, far1 = max(near, 0.0), max(near + growth, 0.0), far0 + growth
+                may[k] = (
+                    (square0 <= near0 * near0) | (square1 <= near1 * near1)
+                    | (square0 >= far0 * far0) | (square1 >= far1 * far1)
+                )  # fmt: skip
+            for k in range(past - first):
+                if may[k]:
+                    n = _fire(
+                        first + k, y, start, vx, vy, growth, t0, dt, contrast, edge, refractory,
+                        threshold, on, off, last, level, fired, out_t, out_x, out_y, out_p, n,
+                    )  # fmt: skip
     return n
 
 
@@ -237,6 +251,7 @@ def trace(  # type: ignore[no-untyped-def]
     out_p = np.empty(capacity, np.uint8)
     n, noise_at, rows = 0, 0, path.shape[0] - 1
     stack = np.empty((64, 2), np.int64)
+    may = np.empty(threshold.shape[1], np.bool_)
     begin = 0
     while begin < rows:
         stop = min(begin + block - (first_step + begin) % block, rows)
@@ -267,7 +282,7 @@ def trace(  # type: ignore[no-untyped-def]
                 n = _visit(
                     path[a, i], path[b, i], float((first_step + a) * step_ns),
                     float((b - a) * step_ns), contrast, edge, refractory, threshold,
-                    on, off, last, level, fired, out_t, out_x, out_y, out_p, n,
+                    on, off, last, level, fired, may, out_t, out_x, out_y, out_p, n,
                 )  # fmt: skip
         end_ns = (first_step + stop) * step_ns
         noise_to = noise_at

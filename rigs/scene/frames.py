@@ -38,8 +38,8 @@ class FrameOptics:
     ground_level: int = 25
     noise: float = 1.5
     marker_id: int = 0
-    marker_side_mm: float = 7.5
-    marker_centre_mm: tuple[float, float] = (16.0, 16.0)
+    marker_side_mm: float = 6.6
+    marker_centre_mm: tuple[float, float] = (15.8, 15.8)
 
 
 class PlateView:
@@ -153,15 +153,34 @@ def add_noise(image, noise, frame_key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _covered(dx, dy, radius):  # type: ignore[no-untyped-def]
+    """Share of a unit pixel at (dx, dy) >= 0 from a disc's centre that lies inside the disc.
+
+    The rim is taken as straight within the pixel; a distance alone would shift centroids by
+    several thousandths of a pixel.
+    """
+    away = np.sqrt(dx * dx + dy * dy)
+    inside = radius - away
+    low, high = min(dx, dy) / away, max(dx, dy) / away
+    corner = 0.5 * (low + high) - abs(inside)
+    if corner <= 0.0:
+        return 1.0 if inside > 0.0 else 0.0
+    if abs(inside) <= 0.5 * (high - low):
+        return 0.5 + inside / high
+    cut = corner * corner / (2.0 * low * high)
+    return 1.0 - cut if inside > 0.0 else cut
+
+
+@njit(cache=True, nogil=True)
 def draw_discs(image, centres, radius, ground, level, margin, dark, bright, frame_key):  # type: ignore[no-untyped-def]
     """Discs with anti-aliased rims and noise in squares round them, on an even ground.
 
     `dark` and `bright` are the noise tile on the ground's level and on the discs', so that most
-    pixels are copied. A rim pixel's share of the disc is taken from its distance to the rim.
+    pixels are copied.
     """
     height, width = image.shape
     image[:] = ground
-    reach, outer, inner = radius + margin, radius + 0.5, radius - 0.5
+    reach, outer, inner = radius + margin, radius + 0.75, radius - 0.75
     for i in range(centres.shape[0]):
         cx, cy = centres[i, 0], centres[i, 1]
         down, along = _shift(frame_key, i + 1)
@@ -192,6 +211,6 @@ def draw_discs(image, centres, radius, ground, level, margin, dark, bright, fram
                 begin = first if side == 0 else max(flat_to + 1, flat_from, first)
                 end = min(flat_from, last + 1) if side == 0 else last + 1
                 for x in range(begin, end):
-                    share = min(outer - np.sqrt((x - cx) * (x - cx) + across), 1.0)
+                    share = _covered(abs(x - cx), abs(y - cy), radius)
                     noise = np.int64(dark[y + down, x + along]) - ground
                     image[y, x] = int(ground + share * (level - ground) + 0.5) + noise

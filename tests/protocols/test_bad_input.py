@@ -33,101 +33,141 @@ def _drop(*path: Any) -> Change:
 COLLECTION = "collection"
 CASES: dict[str, tuple[Change, str, str]] = {
     "unknown key": (
-        _set(COLLECTION, "repetition", to=2), "collection.repetition", "did you mean 'repetitions'"
+        _set(COLLECTION, "repetition", to=2),
+        "collection.repetition",
+        "did you mean 'repetitions'",
     ),
     "unknown key in a phase": (
         _set(COLLECTION, "motion", 1, "sped", to="1 mm/s"),
-        "collection.motion[1].sped", "did you mean 'speed'",
+        "collection.motion[1].sped",
+        "did you mean 'speed'",
     ),
     "unknown phase": (
         _set(COLLECTION, "motion", 1, "phase", to="jump"),
-        "collection.motion[1].phase", "approach",
+        "collection.motion[1].phase",
+        "approach",
     ),
     "wrong unit": (
-        _set(COLLECTION, "motion", 1, "speed", to="2 kg"), "collection.motion[1].speed", "mm/s"
+        _set(COLLECTION, "motion", 1, "speed", to="2 kg"),
+        "collection.motion[1].speed",
+        "mm/s",
     ),
     "no unit": (
         _set(COLLECTION, "motion", 3, "distance", to=12),
-        "collection.motion[3].distance", "has no unit",
+        "collection.motion[3].distance",
+        "has no unit",
     ),
     "factor unit": (
         _set(COLLECTION, "factors", "depth", "unit", to="furlong"),
-        "collection.factors.depth.unit", "must be one of",
+        "collection.factors.depth.unit",
+        "must be one of",
     ),
     "NaN": (
         _set(COLLECTION, "factors", "depth", "values", to=[float("nan")]),
-        "collection.factors.depth.values[0]", "finite",
+        "collection.factors.depth.values[0]",
+        "finite",
     ),
     "infinity": (
         _set(COLLECTION, "factors", "depth", "values", to=[2.4, float("inf")]),
-        "collection.factors.depth.values[1]", "finite",
+        "collection.factors.depth.values[1]",
+        "finite",
     ),
     "negative speed": (
         _set(COLLECTION, "factors", "speed", "values", to=[0.6, -1.0]),
-        "collection.factors.speed.values[1]", "more than 0",
+        "collection.factors.speed.values[1]",
+        "more than 0",
     ),
     "negative speed in a phase": (
         _set(COLLECTION, "motion", 1, "speed", to="-2 mm/s"),
-        "collection.motion[1].speed", "more than 0",
+        "collection.motion[1].speed",
+        "more than 0",
     ),
     "depth over the limit": (
         _set(COLLECTION, "factors", "depth", "values", to=[2.4, 3.7]),
-        "collection.factors.depth.values[1]", "over collection.limits.depth = 3.6 mm",
+        "collection.factors.depth.values[1]",
+        "over collection.limits.depth = 3.6 mm",
     ),
     "slide leaves the workspace": (
         _set(COLLECTION, "motion", 3, "distance", to="21 mm"),
-        "collection.motion[3].distance", "outside collection.limits.workspace.x",
+        "collection.motion[3].distance",
+        "outside collection.limits.workspace.x",
     ),
     "empty factor": (
         _set(COLLECTION, "factors", "depth", "values", to=[]),
-        "collection.factors.depth", "at least one",
+        "collection.factors.depth",
+        "at least one",
     ),
     "no factors": (_set(COLLECTION, "factors", to={}), "collection.factors", "at least one"),
     "duplicate level": (
         _set(COLLECTION, "factors", "depth", "values", to=[2.4, 2.40]),
-        "collection.factors.depth", "2.4 twice",
+        "collection.factors.depth",
+        "2.4 twice",
     ),
     "list and range": (
         _set(COLLECTION, "factors", "depth", "range", to={"from": 1, "to": 2, "step": 1}),
-        "collection.factors.depth", "either 'values' or 'range'",
+        "collection.factors.depth",
+        "either 'values' or 'range'",
     ),
     "range that misses its end": (
-        _set(COLLECTION, "factors", "depth",
-             to={"unit": "mm", "range": {"from": 2.4, "to": 3.4, "step": 0.3}}),
-        "collection.factors.depth.range", "whole number of steps",
+        _set(
+            COLLECTION,
+            "factors",
+            "depth",
+            to={"unit": "mm", "range": {"from": 2.4, "to": 3.4, "step": 0.3}},
+        ),
+        "collection.factors.depth.range",
+        "whole number of steps",
     ),
     "endless range": (
-        _set(COLLECTION, "factors", "depth",
-             to={"unit": "mm", "range": {"from": 0.000001, "to": 3.0, "step": 0.000001}}),
-        "collection.factors.depth.range", "1,000,000",
+        _set(
+            COLLECTION,
+            "factors",
+            "depth",
+            to={"unit": "mm", "range": {"from": 0.000001, "to": 3.0, "step": 0.000001}},
+        ),
+        "collection.factors.depth.range",
+        "1,000,000",
     ),
     "too many trials": (
-        _set(COLLECTION, "repetitions", to=50_000), "collection.factors", "more than 1,000,000"
+        _set(COLLECTION, "repetitions", to=50_000),
+        "collection.factors",
+        "more than 1,000,000",
     ),
     "missing section": (_drop(COLLECTION, "limits"), "collection.limits", "is missing"),
     "reference to nothing": (
-        _set(COLLECTION, "motion", 1, "depth", to="$deep"), "collection.motion", "not there"
+        _set(COLLECTION, "motion", 1, "depth", to="$deep"),
+        "collection.motion",
+        "not there",
     ),
     "unused factor": (
         _set(COLLECTION, "factors", "extra", to={"values": ["a"]}),
-        "collection.factors.extra", "used by no phase",
+        "collection.factors.extra",
+        "used by no phase",
     ),
     "no hold": (_drop(COLLECTION, "motion", 2), "collection.motion", "hold still"),
     "too long": (
         _set(COLLECTION, "limits", "duration", to="10 s"),
-        "collection.limits.duration", "raise the limit",
+        "collection.limits.duration",
+        "raise the limit",
     ),
     "word as a number": (
         _set(COLLECTION, "factors", "direction", to={"values": ["left"]}),
-        "collection.factors.direction.values[0]", "number in deg",
+        "collection.factors.direction.values[0]",
+        "number in deg",
     ),
     "held-out level that is none": (
-        _set("analysis", "split",
-             to={"method": "leave_conditions_out", "test_levels": {"depth": ["9 mm"]}}),
-        "analysis.split.test_levels.depth", "is no level",
+        _set(
+            "analysis",
+            "split",
+            to={"method": "leave_conditions_out", "test_levels": {"depth": ["9 mm"]}},
+        ),
+        "analysis.split.test_levels.depth",
+        "is no level",
     ),
     "shares that do not add up": (
-        _set("analysis", "split", "train", to=0.9), "analysis.split", "add up to 1"
+        _set("analysis", "split", "train", to=0.9),
+        "analysis.split",
+        "add up to 1",
     ),
     "name that leads out of the store": (_set("name", to="../x"), "name", "pattern"),
 }

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import Counter
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_a_plan_is_the_product_in_balanced_blocks(data: dict[str, Any]) -> None:
         assert len({t.repetition for t in block}) == 1
         for name in outer:
             assert len({dict(t.condition)[name] for t in block}) == 1
-    swaps = sum(len(plan.changeovers(a, b)) for a, b in zip(plan.trials, plan.trials[1:]))
+    swaps = sum(len(plan.changeovers(a, b)) for a, b in pairwise(plan.trials))
     assert swaps == (len(factors[outer[0]]["values"]) - 1 if outer else 0)
 
 
@@ -101,8 +102,13 @@ def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
         "print(json.dumps([[t.id, t.split, t.seed] for t in p]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": hash_seed},
-        capture_output=True, text=True, check=True, timeout=60,
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONHASHSEED": hash_seed},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     here = load_plan(ROOT / "protocols" / "kinematic.yaml")
     assert json.loads(done.stdout) == [[t.id, t.split, t.seed] for t in here]
@@ -110,8 +116,13 @@ def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("kinematic", 864), ("gravity", 180), ("disturbance", 80), ("pilot", 36),
-     ("pilot_gravity", 8)],
+    [
+        ("kinematic", 864),
+        ("gravity", 180),
+        ("disturbance", 80),
+        ("pilot", 36),
+        ("pilot_gravity", 8),
+    ],
 )
 def test_shipped_protocols(name: str, count: int) -> None:
     plan = load_plan(ROOT / "protocols" / f"{name}.yaml")
@@ -238,7 +249,11 @@ def test_the_plan_is_read_without_heavy_libraries() -> None:
         "print(sorted(heavy & set(sys.modules)))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True,
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
         timeout=60,
     )
     assert done.stdout.strip() == "[]"

@@ -78,7 +78,9 @@ def test_times_that_run_backwards_are_refused(tmp_path: Path) -> None:
 def test_times_near_two_to_the_62_stay_apart(tmp_path: Path) -> None:
     start = 2**62 // 1000
     whole = EventChunk(
-        np.zeros(3, np.uint16), np.zeros(3, np.uint16), np.zeros(3, np.uint8),
+        np.zeros(3, np.uint16),
+        np.zeros(3, np.uint16),
+        np.zeros(3, np.uint8),
         np.array([start, start + 1, start + 2], np.int64),
     )
     write(tmp_path / "t.h5", whole, 1)

@@ -24,9 +24,7 @@ def test_a_committed_trial_reads_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_the_same_trial_is_the_same_bytes(tmp_path: Path) -> None:
-    sums = [
-        read_json(commit(campaign(tmp_path / name), "t") / "checksums.json") for name in "ab"
-    ]
+    sums = [read_json(commit(campaign(tmp_path / name), "t") / "checksums.json") for name in "ab"]
     assert sums[0] == sums[1]
 
 
@@ -90,7 +88,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut short": (lambda t: (t / "data.h5").write_bytes(b"x"), "has 1 bytes"),
     "file gone": (lambda t: (t / "frames.mkv").unlink(), "is missing"),
     "record changed": (
-        lambda t: write_json(t / "record.json", record("t", block=7)), "does not match"
+        lambda t: write_json(t / "record.json", record("t", block=7)),
+        "does not match",
     ),
     "checksums gone": (lambda t: (t / "checksums.json").unlink(), "cannot be read"),
     "stranger": (lambda t: (t / "notes.txt").write_text("x"), "does not belong here"),
@@ -142,7 +141,7 @@ def test_a_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
     path = tmp_path / ".lock"
     with (
         exclusive(path, "the store"),
-        pytest.raises(Locked, match='the store is in use .*"pid"'),
+        pytest.raises(Locked, match=r'the store is in use .*"pid"'),
         exclusive(path, "the store"),
     ):
         raise AssertionError("two holders")

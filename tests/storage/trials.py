@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,10 @@ def frames(count: int, seed: int = 0) -> FrameChunk:
     times = np.arange(count, dtype=np.int64) * 10_000_000
     return FrameChunk(
         rng.integers(0, 256, (count, FRAME[1], FRAME[0])).astype(np.uint8),
-        np.arange(count, dtype=np.int64), times, times, np.ones(count, np.uint8),
+        np.arange(count, dtype=np.int64),
+        times,
+        times,
+        np.ones(count, np.uint8),
     )
 
 
@@ -41,11 +45,9 @@ def fill(writer: TrialWriter, count: int = 1000, pieces: int = 3) -> None:
     """Write events, pulses, poses and frames in some pieces."""
     whole, pictures = events(count), frames(12)
     edges = np.linspace(0, count, pieces + 1).astype(int)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         rows = slice(low, high)
-        writer.add_events(
-            EventChunk(whole.x[rows], whole.y[rows], whole.p[rows], whole.t_us[rows])
-        )
+        writer.add_events(EventChunk(whole.x[rows], whole.y[rows], whole.p[rows], whole.t_us[rows]))
     times = np.arange(10, dtype=np.int64)
     writer.add_event_pulses(PulseChunk(times))
     writer.add_arm_pulses(PulseChunk(times))
@@ -58,12 +60,20 @@ def record(trial: str, **changes: Any) -> dict[str, Any]:
     """A record that fits what `fill` writes."""
     clock = {"map": IDENTITY, "uncertainty_ns": 1000.0}
     return {
-        "trial": trial, "campaign": "c", "experiment": "kinematic", "role": "measured",
-        "block": 0, "repetition": 1, "attempt": 0, "condition": {"depth": "2.4 mm", "side": "left"},
-        "simulated": True, "recorded_s": 1.0,
+        "trial": trial,
+        "campaign": "c",
+        "experiment": "kinematic",
+        "role": "measured",
+        "block": 0,
+        "repetition": 1,
+        "attempt": 0,
+        "condition": {"depth": "2.4 mm", "side": "left"},
+        "simulated": True,
+        "recorded_s": 1.0,
         "counts": {"events": 1000, "frames": 12, "poses": 10, "pulses": 10},
         "clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock},
-        "quality": {"passed": True, "gates": {}}, **changes,
+        "quality": {"passed": True, "gates": {}},
+        **changes,
     }
 
 

@@ -1,0 +1,120 @@
+"""What was asked for, checked before anything moves: protocol, rig and store belong together.
+
+Nothing here needs Prefect, so a wrong input is answered at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from protocols import InputError, Plan, Trial, load_plan
+from protocols.yaml_file import read_text
+from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash
+from storage.store import Campaign, Store, StoreError
+
+
+@dataclass(frozen=True)
+class Order:
+    """A collection that was asked for and found possible."""
+
+    plan: Plan
+    rig: RigFile
+    rig_text: str
+    store: Path
+    campaign: str
+    enable: tuple[str, ...]
+    operator: str = ""
+    note: str = ""
+
+
+def make_order(
+    protocol: Path,
+    rig: Path,
+    store: Path,
+    *,
+    enable: tuple[str, ...] = (),
+    campaign: str | None = None,
+    operator: str = "",
+    note: str = "",
+) -> Order:
+    """Read and check everything that can be known before anything moves.
+
+    Raises:
+        InputError: protocol, rig, or a plan that this rig or this disk cannot take.
+        StoreError: the folder is no store, or the campaign was begun under another collection.
+    """
+    plan = load_plan(protocol, enable)
+    rig_file, rig_text = load_rig_file(rig)
+    check_plan(rig_file, plan, str(rig))
+    if plan.protocol.collection.plate is not None and not rig_file.has_plate:
+        raise InputError(rig, "mock.plate", None, f"is needed: {protocol} moves a sliding plate")
+    name = campaign or plan.protocol.name
+    order = Order(plan, rig_file, rig_text, store, name, enable, operator, note)
+    if (store / "store.json").exists():
+        found = Store.open(store).campaign(name)
+        if (found.folder / "campaign.json").exists():
+            _check_same(order, found)
+    return order
+
+
+def _check_same(order: Order, campaign: Campaign) -> None:
+    info = campaign.info
+    if info["collection_hash"] != order.plan.collection_hash:
+        raise StoreError(
+            f"{campaign.folder}: was begun under another `collection:` section; changing "
+            "analysis, levels or repetitions is fine, anything else would mix two experiments. "
+            "Give the new one its own name with --campaign"
+        )
+    if info["rig_hash"] != rig_hash(order.rig_text):
+        raise StoreError(
+            f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
+            "give the new one its own name with --campaign"
+        )
+    if missing := campaign.committed() - {trial.id for trial in order.plan}:
+        raise StoreError(
+            f"{campaign.folder}: holds trials that the protocol no longer has, such as "
+            f"{min(missing)}; a protocol may only add trials to a campaign"
+        )
+
+
+def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
+    """Trials that are neither committed nor set aside, in the plan's order."""
+    done = campaign.committed()
+    failed = campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
+
+
+def describe_campaign(store: Store, order: Order) -> Campaign:
+    """Write what the campaign is; the protocol's analysis and levels may have changed."""
+    campaign = store.campaign(order.campaign)
+    info = {
+        "name": order.campaign,
+        "protocol": order.plan.protocol.name,
+        "experiment": order.plan.protocol.collection.experiment,
+        "collection_hash": order.plan.collection_hash,
+        "rig": order.rig.name,
+        "rig_hash": rig_hash(order.rig_text),
+        "simulated": order.rig.simulated,
+        "enabled": list(order.enable),
+    }
+    campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)
+    return campaign
+
+
+def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:
+    """What a campaign holds now: planned = committed + missing."""
+    planned = {trial.id for trial in order.plan}
+    committed = campaign.committed() & planned
+    pending = {trial.id for trial in pending_trials(order.plan, campaign)}
+    return {
+        "campaign": campaign.name,
+        "planned": len(planned),
+        "committed": len(committed),
+        "quarantined": len(campaign.quarantined()),
+        "set_aside": sorted(planned - committed - pending),
+        "missing": len(planned) - len(committed),
+        "simulated": order.rig.simulated,
+    }
