@@ -47,15 +47,22 @@ class Assessment:
         return "; ".join(failed)
 
 
-def assess(folder: Path, run: TrialRun, gates: Gates, rate_hz: int, video: bool) -> Assessment:
-    """Fit the clocks of a sealed trial and hold it against the protocol's gates."""
+def assess(
+    folder: Path, run: TrialRun, gates: Gates, rate_hz: int, mid_exposure_ns: int | None
+) -> Assessment:
+    """Fit the clocks of a sealed trial and hold it against the protocol's gates.
+
+    Args:
+        mid_exposure_ns: from a frame's trigger to its time; None without a video.
+    """
+    video = mid_exposure_ns is not None
     with StreamReader(folder / DATA) as reader:
         counts = reader.counts()
         reference = reader.pulses("sync_pulses")
         trains = {"events": reader.pulses("event_pulses"), "arm": reader.pulses("arm_pulses")}
         frame_times, frame_numbers = reader.column("frames/t"), reader.column("frames/number")
-        if video:
-            trains["frames"] = frame_times[reader.column("frames/sync") > 0]
+        if mid_exposure_ns is not None:
+            trains["frames"] = frame_times[reader.column("frames/sync") > 0] - mid_exposure_ns
         event_us = reader.events().t_us
     clocks: dict[str, Any] = {"reference": "sync box", "grade": GRADE}
     limit = float(gates.sync_uncertainty)

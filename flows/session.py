@@ -118,7 +118,7 @@ class Session:
                     run,
                     collection.gates,
                     collection.recording.sync_rate,
-                    frame_px is not None,
+                    self.rig.frames.mid_exposure_ns if frame_px is not None else None,
                 )
             except BaseException as error:
                 writer.abandon()

@@ -143,7 +143,8 @@ class FrameCamera(Protocol):
     """The camera that looks through the plate."""
 
     px_per_mm: float
-    rate_hz: float
+    mid_exposure_ns: int
+    """From the trigger to the middle of the exposure, which is what a frame's time says."""
 
     def set_region(self, width_px: int, height_px: int) -> None:
         """Read out a centred region only."""

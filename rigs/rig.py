@@ -33,6 +33,8 @@ from rigs.plate_frame import PlateFrame
 from storage.streams import Json, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
+TAIL_S = 0.1
+"""How long cameras are read after the last pulse: they send in blocks."""
 TOUCH_HALF_PX = 30
 """Half the side of the square in which touching off looks for the centre papilla."""
 _MOVE_GRACE_S = 10.0
@@ -106,13 +108,10 @@ class Rig:
             StopRequested: `should_stop` became true; the arm is stopped and clear.
             RigError: anything failed; the arm is stopped.
         """
-        if self.simulation is not None:
-            self.simulation.begin_trial(seed)
         with self._safely(program.home):
             if frame_px is not None:
                 self.frames.set_region(*frame_px)
-            at = self._position()
-            self._move(Move("home", program.home, RETRACT_SPEED_MM_S), at, None)
+            self._home(program.home, seed)
             steps = []
             at, recording, reference = program.home, False, 0
             for index, step in enumerate(program.steps):
@@ -158,12 +157,10 @@ class Rig:
         Raises:
             RigError: nothing was touched within `search_mm`.
         """
-        if self.simulation is not None:
-            self.simulation.begin_trial(seed)
         self.frame = self.frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
         with self._safely(start):
-            self._move(Move("home", start, RETRACT_SPEED_MM_S), self._position(), None)
+            self._home(start, seed)
             self.events.start()
             try:
                 self._wait(0.5)
@@ -262,9 +259,9 @@ class Rig:
         self.sync.start(rate_hz, seed % 65535 + 1)
 
     def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
-        self._drain(sink)
+        """Stop the pulses, and read what the cameras still hold before they stop."""
         self.sync.stop()
-        self._drain(sink)
+        self._wait(TAIL_S, sink)
         self.events.stop()
         if with_frames:
             self.frames.stop()
@@ -276,6 +273,12 @@ class Rig:
         sink.add_arm_pulses(self.arm.read_pulses())
         sink.add_sync_pulses(self.sync.read_pulses())
         sink.add_frames(self.frames.read())
+
+    def _home(self, home: Position, seed: int) -> None:
+        """To where a motion begins; only then is a simulated trial's randomness drawn."""
+        self._move(Move("home", home, RETRACT_SPEED_MM_S), self._position(), None)
+        if self.simulation is not None:
+            self.simulation.begin_trial(seed)
 
     def _position(self) -> Position:
         return self.frame.position(self.arm.pose().xyz_mm)
