@@ -47,9 +47,7 @@ _STYLE = {
 
 def _svg(figure: Any, simulated: bool) -> str:
     if simulated:
-        figure.text(
-            0.995, 0.995, "simulated", ha="right", va="top", fontsize=8, color=GREY, style="italic"
-        )
+        figure.suptitle("simulated", x=0.995, ha="right", fontsize=8, color=GREY, style="italic")
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     plt.close(figure)
@@ -194,7 +192,7 @@ def outputs(
                     panel.axvline(found, color=colour, lw=1.2, ls=":")
         axes[0].plot([], [], color="black", lw=1.4, label="true onset")
         axes[0].plot([], [], color="black", lw=1.2, ls=":", label="detected")
-        axes[0].legend(loc="upper right", ncols=5, fontsize=8, bbox_to_anchor=(1.0, 1.22))
+        axes[0].legend(loc="upper right", ncols=5, fontsize=8, bbox_to_anchor=(1.0, 1.25))
         axes[1].set_xlabel("time since the recording began (s)")
         axes[1].set_xlim(0, float(end_s[-1]) if len(end_s) else 1.0)
         return _svg(figure, simulated)

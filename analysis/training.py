@@ -3,8 +3,8 @@
 Surrogate gradients through the fused neurons of `analysis.iaf`, cross-entropy on output spike
 counts, Adam. Two traps of spiking networks are dealt with here: a layer that never fires passes
 for a network that says "no slip" (it is named in the warnings), and a result that cannot be
-repeated (everything random comes from one seed, and at a fixed number of torch threads the same
-call gives the same bits).
+repeated (everything random comes from one seed, and the same call gives the same bits on any
+number of threads).
 """
 
 from __future__ import annotations
@@ -123,7 +123,10 @@ def fit(
     that is right. Argmax would give a silent network something for its ties, and a detection
     needs a winner. Equal epochs are told apart by argmax accuracy (ties shared), then by the lower
     validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
-    ``training.patience`` epochs in a row were no better.
+    ``training.patience`` epochs in a row were no better. It uses as many threads as torch may.
+
+    There are no biases, so a window without any event gives no spike whatever is learned: it is a
+    tie, and wrong by strict accuracy.
 
     Args:
         train_x, val_x: event counts uint8 (n, steps, channels, cells, cells); they stay uint8
@@ -131,7 +134,7 @@ def fit(
         train_y, val_y: classes, integer (n,), 0..2.
         network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
         seed: decides the first weights and the order of the samples.
-        on_epoch: called with each record as soon as it is there.
+        on_epoch: called with each record as soon as it is there, in the calling thread.
 
     Raises:
         ValueError: no samples, shapes that do not fit, a label that is no class.

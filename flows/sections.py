@@ -9,6 +9,7 @@ import numpy as np
 
 from analysis import dataset, figures
 from analysis.detection import detect
+from analysis.metrics import CLASSES
 from analysis.report import Figure, Number, Section, Table, number, percent
 from analysis.training import Fitted
 from flows.campaigns import Collected
@@ -236,7 +237,7 @@ def _network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Sec
     ]
     classes = [
         [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
-        for name, word in zip(windows["precision"], figures.CLASS_WORDS, strict=True)
+        for name, word in zip(CLASSES, figures.CLASS_WORDS, strict=True)
     ]
     trials = [row["argmax"] for row in windows["by_trial"].values() if row["argmax"] is not None]
     return Section(

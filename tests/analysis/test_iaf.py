@@ -9,7 +9,7 @@ import torch
 from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, PeriodicExponential
 from torch import nn
 
-from analysis.iaf import FusedIAF, fused_counts, fused_forward, fused_layers
+from analysis.iaf import FusedIAF, fused_counts, fused_forward, fused_layers, lone_workers
 from analysis.network import SPIKING, WEIGHTED, build, reset_states, spike_counts
 from protocols.settings import Network, Windows
 
@@ -154,6 +154,30 @@ def test_threads_do_not_disturb_each_other() -> None:
             pool.map(lambda x: fused_counts(net, x), batches), expected, strict=True
         ):
             np.testing.assert_array_equal(found, want)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_batches_side_by_side_keep_their_places(threads: int) -> None:
+    net = build(SMALL, TINY, 0)
+    x = sparse(50, TINY, 0, 0.3)
+    expected = spike_counts(net, x)
+    torch.set_num_threads(threads)
+    for batch in (1, 7, 50, 64):
+        np.testing.assert_array_equal(fused_counts(net, x, batch=batch), expected)
+    assert torch.get_num_threads() == threads
+    torch.set_num_threads(1)
+
+
+def test_the_number_of_threads_comes_back_after_a_fault() -> None:
+    torch.set_num_threads(3)
+    with lone_workers() as pool:
+        assert torch.get_num_threads() == 1
+        assert set(pool.map(lambda _: torch.get_num_threads(), range(9))) == {1}
+    assert torch.get_num_threads() == 3
+    with pytest.raises(ZeroDivisionError), lone_workers() as pool:
+        list(pool.map(lambda k: 1 / k, [1, 0]))
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(1)
 
 
 def test_other_thresholds_are_taken_from_the_layer() -> None:

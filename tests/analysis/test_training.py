@@ -81,6 +81,17 @@ def test_the_same_seed_gives_the_same_bits(fitted: Fitted) -> None:
     assert not torch.equal(other.state_dict["fc2.weight"], fitted.state_dict["fc2.weight"])
 
 
+@pytest.mark.parametrize("threads", [2, 5])
+def test_the_number_of_threads_changes_no_bit(fitted: Fitted, threads: int) -> None:
+    torch.set_num_threads(threads)
+    again = run()
+    assert torch.get_num_threads() == threads
+    torch.set_num_threads(1)
+    assert again.history == fitted.history
+    for name, value in fitted.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+
+
 def test_torchs_global_randomness_is_neither_used_nor_moved(fitted: Fitted) -> None:
     torch.manual_seed(123)
     expected = torch.rand(1)
@@ -130,7 +141,7 @@ def test_patience_ends_it_and_the_callback_sees_every_epoch() -> None:
 
 
 def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One step on a batch of 60, whole and in parts of 16, 16, 16, 12."""
+    """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
     one_step = {"epochs": 1, "batch": 150}
     parts = run(**one_step)
     monkeypatch.setattr(training, "MICRO_BATCH", 150)
