@@ -23,10 +23,9 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
             at = step.to
     events = known.noise_events_per_s * seconds + known.signal_events_per_mm * moved
     total = known.fixed_bytes + events * known.bytes_per_event
-    frame_px = rig.frame_px(plan)
-    if frame_px is not None:
-        area = frame_px[0] * frame_px[1] / (480 * 480)
-        each = known.bytes_per_frame * (1 + known.frame_area_share * (area - 1))
+    if rig.frame_px(plan) is not None:
+        plate = plan.protocol.collection.plate is not None
+        each = known.bytes_per_plate_frame if plate else known.bytes_per_frame
         total += each * seconds * plan.protocol.collection.recording.sync_rate
     return total
 

@@ -80,9 +80,9 @@ class Estimates(StrictModel):
     """Events of one millimetre of recorded motion in contact."""
     bytes_per_event: float = Field(gt=0)
     bytes_per_frame: float = Field(ge=0)
-    """Of one frame of 480 x 480 px; larger ones in proportion to `frame_area_share`."""
-    frame_area_share: float = Field(ge=0, le=1)
-    """Share of a frame's bytes that grows with its area; the rest belongs to the markers."""
+    """Of one frame without the plate's marker: its papillae; the dark ground costs little."""
+    bytes_per_plate_frame: float = Field(ge=0)
+    """Of one frame with the plate's marker."""
     fixed_bytes: float = Field(ge=0)
     """Of one trial: poses, pulses, record."""
 

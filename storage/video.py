@@ -18,7 +18,7 @@ import numpy as np
 
 from storage.streams import U8
 
-CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "4"}
+CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
 _QUEUE_FRAMES = 64
 _PUT_TIMEOUT_S = 60.0
 
