@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.exceptions import TyperException
 
 from flows import console
 from protocols.errors import InputError
@@ -168,7 +168,7 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    from flows.orders import make_order
+    from flows.orders import check_disk, make_order
 
     order = make_order(
         protocol,
@@ -181,6 +181,7 @@ def collect(
     )
     for warning in order.plan.warnings():
         console.say(f"note: {warning}")
+    check_disk([order])
     _prepare(store)
     from flows.collect import collect as run
 
@@ -356,9 +357,10 @@ def _step(folder: Path, names: list[str] | None, as_json: bool, step: str, **opt
 
 def _chain(folder: Path, protocols: list[Path], rig: Path, as_json: bool) -> None:
     """Run the whole chain and print what came out."""
-    from flows.orders import make_order
+    from flows.orders import check_disk, make_order
 
     orders = [make_order(protocol, rig, folder) for protocol in protocols]
+    check_disk(orders)
     _prepare(folder)
     from flows.report import read_summary
     from flows.study import study as run
@@ -411,35 +413,41 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _terminated)
     try:
         code = app(standalone_mode=False)
+        if code == console.INTERRUPTED:
+            _interrupted()
         sys.exit(code if isinstance(code, int) else console.DONE)
     except InputError as error:
         console.say(f"error: {error.message}")
         sys.exit(console.WRONG_INPUT)
     except KeyboardInterrupt:
-        console.say("interrupted: every committed trial is kept; run the same command to go on")
-        sys.stderr.flush()
-        os._exit(console.INTERRUPTED)
+        sys.exit(_interrupted())
     except Exception as error:
         sys.exit(_explain(error))
 
 
+def _interrupted() -> int:
+    console.say("interrupted: every committed trial is kept; run the same command to go on")
+    return console.INTERRUPTED
+
+
 def _explain(error: Exception) -> int:
     """Print what went wrong; a fault of the program itself shows where."""
-    import click
-
-    if isinstance(error, click.exceptions.Exit):
+    if isinstance(error, typer.Exit):
         return int(error.exit_code)
-    if isinstance(error, click.exceptions.Abort):
-        return console.INTERRUPTED
-    if isinstance(error, click.ClickException):
-        error.show()
+    if isinstance(error, typer.Abort):
+        return _interrupted()
+    if isinstance(error, TyperException):
+        console.say(f"error: {error.format_message()} (see --help)")
         return console.WRONG_INPUT
     expected = {"StoreError", "RigError", "ArmFault", "Locked", "StopRequested"}
     if type(error).__name__ not in expected:
         console.messages.print_exception(max_frames=8)
     console.say(f"error: {error or type(error).__name__}")
     if type(error).__name__ == "ArmFault":
-        console.say("the arm was stopped and not unlocked: look at it, then run the command again")
+        console.say(
+            "the arm was stopped and nothing was unlocked: look at it, clear the cause at the "
+            "pendant, then run the same command to go on"
+        )
     return console.FAILED
 
 

@@ -13,9 +13,14 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows import console
-from flows.estimate import check_space, plan_bytes
 from flows.orchestration import Parcel
-from flows.orders import Order, campaign_counts, describe_campaign, pending_trials
+from flows.orders import (
+    Order,
+    campaign_counts,
+    check_disk,
+    describe_campaign,
+    pending_trials,
+)
 from flows.session import Session
 from flows.timing import timed
 from protocols import Trial
@@ -47,8 +52,6 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
         rig = build_rig(wanted.rig)
         session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.operator)
         trials = pending_trials(wanted.plan, campaign)
-        done = {t.id for t in wanted.plan} - {t.id for t in trials}
-        check_space(store.folder, plan_bytes(wanted.rig, wanted.plan, done))
         campaign.add_bench_record(_bench_record(wanted))
         simulated = "simulated " if wanted.rig.simulated else ""
         with console.bar(f"collect {wanted.campaign} ({simulated}trials)", len(trials)) as bar:
@@ -82,6 +85,7 @@ def collect(order: Order) -> dict[str, Any]:
     """Run the collection; returns at once when the store lacks nothing that can be taken."""
     store = Store.create(order.store)
     if pending_trials(order.plan, store.campaign(order.campaign)):
+        check_disk([order])
         return collect_flow(Parcel(order))
     campaign = describe_campaign(store, order)
     return {**campaign_counts(order, campaign), "taken": 0, "retaken": 0}

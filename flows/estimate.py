@@ -1,4 +1,4 @@
-"""What a plan will take on a rig: bytes on disk, from what the rig's streams were measured to need."""
+"""What a plan will take on a rig: bytes on disk, from what its streams were measured to need."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flows.estimate import check_space, plan_bytes
 from protocols import InputError, Plan, Trial, load_plan
 from protocols.yaml_file import read_text
 from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash
@@ -102,6 +103,22 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
     }
     campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)
     return campaign
+
+
+def missing_bytes(order: Order) -> float:
+    """Bytes that the trials still to take are expected to need."""
+    pending = pending_trials(order.plan, Store(order.store).campaign(order.campaign))
+    done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
+    return plan_bytes(order.rig, order.plan, done)
+
+
+def check_disk(orders: list[Order]) -> int:
+    """Free bytes where the orders' store is or will be.
+
+    Raises:
+        InputError: what is still to be taken does not fit.
+    """
+    return check_space(orders[0].store, sum(missing_bytes(order) for order in orders))
 
 
 def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:

@@ -9,8 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from flows.console import size
-from flows.estimate import check_space, plan_bytes
-from flows.orders import Order, make_order, pending_trials
+from flows.orders import Order, check_disk, make_order, missing_bytes, pending_trials
 from protocols import InputError
 from storage.store import Store
 
@@ -37,11 +36,10 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         Check("campaign", True, f"{len(pending)} of {len(order.plan)} still to take"),
     ]
     found += [Check("hint", True, text) for text in order.plan.warnings()]
-    done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
-    needed = plan_bytes(order.rig, order.plan, done)
     try:
-        free = check_space(store, needed)
-        found.append(Check("space", True, f"needs {size(needed)}, {size(free)} free"))
+        free = check_disk([order])
+        needed = size(missing_bytes(order))
+        found.append(Check("space", True, f"needs {needed}, {size(free)} free"))
     except InputError as error:
         found.append(Check("space", False, error.expected))
     found += _check_devices(order)

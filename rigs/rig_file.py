@@ -35,6 +35,21 @@ class ContactPlane(StrictModel):
     """Any point at least 5 mm above the centre."""
     date: str = Field(pattern=r"^\d{4}-\d{2}-\d{2}$")
 
+    @model_validator(mode="after")
+    def _spans(self) -> ContactPlane:
+        """Three points that are a plane; the frame itself is made by `rigs.plate_frame`."""
+        right, above = (
+            [b - a for a, b in zip(self.centre, point, strict=True)]
+            for point in (self.right, self.above)
+        )
+        lengths = math.hypot(*right), math.hypot(*above)
+        if min(lengths) < 5.0:
+            raise ValueError("needs points at least 5 mm from the centre")
+        cosine = sum(a * b for a, b in zip(right, above, strict=True)) / (lengths[0] * lengths[1])
+        if abs(cosine) > 0.98:
+            raise ValueError("has its three points almost on one line")
+        return self
+
 
 class Calibration(StrictModel):
     """What was measured on this rig."""

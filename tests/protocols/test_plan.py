@@ -213,7 +213,7 @@ def test_a_slide_is_centred_and_only_hold_and_slide_are_recorded() -> None:
         slide = next(step for step in moves if step.phase == "slide")
         assert press.to.x_mm == pytest.approx(-slide.to.x_mm, abs=1e-12)
         assert press.to.y_mm == pytest.approx(-slide.to.y_mm, abs=1e-12)
-        assert press.to.distance_mm(slide.to) == pytest.approx(10.0, rel=1e-12)
+        assert press.to.distance_mm(slide.to) == pytest.approx(9.0, rel=1e-12)
         assert slide.to.depth_mm == press.to.depth_mm == float(str(condition["depth"]))
         recorded = [step.phase for step in program.steps if step.recorded]
         assert recorded == ["hold", "slide"]

@@ -1,0 +1,65 @@
+"""A small campaign that goes through every step, and Prefect at home in a folder of the tests."""
+
+from __future__ import annotations
+
+import copy
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.conftest import ROOT, SMALL
+
+# Prefect reads these when it is imported, which happens when a test module imports a flow
+_HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
+os.environ["PREFECT_HOME"] = _HOME
+
+from flows.orchestration import prepare  # noqa: E402
+
+prepare(Path(_HOME))
+
+
+def tiny() -> dict[str, Any]:
+    """Six fast slides: two of each split."""
+    data = copy.deepcopy(SMALL)
+    data["name"] = "tiny"
+    collection = data["collection"]
+    collection["factors"]["depth"]["values"] = [2.4]
+    collection["factors"]["speed"]["values"] = [1.6]
+    collection["factors"]["direction"]["values"] = [0, 60, 120, 180, 240, 300]
+    collection["motion"][3]["distance"] = "7 mm"
+    collection["motion"][2] = {"phase": "hold", "settle": "0.5 s", "duration": "1.5 s"}
+    collection["recording"]["region"] = {"width": "36 mm", "height": "36 mm"}
+    collection["maintenance"]["rezero"]["every"] = 3
+    data["analysis"]["split"] = {
+        "method": "leave_conditions_out",
+        "validation_levels": {"direction": ["120 deg", "180 deg"]},
+        "test_levels": {"direction": ["240 deg", "300 deg"]},
+    }
+    data["analysis"]["training"] = {"epochs": 2}
+    return data
+
+
+def tiny_gravity() -> dict[str, Any]:
+    """Two plates, one fast retraction each."""
+    data: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot_gravity.yaml").read_text())
+    data["name"] = "tiny_gravity"
+    data["collection"]["factors"]["speed"]["values"] = [0.7]
+    data["collection"]["repetitions"] = 1
+    data["collection"]["motion"][6]["distance"] = "2 mm"
+    return data
+
+
+def write(path: Path, data: dict[str, Any]) -> Path:
+    """`data` as a YAML file."""
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.fixture(scope="session")
+def rig_path() -> Path:
+    """The shipped mock rig."""
+    return ROOT / "rigs" / "mock.yaml"

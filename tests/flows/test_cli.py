@@ -1,0 +1,161 @@
+"""The command line as a person and as a program meet it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from storage.files import read_json
+from storage.store import Store
+from storage.verify import verify
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, write
+
+SLIPLAB = [sys.executable, "-m", "flows.cli"]
+
+
+def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PREFECT_HOME", None)
+    return subprocess.run(
+        [*SLIPLAB, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True,
+        text=True, timeout=300,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "count"), [("kinematic", 864), ("gravity", 180)])
+def test_plan_as_json(name: str, count: int) -> None:
+    done = sliplab("plan", f"protocols/{name}.yaml", "--json", "--rig", "rigs/mock.yaml")
+    assert done.returncode == 0
+    data = json.loads(done.stdout)
+    assert data["count"] == len(data["trials"]) == count
+    assert data["seconds"] > 0
+    assert data["bytes"] > 0
+
+
+def test_plan_as_a_table() -> None:
+    done = sliplab("plan", "protocols/pilot.yaml")
+    assert done.returncode == 0
+    assert "36" in done.stdout
+    assert "give --rig to know" in done.stdout
+
+
+def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:
+    data = tiny()
+    data["collection"]["motion"][1]["sped"] = "1 mm/s"
+    path = write(tmp_path / "wrong.yaml", data)
+    for command in (
+        ("plan", path),
+        ("collect", path, "--rig", "rigs/mock.yaml", "--store", tmp_path / "s"),
+        ("check", path, "--rig", "rigs/mock.yaml", "--store", tmp_path / "s"),
+    ):
+        done = sliplab(*command)
+        assert done.returncode == 2
+        assert done.stdout == ""
+        assert done.stderr.count("\n") == 1
+        assert "collection.motion[1].sped" in done.stderr
+        assert "did you mean 'speed'" in done.stderr
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_store_that_is_none_is_said() -> None:
+    done = sliplab("label", "docs")
+    assert done.returncode == 1
+    assert "is not a store" in done.stderr
+
+
+def test_a_plan_that_does_not_fit_the_disk_is_refused(tmp_path: Path) -> None:
+    rig = (ROOT / "rigs" / "mock.yaml").read_text()
+    assert "bytes_per_frame: 14600" in rig
+    path = tmp_path / "rig.yaml"
+    path.write_text(rig.replace("bytes_per_frame: 14600", "bytes_per_frame: 1.0e+9"))
+    done = sliplab("collect", "protocols/pilot.yaml", "--rig", path, "--store", tmp_path / "s")
+    assert done.returncode == 2
+    assert "in reserve, the disk has" in done.stderr
+
+
+def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:
+    arguments = ("protocols/pilot.yaml", "--rig", "rigs/mock.yaml", "--store", tmp_path / "s")
+    done = sliplab("check", *arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["passed"]
+    assert {"arm", "clocks", "space"} <= {item["name"] for item in found["checks"]}
+
+
+def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:
+    """Until `condition()` holds; fails when the process ends first or time is up."""
+    assert callable(condition)
+    end = time.monotonic() + limit_s
+    while not condition():
+        assert process.poll() is None, "ended before it could be stopped"
+        assert time.monotonic() < end, "never came that far"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Checksums of the small campaign's trials, collected in one go."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    path = write(folder / "p.yaml", tiny())
+    done = sliplab("collect", path, "--rig", "rigs/mock.yaml", "--store", folder / "store")
+    assert done.returncode == 0, done.stderr
+    trials = folder / "store" / "campaigns" / "tiny" / "trials"
+    return {trial.name: read_json(trial / "checksums.json") for trial in trials.iterdir()}
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_collection_goes_on_to_the_same_data(
+    number: signal.Signals, tmp_path: Path, undisturbed: dict[str, Any]
+) -> None:
+    """Stopped in the middle of a trial, started again: the files of an undisturbed run."""
+    path = write(tmp_path / "p.yaml", tiny())
+    rig = ROOT / "rigs" / "mock.yaml"
+    store = tmp_path / "stopped"
+    command = ["collect", str(path), "--rig", str(rig), "--store", str(store), "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PREFECT_HOME", None)
+    log = tmp_path / "messages"
+    with log.open("w") as messages:
+        process = subprocess.Popen(
+            [*SLIPLAB, *command], cwd=ROOT, env=environment, text=True, start_new_session=True,
+            stdout=subprocess.DEVNULL, stderr=messages,
+        )  # fmt: skip
+    trials, aside = (store / "campaigns" / "tiny" / name for name in ("trials", "incoming"))
+    try:
+        wait_for(
+            lambda: trials.is_dir() and len(list(trials.iterdir())) >= 2 and any(aside.iterdir()),
+            process,
+        )
+        process.send_signal(number)
+        process.wait(timeout=60)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # Prefect's server, when it was left alone
+        process.wait(timeout=60)
+    if number is signal.SIGKILL:
+        assert process.returncode == -signal.SIGKILL
+    else:
+        assert process.returncode == 130, log.read_text()
+        assert "every committed trial is kept" in log.read_text()
+    early = {folder.name: folder.stat().st_mtime_ns for folder in trials.iterdir()}
+    assert 2 <= len(early) < 6
+    again = sliplab(*command)
+    assert again.returncode == 0, again.stderr
+    result = json.loads(again.stdout)
+    assert result["committed"] == 6
+    assert result["taken"] == 6 - len(early)
+    assert result["missing"] == 0
+    assert all((trials / name).stat().st_mtime_ns == t for name, t in early.items())
+    assert verify(Store.open(store)) == []
+    for name, expected in undisturbed.items():
+        assert read_json(trials / name / "checksums.json") == expected

@@ -1,0 +1,145 @@
+"""The whole chain on a small campaign: right, honest, and stale only where something changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flows.campaigns import collected
+from flows.collect import collect
+from flows.evaluate import evaluate
+from flows.orders import Order, make_order
+from flows.report import read_summary, report
+from flows.study import Outcome, study
+from storage.derived import Derived
+from storage.store import Store
+from tests.flows.conftest import tiny, tiny_gravity, write
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> tuple[list[Order], Outcome]:
+    """Both small campaigns, run once through every step."""
+    folder = tmp_path_factory.mktemp("study")
+    protocols = [
+        write(folder / "tiny.yaml", tiny()),
+        write(folder / "tiny_gravity.yaml", tiny_gravity()),
+    ]
+    orders = [make_order(protocol, rig_path, folder / "store") for protocol in protocols]
+    return orders, study(orders)
+
+
+def store_of(ran: tuple[list[Order], Outcome]) -> Store:
+    """The study's store."""
+    return Store.open(ran[0][0].store)
+
+
+def test_every_step_did_its_work(ran: tuple[list[Order], Outcome]) -> None:
+    _, outcome = ran
+    assert [item["committed"] for item in outcome.collected] == [6, 2]
+    assert [(step["step"], step["done"]) for step in outcome.steps] == [
+        ("label", 8), ("train", 1), ("evaluate", 1), ("report", 1),
+    ]  # fmt: skip
+
+
+def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[Order], Outcome]) -> None:
+    errors = read_summary(store_of(ran))["labels"]["error_ms"]
+    for kind in ("incipient", "gross"):
+        assert errors[kind]["n"] >= 7
+        assert errors[kind]["median_abs"] <= 10.0
+
+
+def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Outcome]) -> None:
+    summary = read_summary(store_of(ran))
+    assert summary["simulated"] is True
+    kinematic = summary["kinematic"]
+    assert set(kinematic["accuracy"]) == {"argmax", "strict", "margin", "n"}
+    assert np.shape(kinematic["confusion"]) == (3, 4)
+    assert set(kinematic["precision"]) == set(kinematic["recall"]) == {
+        "no_slip", "incipient", "gross"
+    }  # fmt: skip
+    for kind in ("incipient", "gross"):
+        latency = kinematic["latency_ms"][kind]
+        assert latency["n"] + latency["missed"] + latency["false_early"] == 2
+        assert {"mean", "std", "median", "p95", "min", "max"} <= set(latency)
+    lead = summary["gravity"]["lead_ms"]
+    assert lead["n"] + lead["missed"] + lead["false_early"] == 2
+    assert {"min", "mean", "std", "median", "detected_first"} <= set(lead)
+    assert summary["disturbance"]["trials"] == 0
+    assert summary["sync"]["grade"] == "hardware trigger"
+    assert summary["quality"] == {
+        "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0
+    }  # fmt: skip
+    assert {"collect tiny", "label", "train", "evaluate", "report"} <= set(summary["timing_s"])
+    assert set(summary["protocols"]) == {"tiny", "tiny_gravity"}
+    assert summary["seeds"]["network"] == [0]
+
+
+def test_plan_and_collection_agree(ran: tuple[list[Order], Outcome]) -> None:
+    for known in read_summary(store_of(ran))["planned"].values():
+        assert known["seconds_collected"] == pytest.approx(known["seconds"], rel=0.1)
+        assert known["bytes_collected"] == pytest.approx(known["bytes"], rel=0.25)
+
+
+def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outcome]) -> None:
+    text = (store_of(ran).folder / "report" / "index.html").read_text()
+    assert "Every number and picture here is simulated" in text
+    assert text.count("<svg") >= 7
+    assert text.count(">simulated</text>") == text.count("<figure>")
+    for outside in ("http://", "https://", "src="):
+        found = [line for line in text.splitlines() if outside in line]
+        assert all("xmlns" in line or "DTD" in line or "purl.org" in line for line in found)
+
+
+def test_nothing_changed_is_nothing_to_do(ran: tuple[list[Order], Outcome]) -> None:
+    again = study(ran[0])
+    assert [item["taken"] for item in again.collected] == [0, 0]
+    assert [step["done"] for step in again.steps] == [0, 0, 0, 0]
+
+
+def test_another_margin_is_evaluation_and_report_only(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+) -> None:
+    store = store_of(ran)
+    counts = Derived.of(store, "counts", "tiny").folder
+    before = {path: path.stat().st_mtime_ns for path in counts.iterdir()}
+    data: dict[str, Any] = tiny()
+    data["analysis"]["detection"]["margin"] = 3.0
+    orders = [make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder), ran[0][1]]
+    outcome = study(orders)
+    done = [(step["step"], step["done"]) for step in outcome.steps]
+    assert done == [("label", 0), ("train", 0), ("evaluate", 1), ("report", 1)]
+    assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
+    assert read_summary(store)["detection"]["tiny"]["margin"] == 3.0
+    study(ran[0])  # back to what the other tests know
+
+
+def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> None:
+    store = store_of(ran)
+    campaigns = collected(store)
+    assert evaluate(store, campaigns, margin=4.0)["done"] == 1
+    assert report(store, campaigns)["done"] == 1
+    assert evaluate(store, campaigns)["done"] == 1
+    assert report(store, campaigns)["done"] == 1
+    assert read_summary(store)["detection"]["tiny"]["margin"] == 2.0
+
+
+def test_the_same_seed_gives_the_same_summary(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+) -> None:
+    orders = [make_order(Path(order.plan.file), rig_path, tmp_path / "store") for order in ran[0]]
+    study(orders)
+    first, second = (read_summary(Store.open(folder)) for folder in (
+        store_of(ran).folder, tmp_path / "store"
+    ))  # fmt: skip
+    for summary in (first, second):
+        summary.pop("timing_s")
+    assert json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
+
+
+def test_a_collection_that_is_complete_returns_at_once(ran: tuple[list[Order], Outcome]) -> None:
+    result = collect(ran[0][0])
+    assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)

@@ -1,0 +1,75 @@
+"""Rig files are checked as carefully as protocols."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from protocols import InputError, load_plan
+from rigs.rig_file import check_plan, load_rig_file
+from tests.conftest import ROOT
+
+Change = Callable[[dict[str, Any]], None]
+MOCK: str = (ROOT / "rigs" / "mock.yaml").read_text()
+
+
+def _set(*path: str, to: Any) -> Change:
+    def change(data: dict[str, Any]) -> None:
+        for part in path[:-1]:
+            data = data[part]
+        data[path[-1]] = to
+
+    return change
+
+
+CASES: dict[str, tuple[Change, str, str]] = {
+    "unknown key": (_set("frame_camera", "scael", to=3), "frame_camera.scael", "unknown key"),
+    "unknown driver": (_set("driver", to="abacus"), "driver", "'mock'"),
+    "wrong unit": (_set("limits", "speed", to="5 kg"), "limits.speed", "mm/s"),
+    "slow poll": (_set("poll", to="2 s"), "poll", "at most 1 s"),
+    "no number": (
+        _set("calibration", "contact_plane", "centre", to=["a", "0 mm", "0 mm"]),
+        "calibration.contact_plane.centre[0]",
+        "number with a unit",
+    ),
+    "points on a line": (
+        _set("calibration", "contact_plane", "above", to=["399 mm", "120 mm", "300 mm"]),
+        "calibration.contact_plane",
+        "one line",
+    ),
+    "negative noise": (
+        _set("mock", to={"event_camera": {"noise_hz": -1}}),
+        "mock.event_camera.noise_hz",
+        "greater than or equal to 0",
+    ),
+    "infinite scale": (
+        _set("frame_camera", "scale_px_per_mm", to=float("inf")),
+        "frame_camera.scale_px_per_mm",
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_message_names_key_and_cure(case: str, tmp_path: Path) -> None:
+    change, key, says = CASES[case]
+    data = yaml.safe_load(MOCK)
+    change(data)
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    with pytest.raises(InputError) as caught:
+        load_rig_file(path)
+    assert caught.value.key.startswith(key)
+    assert str(path) in caught.value.message
+    assert says in caught.value.message
+
+
+def test_a_plan_beyond_the_rig_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(MOCK.replace("depth: 4 mm", "depth: 3 mm"))
+    rig, _ = load_rig_file(path)
+    plan = load_plan(ROOT / "protocols" / "pilot.yaml")
+    with pytest.raises(InputError, match=r"needs 3.4 mm in its phase 'press'"):
+        check_plan(rig, plan, str(path))
