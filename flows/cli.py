@@ -109,14 +109,16 @@ def plan(
             [
                 trial.index,
                 trial.block,
-                *(known[name] for name in factors),
+                *(known[name].split()[0] for name in factors),
                 trial.repetition,
                 trial.split if trial.role == "measured" else trial.role,
                 f"{found.seconds(trial):.1f}",
                 before,
             ]
         )
-    columns = ["#", "block", *factors, "repetition", "split", "motion (s)", "before it"]
+    units = {name: factor.unit for name, factor in found.protocol.collection.factors.items()}
+    named = [f"{name} ({units[name]})" if units[name] else name for name in factors]
+    columns = ["#", "block", *named, "rep.", "split", "motion (s)", "before it"]
     console.print_table(f"{protocol}: {found.protocol.title}", columns, table, limit=40)
     console.print_pairs(
         "In all",
@@ -164,11 +166,17 @@ def collect(
         str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
     ] = None,
     operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
+    temperature: Annotated[
+        float | None, typer.Option("--temperature", help="Of the room, degrees Celsius.")
+    ] = None,
+    humidity: Annotated[
+        float | None, typer.Option("--humidity", min=0, max=100, help="Relative, percent.")
+    ] = None,
     note: Annotated[str, typer.Option("--note", help="Anything worth keeping.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    from flows.orders import check_disk, make_order
+    from flows.orders import Bench, check_disk, make_order
 
     order = make_order(
         protocol,
@@ -176,8 +184,7 @@ def collect(
         store,
         enable=tuple(enable or ()),
         campaign=campaign,
-        operator=operator,
-        note=note,
+        bench=Bench(operator, temperature, humidity, note),
     )
     for warning in order.plan.warnings():
         console.say(f"note: {warning}")
@@ -443,11 +450,6 @@ def _explain(error: Exception) -> int:
     if type(error).__name__ not in expected:
         console.messages.print_exception(max_frames=8)
     console.say(f"error: {error or type(error).__name__}")
-    if type(error).__name__ == "ArmFault":
-        console.say(
-            "the arm was stopped and nothing was unlocked: look at it, clear the cause at the "
-            "pendant, then run the same command to go on"
-        )
     return console.FAILED
 
 

@@ -6,6 +6,7 @@ real rig, a task a batch on a mock rig (where a trial takes less time than a tas
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
@@ -50,7 +51,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
         campaign = describe_campaign(store, wanted)
         campaign.sweep()
         rig = build_rig(wanted.rig)
-        session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.operator)
+        session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.bench.operator)
         trials = pending_trials(wanted.plan, campaign)
         campaign.add_bench_record(_bench_record(wanted))
         simulated = "simulated " if wanted.rig.simulated else ""
@@ -71,12 +72,16 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
 
 
 def _bench_record(order: Order) -> dict[str, Any]:
+    """One stretch of work at the rig."""
+    began = datetime.now(UTC)
+    skin = order.rig.skin
     return {
-        "began": datetime.now(UTC).isoformat(timespec="seconds"),
-        "operator": order.operator,
-        "note": order.note,
+        "began": began.isoformat(timespec="seconds"),
+        **asdict(order.bench),
         "rig": order.rig.name,
-        "skin": order.rig.skin.serial,
+        "sensor": order.rig.sensor,
+        "skin": skin.serial,
+        "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
         "simulated": order.rig.simulated,
     }
 

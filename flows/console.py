@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from rich.box import SIMPLE, SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -44,7 +45,7 @@ def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, limit: int = 0
 ) -> None:
     """A table; with a `limit`, the middle of a long one is left out and counted."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     for column in columns:
         table.add_column(column, overflow="fold")
     left_out = len(rows) - limit if limit and len(rows) > limit else 0
@@ -60,7 +61,7 @@ def print_table(
 
 def print_pairs(title: str, pairs: Mapping[str, object]) -> None:
     """Names and values, one pair a line."""
-    table = Table(title=title, title_justify="left", show_header=False)
+    table = Table(title=title, title_justify="left", show_header=False, box=SIMPLE)
     for name, value in pairs.items():
         table.add_row(name, _cell(value))
     results.print(table)

@@ -17,6 +17,16 @@ from storage.store import Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)
+class Bench:
+    """Who stands at the rig, and what the room is like; kept for each stretch of work."""
+
+    operator: str = ""
+    temperature_c: float | None = None
+    humidity_percent: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class Order:
     """A collection that was asked for and found possible."""
 
@@ -26,8 +36,7 @@ class Order:
     store: Path
     campaign: str
     enable: tuple[str, ...]
-    operator: str = ""
-    note: str = ""
+    bench: Bench = Bench()
 
 
 def make_order(
@@ -37,8 +46,7 @@ def make_order(
     *,
     enable: tuple[str, ...] = (),
     campaign: str | None = None,
-    operator: str = "",
-    note: str = "",
+    bench: Bench = Bench(),
 ) -> Order:
     """Read and check everything that can be known before anything moves.
 
@@ -52,7 +60,7 @@ def make_order(
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
         raise InputError(rig, "mock.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
-    order = Order(plan, rig_file, rig_text, store, name, enable, operator, note)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench)
     if (store / "store.json").exists():
         found = Store.open(store).campaign(name)
         if (found.folder / "campaign.json").exists():

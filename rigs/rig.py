@@ -231,13 +231,15 @@ class Rig:
         deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
         while not (progress := self.arm.progress()).done:
             if not progress.state.healthy:
-                raise ArmFault("arm", f"{progress.state.value} in the phase '{step.phase}'")
+                raise _fault(progress.state, step.phase)
             if self.clock.now_ns() > deadline:
                 raise ArmFault("arm", f"did not end the phase '{step.phase}' in time")
             left = seconds - (self.arm.now_ns() - start) / 1e9
             self._wait(min(self.poll_s, max(left, 1e-3)), sink)
         if not progress.state.healthy:
-            raise ArmFault("arm", f"{progress.state.value} in the phase '{step.phase}'")
+            raise _fault(progress.state, step.phase)
+        if not progress.finished:
+            raise ArmFault("arm", f"was stopped from outside in the phase '{step.phase}'")
         return progress.finished[-1]
 
     def _wait(self, seconds: float, sink: Sink | None = None) -> None:
@@ -315,11 +317,15 @@ class Rig:
         self.arm.stop()
 
 
-def advice(state: ArmState) -> str:
-    """What a person must do about an arm in this state."""
-    return {
-        ArmState.PROTECTIVE_STOP: "look at the arm, clear the cause, and unlock the protective "
-        "stop on the pendant; then run the same command again",
-        ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm on the pendant",
+def _fault(state: ArmState, phase: str) -> ArmFault:
+    """What happened, and what a person must do about it; nothing is unlocked from here."""
+    advice = {
+        ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
+        ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm at the pendant",
         ArmState.DISCONNECTED: "check power and network of the arm's controller",
-    }.get(state, "run the same command again")
+    }.get(state, "look at the arm")
+    return ArmFault(
+        "arm",
+        f"{state.value} in the phase '{phase}'; the arm stays where it is: {advice}, move it clear "
+        "of the plate, then run the same command to go on",
+    )

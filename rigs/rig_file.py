@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,7 +34,7 @@ class ContactPlane(StrictModel):
     """Any point at least 5 mm to the right of the centre, as the sensor sees the plate."""
     above: Point
     """Any point at least 5 mm above the centre."""
-    date: str = Field(pattern=r"^\d{4}-\d{2}-\d{2}$")
+    taught: date
 
     @model_validator(mode="after")
     def _spans(self) -> ContactPlane:
@@ -72,6 +73,8 @@ class Skin(StrictModel):
     """The sensor's papillae by ring, from the one in the centre outwards."""
 
     serial: str = Field(min_length=1, max_length=40)
+    made: date | None = None
+    """When it was cured; bench records keep its age."""
     ring_counts: tuple[Annotated[int, Field(ge=1, le=60)], ...]
     ring_spacing: PositiveMillimetres
     radius: PositiveMillimetres
@@ -119,6 +122,8 @@ class RigFile(StrictModel):
     driver: Literal["mock"]
     poll: PositiveSeconds
     """How often streams are read and stop requests looked at."""
+    sensor: str = Field(min_length=1, max_length=40)
+    """Serial number of the event camera and its housing."""
     calibration: Calibration
     limits: RigLimits
     skin: Skin

@@ -175,3 +175,20 @@ def test_nothing_and_the_wrong_thing() -> None:
     assert track_plate([]).xy.shape == (0, 2)
     with pytest.raises(TypeError, match="uint8"):
         PlateTracker().update(np.zeros(SHAPE))  # type: ignore[arg-type]
+
+
+def test_a_quiet_zone_on_a_dark_ground_is_not_the_marker() -> None:
+    """The white card is a square, too: at OpenCV's default distance it hid the marker inside."""
+    for side in (60, 90, 108):
+        module = side // 6
+        marker = cv2.aruco.generateImageMarker(
+            cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 6 * module
+        )
+        card = np.full((8 * module, 8 * module), 255, np.uint8)
+        card[module:-module, module:-module] = marker
+        frame = np.full((512, 512), 25, np.uint8)
+        frame[20 : 20 + 8 * module, 350 : 350 + 8 * module] = np.where(card > 127, 200, 25)
+        ok, centre, _ = PlateTracker().update(frame)
+        assert ok
+        expected = np.array([350, 20]) + (8 * module - 1) / 2
+        assert np.abs(centre - expected).max() < 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,10 @@ def session(folder: Path, data: dict[str, Any], **mock: Any) -> tuple[Session, C
     """A connected session on a mock rig with other mock settings."""
     folder.mkdir(exist_ok=True)
     rig_data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
-    text = json.dumps({**rig_data, "mock": {**rig_data["mock"], **mock}}, default=float)
+    text = json.dumps(
+        {**rig_data, "mock": {**rig_data["mock"], **mock}},
+        default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
+    )
     (folder / "rig.yaml").write_text(text)
     order = make_order(write(folder / "p.yaml", data), folder / "rig.yaml", folder / "store")
     campaign = describe_campaign(Store.create(folder / "store"), order)
