@@ -14,7 +14,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows import console
-from flows.orchestration import Parcel
+from flows.orchestration import Parcel, run
 from flows.orders import (
     Order,
     campaign_counts,
@@ -91,6 +91,6 @@ def collect(order: Order) -> dict[str, Any]:
     store = Store.create(order.store)
     if pending_trials(order.plan, store.campaign(order.campaign)):
         check_disk([order])
-        return collect_flow(Parcel(order))
+        return run(collect_flow, Parcel(order))
     campaign = describe_campaign(store, order)
     return {**campaign_counts(order, campaign), "taken": 0, "retaken": 0}

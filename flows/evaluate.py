@@ -18,7 +18,7 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
-from flows.orchestration import Parcel
+from flows.orchestration import Parcel, run
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
 from protocols import Trial
@@ -259,5 +259,5 @@ def evaluate(
     job = make_job(store, campaigns, margin, smoothing)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
-        evaluate_flow(Parcel(job))
+        run(evaluate_flow, Parcel(job))
     return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from prefect.cache_policies import NO_CACHE
 from analysis import labelling
 from flows import console
 from flows.campaigns import Collected
-from flows.orchestration import Parcel
+from flows.orchestration import Parcel, run
 from flows.timing import timed
 from protocols.settings import Labelling
 from storage.derived import Derived, make_key
@@ -46,6 +47,11 @@ def stale_labels(store: Store, campaigns: list[Collected]) -> list[Work]:
     return work
 
 
+def _leave_signals_to_the_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; only the parent answers it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _label_one(folder: Path, settings: Labelling) -> tuple[dict[str, Any], dict[str, Any]]:
     """Runs in a process of its own."""
     label = labelling.label_recording(Recording(folder), settings)
@@ -72,14 +78,17 @@ def label_flow(wanted: Parcel[tuple[Store, list[Work]]]) -> int:
     workers = max(1, min(len(work), os.cpu_count() or 1))
     with (
         timed(store, "label"),
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            workers, mp_context=get_context("spawn"), initializer=_leave_signals_to_the_parent
+        ) as pool,
         console.bar("label (trials)", len(work)) as bar,
     ):
         try:
             for start in range(0, len(work), CHUNK):
                 label_chunk(Parcel((store, work[start : start + CHUNK], pool, bar)))
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in active_children():
+                worker.terminate()  # what a worker had not handed over is simply made again
             raise
     return len(work)
 
@@ -89,5 +98,5 @@ def label(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     total = sum(len(item.trials) for item in campaigns)
     work = stale_labels(store, campaigns)
     if work:
-        label_flow(Parcel((store, work)))
+        run(label_flow, Parcel((store, work)))
     return {"step": "label", "done": len(work), "fresh": total - len(work)}

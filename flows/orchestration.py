@@ -7,10 +7,23 @@ that the user names with PREFECT_API_URL is used instead of the embedded one.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+
+from flows.embedded_server import EmbeddedServer
 
 T = TypeVar("T")
+
+_DEFAULTS = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_LOGGING_LEVEL": "CRITICAL",
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
+    "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
+    "PREFECT_CLI_PROMPT": "false",
+}
+_servers: dict[str, EmbeddedServer] = {}
 
 
 class Parcel(Generic[T]):
@@ -20,22 +33,33 @@ class Parcel(Generic[T]):
         self.content = content
 
 
-_DEFAULTS = {
-    "DO_NOT_TRACK": "1",
-    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-    "PREFECT_SERVER_ALLOW_EPHEMERAL_MODE": "true",
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
-    "PREFECT_LOGGING_LEVEL": "CRITICAL",
-    "PREFECT_LOGGING_TO_API_ENABLED": "false",
-    "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
-    "PREFECT_CLI_PROMPT": "false",
-}
-
-
 def prepare(store: Path) -> None:
     """Point Prefect at the store's own home, unless the user has set one; the store must exist."""
     home = store.resolve() / ".prefect"
-    home.mkdir(exist_ok=True)
-    os.environ.setdefault("PREFECT_HOME", str(home))
+    if "PREFECT_HOME" not in os.environ:
+        home.mkdir(exist_ok=True)
+        os.environ["PREFECT_HOME"] = str(home)
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
+
+
+def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
+    """Run a flow on the user's server, or on the embedded one, which the first flow starts.
+
+    Without heartbeats, because each would cost a flow a second of waiting for their thread; a
+    killed run is known by what the store lacks.
+    """
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
+        temporary_settings,
+    )
+
+    updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
+    if PREFECT_API_URL.value() is None:
+        home = os.environ["PREFECT_HOME"]
+        if home not in _servers:
+            _servers[home] = EmbeddedServer(Path(home))
+        updates[PREFECT_API_URL] = _servers[home].url
+    with temporary_settings(updates=updates):
+        return flow(parcel)

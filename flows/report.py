@@ -11,7 +11,7 @@ from analysis import report as page
 from analysis import training
 from flows import evaluate, sections, timing
 from flows.campaigns import Collected
-from flows.orchestration import Parcel
+from flows.orchestration import Parcel, run
 from flows.summary import make_summary
 from flows.train import wanted_models
 from storage.derived import Derived, make_key
@@ -79,7 +79,7 @@ def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         or not (report_folder(store) / "index.html").exists()
     )
     if stale:
-        report_flow(Parcel((store, campaigns, key)))
+        run(report_flow, Parcel((store, campaigns, key)))
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
 
 

@@ -15,7 +15,7 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
-from flows.orchestration import Parcel
+from flows.orchestration import Parcel, run
 from flows.timing import timed
 from protocols.hashing import hash_integer
 from protocols.settings import AnalysisSettings
@@ -166,5 +166,5 @@ def train(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     models = wanted_models(store, campaigns)
     stale = [model for model in models if not model.fresh]
     if stale:
-        train_flow(Parcel((store, campaigns, stale)))
+        run(train_flow, Parcel((store, campaigns, stale)))
     return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}

@@ -1,0 +1,154 @@
+"""Following the markers, beside OpenCV's blob detectors on the same drawn frames, on one core.
+
+The detectors only find blobs: naming them would come on top. Accuracy is reckoned on frames
+without noise, each blob given to the nearest true centre.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from analysis.markers import MarkerTracks, otsu_threshold, track
+from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
+from rigs.mock.settings import FrameCamera, MockSettings
+from rigs.mock.world import World
+from rigs.scene.frames import FrameOptics, PlateView
+from storage.streams import F64, U8
+from storage.video import VideoWriter, read_frames
+
+RATE_HZ = 100
+SIDE_PX = 504
+"""The kinematic grid's 42 mm."""
+
+
+def measure(frames: int = 300, runs: int = RUNS) -> Figures:
+    """Times per frame, centroids against each other and the truth, and decoding with tracking."""
+    images, truth = _video(frames, FrameCamera().noise)
+    clean, _ = _video(frames, 0.0)
+    layout = truth[0] - truth[0, 0]
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    default, tuned = _default_detector(), _tuned_detector()
+    try:
+        with one_core():
+            taken = alternate(
+                runs,
+                ours=lambda: track(images, layout),
+                default=lambda: [default.detect(image) for image in images],
+                tuned=lambda: [tuned.detect(image) for image in images],
+                components=lambda: [components(image) for image in images],
+            )
+    finally:
+        cv2.setNumThreads(threads)
+    best = [min(pair) for pair in zip(taken["tuned"], taken["components"], strict=True)]
+    figures = {
+        **ratio("x_blob_detector", taken["default"], taken["ours"]),
+        **ratio("x_best_opencv", best, taken["ours"]),
+    }
+    for name, prefix in (
+        ("ours", ""), ("default", "blob_detector_"), ("tuned", "tuned_detector_"),
+        ("components", "components_"),
+    ):  # fmt: skip
+        figures |= spread(f"{prefix}frame_ms", [value * 1e3 / frames for value in taken[name]])
+    ours = track(clean, layout).xy
+    by_components = np.stack([_nearest(components(image), at) for image, at in _zip(clean, truth)])
+    by_detector = np.stack([_nearest(_points(default, i), at) for i, at in _zip(clean, truth)])
+    figures |= {
+        "centroid_diff_px": _rms(ours - by_components),
+        "error_px": _rms(ours - truth),
+        "components_error_px": _rms(by_components - truth),
+        "blob_detector_error_px": _rms(by_detector - truth),
+        "blob_detector_found_share": float(np.isfinite(by_detector[..., 0]).mean()),
+    }
+    return figures | _from_file(images, layout, runs)
+
+
+def components(image: U8) -> F64:
+    """Threshold, connected components, and each one's centroid weighted by intensity."""
+    level = otsu_threshold(image)
+    binary = cv2.threshold(image, level, 255, cv2.THRESH_BINARY)[1]
+    stats = cv2.connectedComponentsWithStats(binary, connectivity=4)[2]
+    found = []
+    for left, top, width, height, area in stats[1:].tolist():
+        if area >= 50:
+            part = cv2.subtract(image[top : top + height, left : left + width], float(level))
+            moments = cv2.moments(part)
+            weight = moments["m00"]
+            found.append((left + moments["m10"] / weight, top + moments["m01"] / weight))
+    return np.array(found, np.float64).reshape(-1, 2)
+
+
+def _default_detector() -> cv2.SimpleBlobDetector:
+    """As OpenCV ships it (thresholds 50 to 220 in steps of 10), but for bright blobs."""
+    parameters = cv2.SimpleBlobDetector_Params()
+    parameters.blobColor = 255
+    return cv2.SimpleBlobDetector_create(parameters)
+
+
+def _tuned_detector() -> cv2.SimpleBlobDetector:
+    """With a single threshold, half-way, and no filter but the area's."""
+    parameters = cv2.SimpleBlobDetector_Params()
+    parameters.blobColor = 255
+    parameters.minThreshold, parameters.maxThreshold = 112.0, 122.0
+    parameters.thresholdStep = 10.0
+    parameters.minRepeatability = 1
+    parameters.filterByInertia = parameters.filterByConvexity = False
+    parameters.filterByCircularity = False
+    return cv2.SimpleBlobDetector_create(parameters)
+
+
+def _video(frames: int, noise: float) -> tuple[list[U8], F64]:
+    """A skin that slides 6 mm, and the true centres in pixels."""
+    camera = FrameCamera()
+    optics = FrameOptics(
+        px_per_mm=camera.px_per_mm, tip_radius_mm=camera.tip_radius_mm,
+        tip_level=camera.tip_level, ground_level=camera.ground_level, noise=noise,
+    )  # fmt: skip
+    view = PlateView(optics, SIDE_PX, SIDE_PX)
+    layout = World(MockSettings(seed=SEED)).skin.layout_mm
+    along = np.linspace(-3.0, 3.0, 300)[:frames, None, None]
+    tips = layout[None] + along * np.array([1.0, 0.3])
+    images = np.empty((frames, SIDE_PX, SIDE_PX), np.uint8)
+    view.draw(images, tips, None, np.arange(frames, dtype=np.int64), SEED)
+    return list(images), view.centre_px(tips)
+
+
+def _from_file(images: list[U8], layout: F64, runs: int) -> Figures:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frames.mkv"
+        video = VideoWriter(path, SIDE_PX, SIDE_PX, RATE_HZ)
+        video.write(np.stack(images))
+        video.close()
+
+        def decode_and_track() -> MarkerTracks:
+            return track(read_frames(path, threads=2), layout)
+
+        taken = alternate(runs, ours=decode_and_track)["ours"]
+    return rate("decode_track_x_realtime", len(images) / RATE_HZ, taken)
+
+
+def _zip(images: list[U8], truth: F64) -> list[tuple[U8, F64]]:
+    return list(zip(images, truth, strict=True))
+
+
+def _points(detector: cv2.SimpleBlobDetector, image: U8) -> F64:
+    return np.array([point.pt for point in detector.detect(image)], np.float64).reshape(-1, 2)
+
+
+def _nearest(found: F64, truth: F64) -> F64:
+    """The blob nearest to each true centre, (m, 2); NaN where none is within 5 px."""
+    result = np.full(truth.shape, np.nan)
+    if len(found):
+        apart = np.hypot(*np.moveaxis(found[None] - truth[:, None], -1, 0))
+        near = apart.min(axis=1) < 5.0
+        result[near] = found[apart.argmin(axis=1)][near]
+    return result
+
+
+def _rms(apart: F64) -> float:
+    """Root mean square distance, px; NaN (a marker not found) is left out."""
+    return float(np.sqrt(np.nanmean(np.sum(apart**2, axis=-1))))

@@ -1,0 +1,64 @@
+"""What Prefect costs a collection of 864 empty trials, in the shape of `flows.collect`.
+
+One flow, a task for every 25 trials, until the flow has ended and what it sends to its server
+has been sent. The embedded server is started before the clock runs; its work after the flow goes
+on in its own process. `loop_ms` is the bare loop; `batched_ms` is what the flow takes over it. Both
+are for all 864 together.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.measure import RUNS, Figures, alternate, spread
+from flows.orchestration import Parcel, prepare
+
+
+def measure(trials: int = 864, runs: int = RUNS) -> Figures:
+    """Milliseconds for `trials` empty steps, bare and in batches."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        prepare(Path(folder))  # before Prefect is imported
+        return _compare(trials, runs)
+
+
+def _compare(trials: int, runs: int) -> Figures:
+    from prefect import flow, task
+    from prefect.cache_policies import NO_CACHE
+    from prefect.events.worker import EventsWorker
+
+    from flows.collect import MOCK_BATCH
+
+    def step(trial: int) -> int:
+        return trial
+
+    @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
+    def take(part: Parcel[range]) -> int:
+        return sum(1 for trial in part.content if step(trial) >= 0)
+
+    @flow(name="collect", validate_parameters=False, persist_result=False)
+    def collect(wanted: Parcel[range]) -> int:
+        every = wanted.content
+        return sum(
+            take(Parcel(every[at : at + MOCK_BATCH])) for at in range(0, len(every), MOCK_BATCH)
+        )
+
+    def loop() -> int:
+        return sum(1 for trial in range(trials) if step(trial) >= 0)
+
+    def batched() -> None:
+        done: Any = collect(Parcel(range(trials)))
+        EventsWorker.drain_all(timeout=60, at_exit=False)
+        if done != trials:
+            raise RuntimeError(f"{done} of {trials} steps were taken")
+
+    taken = alternate(runs, loop=loop, batched=batched)
+    over = [
+        (full - bare) * 1e3 for full, bare in zip(taken["batched"], taken["loop"], strict=True)
+    ]
+    return {
+        **spread("loop_ms", [each * 1e3 for each in taken["loop"]]),
+        **spread("batched_ms", over),
+        "batched_ms_per_trial": sorted(over)[len(over) // 2] / trials,
+    }

@@ -1,0 +1,96 @@
+"""One slide of the kinematic grid on the simulated rig, without frames: what several time.
+
+Simulated, like everything that comes out of it.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from benchmarks.measure import SEED
+from rigs.capabilities import Segment
+from rigs.mock.devices import MockDevices, build_mock
+from rigs.mock.settings import MockSettings
+from storage.streams import EventChunk
+
+DEPTH_MM, SPEED_MM_S, LENGTH_MM = 2.8, 1.0, 15.0
+HOLD_S, CHUNK_S = 2.0, 0.1
+
+
+def press(devices: MockDevices, length_mm: float) -> None:
+    """Begin a trial: press at one end of the slide and let the skin settle."""
+    devices.arm.connect()
+    devices.begin_trial(SEED)
+    _go(devices, -length_mm / 2, -5.0, 20.0)
+    _go(devices, -length_mm / 2, DEPTH_MM, 2.0)
+    devices.clock.wait(1.0)
+    devices.world.advance()
+
+
+def hold_and_slide(devices: MockDevices, length_mm: float, events: bool = True) -> EventChunk:
+    """What is recorded of a trial: two seconds of hold, and the slide at 1 mm/s."""
+    parts: list[EventChunk] = []
+    if events:
+        devices.events.start()
+    devices.sync.start(100.0, 4321)
+    left = round((HOLD_S + length_mm / SPEED_MM_S) / CHUNK_S)
+    for chunk in range(left):
+        if chunk == round(HOLD_S / CHUNK_S):
+            target = devices.world.plane.pose(length_mm / 2, 0.0, DEPTH_MM)
+            devices.arm.start([Segment(target, SPEED_MM_S)])
+        devices.clock.wait(CHUNK_S)
+        parts.append(devices.events.read() if events else _nothing(devices))
+    devices.events.stop()
+    parts.append(devices.events.read())
+    devices.sync.stop()
+    return _joined(parts)
+
+
+def seconds(length_mm: float) -> float:
+    """How long `hold_and_slide` lasts in simulated time."""
+    return HOLD_S + length_mm / SPEED_MM_S
+
+
+@cache
+def slide_events(length_mm: float = LENGTH_MM) -> EventChunk:
+    """The events of one trial, default noise."""
+    devices = build_mock(MockSettings(seed=SEED))
+    press(devices, length_mm)
+    return hold_and_slide(devices, length_mm)
+
+
+def many_events(count: int) -> EventChunk:
+    """`count` events: one trial after another, as often as it takes."""
+    one = slide_events(LENGTH_MM if count > 100_000 else 1.0)
+    times = -(-count // len(one))
+    period = int(one.t_us[-1] - one.t_us[0]) + 1
+    rounds = np.repeat(np.arange(times, dtype=np.int64) * period, len(one))
+    return EventChunk(
+        np.tile(one.x, times)[:count],
+        np.tile(one.y, times)[:count],
+        np.tile(one.p, times)[:count],
+        (np.tile(one.t_us, times) + rounds)[:count],
+    )
+
+
+def _go(devices: MockDevices, x_mm: float, depth_mm: float, speed: float) -> None:
+    devices.arm.start([Segment(devices.world.plane.pose(x_mm, 0.0, depth_mm), speed)])
+    while not devices.arm.progress().done:
+        devices.clock.wait(0.02)
+
+
+def _nothing(devices: MockDevices) -> EventChunk:
+    devices.world.advance()
+    empty = np.empty(0, np.uint16)
+    return EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))
+
+
+def _joined(parts: list[EventChunk]) -> EventChunk:
+    return EventChunk(
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.p for part in parts]),
+        np.concatenate([part.t_us for part in parts]),
+    )

@@ -1,0 +1,100 @@
+"""The embedded Prefect server as a process of ours: it survives Ctrl-C and dies with its parent.
+
+Prefect's own embedded server shares the terminal's process group, so Ctrl-C takes it away while
+the flow still has to tell it that it crashed (a minute of retries), and it outlives a killed
+parent. This one leads a session of its own, and the kernel ends it when its parent dies.
+
+Run as a module it is the server; imported it starts one.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+START_LIMIT_S = 120.0
+STOP_LIMIT_S = 10.0
+_PR_SET_PDEATHSIG = 1
+
+
+class ServerError(RuntimeError):
+    """The embedded server did not start; the message says where its log is."""
+
+
+class EmbeddedServer:
+    """One server on a free port of the loopback, its log in Prefect's home."""
+
+    def __init__(self, home: Path) -> None:
+        self._log = home / "server.log"
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = int(probe.getsockname()[1])
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "flows.embedded_server", str(self.port), str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env={**os.environ, "PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"},
+            )
+        atexit.register(self.stop)
+        self._wait_until_healthy()
+
+    @property
+    def url(self) -> str:
+        """What PREFECT_API_URL must be."""
+        return f"http://127.0.0.1:{self.port}/api"
+
+    def _wait_until_healthy(self) -> None:
+        end = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < end:
+            try:
+                self._process.wait(timeout=0.05)
+            except subprocess.TimeoutExpired:
+                if self._healthy():
+                    return
+            else:
+                break
+        self.stop()
+        raise ServerError(f"the embedded Prefect server did not start; see {self._log}")
+
+    def _healthy(self) -> bool:
+        try:
+            with urllib.request.urlopen(f"{self.url}/health", timeout=5) as answer:
+                return int(answer.status) == 200
+        except (urllib.error.URLError, OSError):
+            return False
+
+    def stop(self) -> None:
+        """End the server; safe to call more than once."""
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(timeout=STOP_LIMIT_S)
+
+
+def _serve(port: int, parent: int) -> None:
+    """Be the server until told to end, or until the parent dies."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        return  # it died before it could be watched
+    import uvicorn
+    from prefect.server.api.server import create_app
+
+    uvicorn.run(create_app, factory=True, host="127.0.0.1", port=port, log_level="error")
+
+
+if __name__ == "__main__":
+    _serve(int(sys.argv[1]), int(sys.argv[2]))
