@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.markers import Floats, Frame, MarkerTracker, MarkerTracks, checked_frame, stack_tracks
+from analysis.blobs import Floats, Frame, checked_frame
+from analysis.markers import MarkerTracker, MarkerTracks, stack_tracks
 
 MAX_BRIDGED = 5
 """Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm

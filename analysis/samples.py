@@ -11,11 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-NO_SLIP = 0
-INCIPIENT = 1
-GROSS = 2
-CLASSES = (NO_SLIP, INCIPIENT, GROSS)
-CLASS_NAMES = ("no slip", "incipient", "gross")
+from analysis.metrics import GROSS, INCIPIENT, NO_SLIP
 
 
 def consecutive_windows(start_ns: int, end_ns: int, window_ns: int) -> NDArray[np.int64]:

@@ -9,22 +9,15 @@ number of threads).
 
 from __future__ import annotations
 
-import io
-import os
-import pickle
-import tempfile
 import time
-import zipfile
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from pydantic import ValidationError
 from scipy.special import log_softmax
 from torch import nn
 
@@ -44,8 +37,6 @@ SILENT_RATE = 1e-5
 
 SATURATED_RATE = 0.9
 """Spikes per neuron and step at or above which a layer counts as saturated (1 is the most)."""
-
-FORMAT = "sliplab-model-1"
 
 
 @dataclass(frozen=True)
@@ -193,79 +184,6 @@ def predict_counts(fitted: Fitted, x: Array) -> npt.NDArray[np.int64]:
         ValueError: samples of another shape.
     """
     return fused_counts(restore(fitted), x)
-
-
-def save(path: Path, fitted: Fitted) -> None:
-    """Write a model file: whole or not at all, and the same bytes for the same model."""
-    content = {
-        "format": FORMAT,
-        "state_dict": fitted.state_dict,
-        "network": fitted.network.model_dump(mode="json"),
-        "windows": fitted.windows.model_dump(mode="json"),
-        "training": fitted.training.model_dump(mode="json"),
-        "seed": fitted.seed,
-        "history": [asdict(record) for record in fitted.history],
-        "chosen_epoch": fitted.chosen_epoch,
-        "warnings": list(fitted.warnings),
-    }
-    buffer = io.BytesIO()  # torch writes a file's name into it; a buffer has none
-    torch.save(content, buffer)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(buffer.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
-def load(path: Path) -> Fitted:
-    """Read a model file that `save` wrote. Nothing in it is executed.
-
-    Raises:
-        OSError: there is none, or it cannot be read.
-        ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
-    """
-    data = path.read_bytes()
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            spoilt = archive.testzip()  # torch does not look at the checksums
-        if spoilt is not None:
-            raise ValueError(f"{spoilt} in it is damaged")
-        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"its format is not {FORMAT}")
-        fitted = Fitted(
-            state_dict=content["state_dict"],
-            network=Network.model_validate(content["network"]),
-            windows=Windows.model_validate(content["windows"]),
-            training=Training.model_validate(content["training"]),
-            seed=content["seed"],
-            history=tuple(EpochRecord(**record) for record in content["history"]),
-            chosen_epoch=content["chosen_epoch"],
-            warnings=tuple(content["warnings"]),
-        )
-        restore(fitted)
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-        RuntimeError,
-        ValidationError,
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-    ) as error:
-        raise ValueError(f"{path}: not a model file of this program: {error}") from error
-    return fitted
 
 
 @dataclass(frozen=True)

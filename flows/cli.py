@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.exceptions import TyperException
 
 from flows import console
 from protocols.errors import InputError
@@ -67,72 +64,12 @@ def plan(
         rig_file, _ = load_rig_file(rig)
         check_plan(rig_file, found, str(rig))
         needed = round(plan_bytes(rig_file, found))
+    from flows import plan_view
+
     if as_json:
-        rows = [
-            {
-                "index": trial.index,
-                "id": trial.id,
-                "role": trial.role,
-                "block": trial.block,
-                "repetition": trial.repetition,
-                "condition": found.describe(trial),
-                "split": trial.split,
-                "seconds": found.seconds(trial),
-                "before": [
-                    {"kind": task.kind, "by_person": task.by_person, "prompt": task.prompt}
-                    for task in found.tasks_before(trial)
-                ],
-            }
-            for trial in found
-        ]
-        console.print_json(
-            {
-                "protocol": found.protocol.name,
-                "trials": rows,
-                "count": len(found),
-                "seconds": found.total_seconds,
-                "bytes": needed,
-                "stretches": found.stretches(),
-                "warnings": found.warnings(),
-            }
-        )
-        return
-    factors = list(found.protocol.collection.factors)
-    table = []
-    for trial in found:
-        known = found.describe(trial)
-        before = ", ".join(
-            f"{task.kind} (person)" if task.by_person else task.kind
-            for task in found.tasks_before(trial)
-        )
-        table.append(
-            [
-                trial.index,
-                trial.block,
-                *(known[name].split()[0] for name in factors),
-                trial.repetition,
-                trial.split if trial.role == "measured" else trial.role,
-                f"{found.seconds(trial):.1f}",
-                before,
-            ]
-        )
-    units = {name: factor.unit for name, factor in found.protocol.collection.factors.items()}
-    named = [f"{name} ({units[name]})" if units[name] else name for name in factors]
-    columns = ["#", "block", *named, "rep.", "split", "motion (s)", "before it"]
-    console.print_table(f"{protocol}: {found.protocol.title}", columns, table, limit=40)
-    console.print_pairs(
-        "In all",
-        {
-            "trials": len(found),
-            "motion": console.duration(found.total_seconds),
-            "disk": console.size(needed) if needed is not None else "give --rig to know",
-            "stretches without a person": ", ".join(
-                f"{last - first + 1} trials" for first, last in found.stretches()
-            ),
-        },
-    )
-    for warning in found.warnings():
-        console.say(f"note: {warning}")
+        console.print_json(plan_view.as_json(found, needed))
+    else:
+        plan_view.show(found, needed)
 
 
 @app.command()
@@ -408,50 +345,3 @@ def _finish(result: dict[str, Any], title: str, as_json: bool) -> None:
         for key, value in result.items()
     }
     console.print_pairs(title, shown)
-
-
-def _terminated(number: int, frame: object) -> None:
-    """SIGTERM stops as Ctrl-C does: the arm first."""
-    raise KeyboardInterrupt
-
-
-def main() -> None:
-    """Entry point: maps errors to messages and exit codes."""
-    signal.signal(signal.SIGTERM, _terminated)
-    try:
-        code = app(standalone_mode=False)
-        if code == console.INTERRUPTED:
-            _interrupted()
-        sys.exit(code if isinstance(code, int) else console.DONE)
-    except InputError as error:
-        console.say(f"error: {error.message}")
-        sys.exit(console.WRONG_INPUT)
-    except KeyboardInterrupt:
-        sys.exit(_interrupted())
-    except Exception as error:
-        sys.exit(_explain(error))
-
-
-def _interrupted() -> int:
-    console.say("interrupted: every committed trial is kept; run the same command to go on")
-    return console.INTERRUPTED
-
-
-def _explain(error: Exception) -> int:
-    """Print what went wrong; a fault of the program itself shows where."""
-    if isinstance(error, typer.Exit):
-        return int(error.exit_code)
-    if isinstance(error, typer.Abort):
-        return _interrupted()
-    if isinstance(error, TyperException):
-        console.say(f"error: {error.format_message()} (see --help)")
-        return console.WRONG_INPUT
-    expected = {"StoreError", "RigError", "ArmFault", "Locked", "StopRequested"}
-    if type(error).__name__ not in expected:
-        console.messages.print_exception(max_frames=8)
-    console.say(f"error: {error or type(error).__name__}")
-    return console.FAILED
-
-
-if __name__ == "__main__":
-    main()

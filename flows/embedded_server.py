@@ -40,7 +40,14 @@ class EmbeddedServer:
             self.port = int(probe.getsockname()[1])
         with self._log.open("w") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "flows.embedded_server", str(self.port), str(os.getpid())],
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "flows.embedded_server",
+                    str(self.port),
+                    str(os.getpid()),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

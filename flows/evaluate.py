@@ -10,7 +10,7 @@ import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis import dataset, metrics, training
+from analysis import dataset, metrics, model_file, training
 from analysis.baselines import evaluate_baselines
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
@@ -113,7 +113,7 @@ def count_spikes(wanted: Parcel[Job]) -> int:
         if not Derived.of(job.store, COUNTS, item.name).fresh(trial.id, key)
     ]
     if work:
-        fitted = training.load(job.model.path)
+        fitted = model_file.load(job.model.path)
         with console.bar("evaluate (trials)", len(work)) as bar:
             for item, trial, recording, key in work:
                 x, end_ns = dataset.trial_windows(recording, windows)
@@ -144,7 +144,7 @@ def _score_windows(job: Job) -> dict[str, Any]:
     settings = training_settings(job.campaigns)
     train = load_samples(job.store, job.campaigns, "train")
     test = load_samples(job.store, job.campaigns, "test")
-    counts = training.predict_counts(training.load(job.model.path), test.x)
+    counts = training.predict_counts(model_file.load(job.model.path), test.x)
     margin = settings.detection.margin
     by_trial = {
         str(number): asdict(

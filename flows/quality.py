@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from analysis.clocks import ClockFit, ClockRefused, fit_clock
-from protocols.model import Gates
+from protocols.conditions import Gates
 from rigs.rig import TrialRun
 from storage.hdf5 import StreamReader
 from storage.streams import I64

@@ -7,8 +7,8 @@ from typing import Any
 
 from prefect import flow
 
+from analysis import model_file
 from analysis import report as page
-from analysis import training
 from flows import evaluate, sections, timing
 from flows.campaigns import Collected
 from flows.orchestration import Parcel, run
@@ -57,7 +57,7 @@ def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
     with timing.timed(store, "report"):
         evaluation = Derived.of(store, evaluate.STEP).read(evaluate.NAME)
         model = evaluate.choose_model(wanted_models(store, campaigns))
-        fitted = training.load(model.path)
+        fitted = model_file.load(model.path)
         summary = make_summary(store, campaigns, evaluation)
         html = page.render(
             [item.name for item in campaigns],

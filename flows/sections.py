@@ -15,7 +15,7 @@ from analysis.training import Fitted
 from flows.campaigns import Collected
 from flows.evaluate import trial_counts
 from flows.label import STEP as LABELS
-from protocols.model import Level
+from protocols.factors import Level
 from protocols.settings import Detection
 from storage.derived import Derived
 from storage.recording import Recording

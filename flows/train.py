@@ -9,7 +9,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis import dataset, training
+from analysis import dataset, model_file, training
 from analysis.dataset import SampleSet
 from flows import console
 from flows.campaigns import Collected, training_campaigns
@@ -128,7 +128,7 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]])
     for warning in fitted.warnings:
         console.say(f"warning: {warning}")
     model.path.parent.mkdir(parents=True, exist_ok=True)
-    training.save(model.path, fitted)
+    model_file.save(model.path, fitted)
     info = {
         "key": model.key,
         "seed": model.seed,

@@ -12,14 +12,13 @@ from decimal import Decimal
 from itertools import product
 from typing import Any
 
-from protocols.model import (
+from protocols.factors import Level
+from protocols.model import Collection, Protocol
+from protocols.phases import (
     Approach,
-    Collection,
     Hold,
-    Level,
     PlateMotion,
     Press,
-    Protocol,
     Release,
     Retract,
     Return,

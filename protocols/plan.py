@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Literal
 
 from protocols.errors import InputError
+from protocols.factors import Level
 from protocols.hashing import hash_data, hash_integer
-from protocols.model import Level, Protocol
+from protocols.model import Protocol
 from protocols.motion import build_program, check_limits
 from protocols.program import Dwell, Program
 from protocols.quantity import FILE_UNITS, canonical, to_decimal

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from protocols.factors import Factor, Level
 from protocols.hashing import hash_integer
-from protocols.model import Factor, Level
 from protocols.quantity import canonical, parse
 from protocols.settings import Split
 from protocols.yaml_file import KeyedError

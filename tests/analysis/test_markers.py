@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.markers import MarkerTracker, find_blobs, match_layout, track
+from analysis.blobs import find_blobs, match_layout
+from analysis.markers import MarkerTracker, track
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]

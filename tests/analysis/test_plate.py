@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.markers import find_blobs, track
+from analysis.blobs import find_blobs
+from analysis.markers import track
 from analysis.plate import PlateTracker, bridge, track_plate, track_video
 
 Floats = NDArray[np.float64]

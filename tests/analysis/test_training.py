@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from analysis import metrics, training
+from analysis.model_file import FORMAT, load, save
 from analysis.network import build, spike_counts, weights
-from analysis.training import EpochRecord, Fitted, fit, load, predict_counts, restore, save
+from analysis.training import EpochRecord, Fitted, fit, predict_counts, restore
 from protocols.settings import Network, Training, Windows
 
 NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
@@ -204,7 +205,7 @@ def test_a_failed_save_leaves_the_old_file_and_no_litter(
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr(training.os, "replace", fail)
+    monkeypatch.setattr("storage.files.os.replace", fail)
     with pytest.raises(OSError, match="no space"):
         save(path, fitted)
     assert [p.name for p in tmp_path.iterdir()] == ["model.pt"]
@@ -230,7 +231,7 @@ def damaged(path: Path, kind: str, good: bytes) -> None:
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr("a.txt", "a")
     elif kind == "code":
-        torch.save({"format": training.FORMAT, "state_dict": Bomb()}, path)
+        torch.save({"format": FORMAT, "state_dict": Bomb()}, path)
     elif kind == "pickle":
         path.write_bytes(pickle.dumps(Bomb()))
     elif kind == "other format":

@@ -20,7 +20,7 @@ from storage.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 
-SLIPLAB = [sys.executable, "-m", "flows.cli"]
+SLIPLAB = [sys.executable, "-m", "flows"]
 
 
 def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:

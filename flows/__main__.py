@@ -1,0 +1,60 @@
+"""The program's entry: runs the command line, maps faults to messages and exit codes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+import typer
+from typer.exceptions import TyperException
+
+from flows import console
+from flows.cli import app
+from protocols.errors import InputError
+
+
+def _terminated(number: int, frame: object) -> None:
+    """SIGTERM stops as Ctrl-C does: the arm first."""
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point: maps errors to messages and exit codes."""
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        code = app(standalone_mode=False)
+        if code == console.INTERRUPTED:
+            _interrupted()
+        sys.exit(code if isinstance(code, int) else console.DONE)
+    except InputError as error:
+        console.say(f"error: {error.message}")
+        sys.exit(console.WRONG_INPUT)
+    except KeyboardInterrupt:
+        sys.exit(_interrupted())
+    except Exception as error:
+        sys.exit(_explain(error))
+
+
+def _interrupted() -> int:
+    console.say("interrupted: every committed trial is kept; run the same command to go on")
+    return console.INTERRUPTED
+
+
+def _explain(error: Exception) -> int:
+    """Print what went wrong; a fault of the program itself shows where."""
+    if isinstance(error, typer.Exit):
+        return int(error.exit_code)
+    if isinstance(error, typer.Abort):
+        return _interrupted()
+    if isinstance(error, TyperException):
+        console.say(f"error: {error.format_message()} (see --help)")
+        return console.WRONG_INPUT
+    expected = {"StoreError", "RigError", "ArmFault", "Locked", "StopRequested"}
+    if type(error).__name__ not in expected:
+        console.messages.print_exception(max_frames=8)
+    console.say(f"error: {error or type(error).__name__}")
+    return console.FAILED
+
+
+if __name__ == "__main__":
+    main()

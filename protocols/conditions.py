@@ -1,0 +1,129 @@
+"""What is recorded of a trial, what it may not exceed, when it is good, how a rig is kept fit."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from protocols.factors import LevelField
+from protocols.quantity import (
+    KilogramsOrRef,
+    Millimetres,
+    PositiveMillimetres,
+    PositiveSeconds,
+    PositiveSpeed,
+)
+from protocols.yaml_file import StrictModel
+
+
+class Region(StrictModel):
+    """The part of the plate that the outside camera reads out, centred."""
+
+    width: PositiveMillimetres
+    height: PositiveMillimetres
+
+
+class Recording(StrictModel):
+    """What is kept of each trial, from the end of settling to the end of the motion."""
+
+    region: Region
+    sync_rate: Annotated[Literal[100], Field()] = 100
+    """Ticks of the sync box a second, Hz: frames are taken on them."""
+    streams: tuple[Literal["events", "frames", "poses"], ...] = ("events", "frames", "poses")
+
+    @field_validator("streams")
+    @classmethod
+    def _needed(cls, streams: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(streams)) != len(streams) or "events" not in streams or "poses" not in streams:
+            raise ValueError("must hold 'events' and 'poses', and may hold 'frames', none twice")
+        return streams
+
+
+class Axis(StrictModel):
+    """Allowed interval of one coordinate, in plate coordinates."""
+
+    low: Millimetres
+    high: Millimetres
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Axis:
+        if not self.low < self.high:
+            raise ValueError("'low' must be below 'high'")
+        return self
+
+
+class Workspace(StrictModel):
+    """The box that the sensor's centre must stay in, in plate coordinates."""
+
+    x: Axis
+    y: Axis
+
+
+class Limits(StrictModel):
+    """What no trial of this protocol may exceed, checked before anything moves."""
+
+    depth: PositiveMillimetres
+    speed: PositiveSpeed
+    clearance: PositiveMillimetres
+    workspace: Workspace
+    duration: PositiveSeconds
+
+
+class Gates(StrictModel):
+    """When a trial is not good enough and is taken again."""
+
+    sync_uncertainty: PositiveSeconds = Decimal("0.001")
+    """95 % uncertainty of events against frames and poses."""
+    frames_lost: Annotated[int, Field(ge=0)] = 0
+    event_gap: PositiveSeconds = Decimal("0.05")
+    """Longest silence of the event camera while the arm moves in contact."""
+    retakes: Annotated[int, Field(ge=0, le=10)] = 2
+    """How often a trial is taken again before it is set aside."""
+
+
+class References(StrictModel):
+    """One condition taken again and again, to see the skin wear and the rig drift."""
+
+    every: Annotated[int, Field(ge=1)]
+    condition: dict[str, LevelField]
+
+
+class WarmUp(StrictModel):
+    """Presses before the first trial of every stretch of work."""
+
+    presses: Annotated[int, Field(ge=1, le=100)]
+    depth: PositiveMillimetres
+    speed: PositiveSpeed
+    clearance: PositiveMillimetres
+
+
+class Rezero(StrictModel):
+    """Depth zero found again by touching off, before every so many trials."""
+
+    every: Annotated[int, Field(ge=1)]
+    speed: PositiveSpeed
+    search: PositiveMillimetres
+    """How far beyond the taught plane the touch may be looked for; a hard limit."""
+
+
+class Cleaning(StrictModel):
+    """A person cleans skin and plate before every so many trials."""
+
+    every: Annotated[int, Field(ge=1)]
+    prompt: Annotated[str, Field(min_length=1, max_length=400)]
+
+
+class Maintenance(StrictModel):
+    """What keeps a long campaign comparable from its first trial to its last."""
+
+    warm_up: WarmUp | None = None
+    rezero: Rezero | None = None
+    clean: Cleaning | None = None
+
+
+class PlateSetup(StrictModel):
+    """The plate that hangs on the slider in gravity and disturbance trials."""
+
+    mass: KilogramsOrRef

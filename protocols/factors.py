@@ -1,0 +1,122 @@
+"""Factors of an experiment and their levels, as a protocol file gives them: a list or a range."""
+
+from __future__ import annotations
+
+import re
+from decimal import Decimal
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, PlainSerializer, field_validator, model_validator
+
+from protocols.quantity import UNITS, canonical, to_decimal
+from protocols.yaml_file import StrictModel
+
+MAX_TRIALS = 1_000_000
+_WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
+
+Level = Decimal | str
+
+
+def _number(raw: object) -> Decimal:
+    return to_decimal(raw)
+
+
+Number = Annotated[Decimal, BeforeValidator(_number), PlainSerializer(canonical)]
+
+
+class Range(StrictModel):
+    """Evenly spaced levels, both ends included."""
+
+    start: Number = Field(alias="from")
+    stop: Number = Field(alias="to")
+    step: Number
+
+    @model_validator(mode="after")
+    def _whole(self) -> Range:
+        if self.step <= 0:
+            raise ValueError(f"step = {canonical(self.step)} must be more than 0")
+        if self.stop < self.start:
+            raise ValueError("'to' must not be below 'from'")
+        if (self.stop - self.start) % self.step:
+            raise ValueError(
+                f"from {canonical(self.start)} to {canonical(self.stop)} is not a whole number "
+                f"of steps of {canonical(self.step)}"
+            )
+        if self.count > MAX_TRIALS:
+            raise ValueError(f"has {self.count} levels; at most {MAX_TRIALS:,} trials")
+        return self
+
+    @property
+    def count(self) -> int:
+        """Number of levels."""
+        return int((self.stop - self.start) / self.step) + 1
+
+    def levels(self) -> tuple[Decimal, ...]:
+        """The levels in order."""
+        return tuple(self.start + index * self.step for index in range(self.count))
+
+
+def _level(raw: object) -> Level:
+    if isinstance(raw, str):
+        if not _WORD.fullmatch(raw):
+            raise ValueError(
+                "must be a number (the unit stands once, in 'unit') or a word of letters, "
+                "digits, '_' and '-'"
+            )
+        return raw
+    return to_decimal(raw)
+
+
+def _write_level(level: Level) -> str:
+    return level if isinstance(level, str) else canonical(level)
+
+
+LevelField = Annotated[Level, BeforeValidator(_level), PlainSerializer(_write_level)]
+
+
+class Factor(StrictModel):
+    """One factor of the factorial: its unit and its levels, as a list or a range."""
+
+    unit: str | None = None
+    values: tuple[LevelField, ...] | None = None
+    range: Range | None = None
+    optional: tuple[LevelField, ...] = ()
+    """Levels that the protocol knows but does not take unless they are switched on."""
+    changeover: Literal["none", "person"] = "none"
+    """`person`: somebody has to change it by hand, so its levels become outer blocks."""
+
+    @field_validator("unit")
+    @classmethod
+    def _known(cls, unit: str | None) -> str | None:
+        canonical_units = sorted({kind for kind, _ in UNITS.values()})
+        if unit is not None and unit not in canonical_units:
+            raise ValueError(f"must be one of {', '.join(canonical_units)}")
+        return unit
+
+    @model_validator(mode="after")
+    def _levels(self) -> Factor:
+        if (self.values is None) == (self.range is None):
+            raise ValueError("must have either 'values' or 'range'")
+        levels = self.levels()
+        if not levels:
+            raise ValueError("has no levels; give at least one")
+        seen: set[Level] = set()
+        for level in (*levels, *self.optional):
+            if level in seen:
+                raise ValueError(f"has the level {_write_level(level)} twice")
+            seen.add(level)
+            if isinstance(level, str) == (self.unit is not None):
+                raise ValueError(
+                    f"has the level {_write_level(level)}: numbers need a unit, words have none"
+                )
+        return self
+
+    def levels(self) -> tuple[Level, ...]:
+        """The levels taken, in the order of the file."""
+        if self.range is not None:
+            return self.range.levels()
+        return self.values or ()
+
+    def text(self, level: Level) -> str:
+        """A level with its unit: ``2.4 mm``, ``left``."""
+        return level if isinstance(level, str) else f"{canonical(level)} {self.unit}"

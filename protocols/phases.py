@@ -1,0 +1,112 @@
+"""The phases that a trial's motion is made of, and nothing about their order."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from protocols.quantity import (
+    DegreesOrRef,
+    FactorRef,
+    MillimetresOrRef,
+    PercentOrRef,
+    PositiveMillimetres,
+    PositiveSeconds,
+    PositiveSpeed,
+    Seconds,
+    SpeedOrRef,
+)
+from protocols.yaml_file import StrictModel, register_tags
+
+
+class Approach(StrictModel):
+    """Travel, clear of the plate, to above the place where the trial begins."""
+
+    phase: Literal["approach"]
+    clearance: PositiveMillimetres
+    speed: PositiveSpeed
+
+
+class Press(StrictModel):
+    """Straight in along the plate's normal, to an indentation depth."""
+
+    phase: Literal["press"]
+    depth: MillimetresOrRef
+    speed: PositiveSpeed
+
+
+class Hold(StrictModel):
+    """Standing still: `settle` passes first, then `duration`, which may be recorded."""
+
+    phase: Literal["hold"]
+    duration: PositiveSeconds
+    settle: Seconds = Decimal(0)
+
+
+class Slide(StrictModel):
+    """Along the plate at constant depth; the path is centred on the plate."""
+
+    phase: Literal["slide"]
+    distance: MillimetresOrRef
+    speed: SpeedOrRef
+    direction: DegreesOrRef
+
+
+def _share_or_side(raw: object) -> object:
+    if isinstance(raw, str) and raw.startswith("$"):
+        return FactorRef(raw[1:])
+    return raw
+
+
+SideField = Annotated[
+    Literal["left", "right"] | FactorRef, BeforeValidator(_share_or_side), PlainSerializer(str)
+]
+
+
+class Disturbance(StrictModel):
+    """A sideways motion during retraction, as a share of the retraction's speed."""
+
+    share: PercentOrRef
+    side: SideField
+
+
+class Retract(StrictModel):
+    """Slowly out along the normal, with an optional sideways disturbance."""
+
+    phase: Literal["retract"]
+    distance: MillimetresOrRef
+    speed: SpeedOrRef
+    disturbance: Disturbance | None = None
+
+
+class PlateMotion(StrictModel):
+    """Something done to the sliding plate."""
+
+    phase: Literal["plate"]
+    action: Literal["raise", "release", "catch"]
+    duration: Seconds = Decimal(0)
+
+
+class Release(StrictModel):
+    """Out along the normal until clear of the plate."""
+
+    phase: Literal["release"]
+    clearance: PositiveMillimetres
+    speed: PositiveSpeed
+
+
+class Return(StrictModel):
+    """Back to above the plate's centre."""
+
+    phase: Literal["return"]
+    speed: PositiveSpeed
+
+
+_PHASES = ("approach", "press", "hold", "slide", "retract", "plate", "release", "return")
+register_tags(*_PHASES)
+Phase = Annotated[
+    Approach | Press | Hold | Slide | Retract | PlateMotion | Release | Return,
+    Field(discriminator="phase"),
+]
