@@ -37,6 +37,8 @@ CampaignOption = Annotated[
 
 FULL = ("kinematic", "gravity", "disturbance")
 PILOT = ("pilot", "pilot_gravity")
+SHOWN = ("campaign", "trial", "recorded_s", "events", "frames", "attempt", "simulated")
+"""Columns of the catalogue that fit a terminal."""
 
 
 def package_file(package: str, name: str) -> Path:
@@ -240,9 +242,10 @@ def trials(
             {"count": len(table), "trials": json.loads(table.to_json(orient="records"))}
         )
     elif output is None:
-        rows = [[_plain(value) for value in row] for row in table.itertuples(index=False)]
-        console.print_table(f"trials of {store}", list(table.columns), rows, limit=40)
-        console.say(f"{len(table)} trials")
+        shown = [name for name in SHOWN if name in table.columns]
+        rows = [list(row) for row in table[shown].itertuples(index=False)]
+        console.print_table(f"trials of {store}", shown, rows, limit=40)
+        console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
 
 
 @app.command()
@@ -266,11 +269,6 @@ def verify(store: StoreArgument, as_json: JsonOption = False) -> None:
         console.results.print(f"{total} trials, all as they were committed")
     if problems:
         raise typer.Exit(console.FAILED)
-
-
-def _plain(value: object) -> object:
-    """A catalogue cell for a table: no NaN where a factor does not apply."""
-    return None if isinstance(value, float) and value != value else value
 
 
 def _prepare(folder: Path) -> None:

@@ -19,7 +19,7 @@ from storage.files import read_json, write_json, write_text
 from storage.store import Store, StoreError
 
 STEP = "report"
-VERSION = 1
+VERSION = 2
 
 
 def report_folder(store: Store) -> Path:

@@ -397,7 +397,7 @@ def _labels(summary: dict[str, Any]) -> Section | None:
             number(values["median_abs"], 2),
             number(values["max_abs"], 2),
         ]
-        for kind, values in errors.items()
+        for kind, values in ((kind, errors[kind]) for kind in ("incipient", "gross"))
     ]
     return Section(
         "How exact the labels are",

@@ -1,0 +1,101 @@
+"""The benchmarks run and say what they should, on sizes too small to mean anything."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from benchmarks import __main__ as command
+from benchmarks import measure
+
+TINY: dict[str, dict[str, Any]] = {
+    "storage": {"events": 30_000, "frames": 3, "size": 96, "runs": 1},
+    "scene": {"length_mm": 1.0, "frames": 5, "runs": 1},
+    "clocks": {"trains": 3, "seconds": 10.0},
+    "labels": {"frames": 5, "runs": 1},
+}
+PROMISED = {
+    "storage": {
+        "write_m_events_per_s", "read_m_events_per_s", "window_30ms_ms", "bytes_per_event",
+        "frames_per_s_800", "pickle_write_m_events_per_s", "pickle_read_m_events_per_s",
+        "pickle_window_30ms_ms", "pickle_bytes_per_event",
+    },
+    "scene": {
+        "tracks_x_realtime", "ns_per_event", "frame_ms_512", "contact_x_realtime", "peak_mb",
+    },
+    "clocks": {
+        "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
+        "index_worst_error_us", "xcorr_worst_error_us",
+    },
+    "labels": {
+        "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_a_benchmark_gives_what_is_promised(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole: Callable[..., command.Result] = command.result
+    monkeypatch.setattr(command, "result", lambda wanted: whole(wanted, **TINY[wanted]))
+    monkeypatch.setattr("sys.argv", ["benchmarks", name, "--json"])
+    assert command.main() == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    found = json.loads(line)
+    assert set(found) == {"name", "figures", "versions", "machine", "seed"}
+    assert found["name"] == name
+    assert found["figures"].keys() >= PROMISED[name]
+    for figure, value in found["figures"].items():
+        assert isinstance(value, float), figure
+        assert math.isfinite(value), figure
+        assert value >= 0, figure
+        low, high = (found["figures"].get(f"{figure}_{end}", value) for end in ("min", "max"))
+        assert low <= value <= high
+    assert set(found["machine"]) == {"cpu", "cores", "memory_gb", "os"}
+    assert found["versions"].keys() >= {"python", "sliplab", "numpy"}
+    if name == "clocks":
+        assert (found["figures"]["accepted_share"], found["figures"]["wrong_accepted"]) == (1, 0)
+
+
+def test_rivals_take_turns() -> None:
+    order: list[str] = []
+    taken = measure.alternate(2, a=lambda: order.append("a"), b=lambda: order.append("b"))
+    assert "".join(order) == "ababab"  # the first round does not count
+    assert {name: len(times) for name, times in taken.items()} == {"a": 2, "b": 2}
+
+
+def test_ratios_are_of_pairs() -> None:
+    assert measure.ratio("x", [4.0, 9.0, 2.0], [2.0, 3.0, 2.0]) == {
+        "x": 2.0,
+        "x_min": 1.0,
+        "x_max": 3.0,
+    }
+
+
+def test_the_page_has_every_figure_once() -> None:
+    one = {
+        "name": "scene",
+        "figures": {"a_ms": 1.25, "a_ms_min": 1.0, "a_ms_max": 2.0, "b_mb": 1234.5, "c_ms": None},
+        "versions": {"python": "3"},
+        "machine": {"cpu": "some", "cores": 2, "memory_gb": 8.0, "os": "an OS"},
+        "seed": 1,
+    }
+    page = command.markdown([one], "2026-01-01")
+    assert "| a_ms | 1.25 | 1 to 2 |" in page
+    assert "| b_mb | 1,234 |  |" in page
+    assert "| c_ms | - |  |" in page
+
+
+def test_an_unknown_name_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["benchmarks", "everything"])
+    with pytest.raises(SystemExit) as refused:
+        command.main()
+    assert refused.value.code == 2
+    assert "storage" in capsys.readouterr().err
