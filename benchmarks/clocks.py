@@ -1,10 +1,11 @@
 """Clock fits on faulty pulse trains, beside the two ways in which trains are usually paired.
 
-A train: 20 s of the code at 100 ticks a second, drift of up to 100 ppm, 5 us of jitter, 2 % missing, 1 %
-reported twice, 2 % late by up to 5 ms, stamps cut to whole microseconds. The error of a fit is
-the largest that its map makes anywhere in the train. Every seed gives a stretch of the same code of
-65,535 ticks; stretches that overlap do fit where they overlap, so the trains that must be refused
-are taken from elsewhere in it.
+A train: 20 s of the code at 100 ticks a second, drift of up to 100 ppm, 5 us of jitter, 2 %
+missing, 1 % reported twice, 2 % late by up to 5 ms, stamps cut to whole microseconds. The error of
+a fit is the largest that its map makes anywhere in the train. `wrong_accepted` counts maps that are
+wrong by over 100 us, and fits of trains that do not belong together: without a code, or of another
+stretch of it. Every seed gives a stretch of the same 65,535 ticks; stretches that overlap do fit
+where they overlap, so the other stretch is one that does not.
 """
 
 from __future__ import annotations

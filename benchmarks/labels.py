@@ -2,7 +2,8 @@
 
 The detectors only find blobs: naming them would come on top. `x_best_opencv` takes the faster of a
 tuned detector and connected components in each round. Accuracy is reckoned on frames without noise,
-each blob given to the nearest true centre; `centroid_diff_px` is against connected components.
+each blob given to the nearest true centre; `centroid_diff_px` is against connected components
+over the whole frame at the tracker's own threshold, so only rounding may remain of it.
 Decoding uses two threads.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +24,7 @@ from rigs.scene.frames import FrameOptics, PlateView
 from storage.streams import F64, U8
 from storage.video import VideoWriter, read_frames
 
+_CV2: Any = cv2  # its stubs lack the blob detector
 RATE_HZ = 100
 SIDE_PX = 504
 """The kinematic grid's 42 mm."""
@@ -92,23 +95,23 @@ def components(image: U8) -> F64:
     return np.array(found, np.float64).reshape(-1, 2)
 
 
-def _default_detector() -> cv2.SimpleBlobDetector:
+def _default_detector() -> Any:
     """As OpenCV ships it (thresholds 50 to 220 in steps of 10), but for bright blobs."""
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = _CV2.SimpleBlobDetector_Params()
     parameters.blobColor = 255
-    return cv2.SimpleBlobDetector_create(parameters)
+    return _CV2.SimpleBlobDetector_create(parameters)
 
 
-def _tuned_detector() -> cv2.SimpleBlobDetector:
+def _tuned_detector() -> Any:
     """With a single threshold, half-way, and no filter but the area's."""
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = _CV2.SimpleBlobDetector_Params()
     parameters.blobColor = 255
     parameters.minThreshold, parameters.maxThreshold = 112.0, 122.0
     parameters.thresholdStep = 10.0
     parameters.minRepeatability = 1
     parameters.filterByInertia = parameters.filterByConvexity = False
     parameters.filterByCircularity = False
-    return cv2.SimpleBlobDetector_create(parameters)
+    return _CV2.SimpleBlobDetector_create(parameters)
 
 
 def _video(frames: int, noise: float) -> tuple[list[U8], F64]:
@@ -141,7 +144,7 @@ def _from_file(images: list[U8], layout: F64, runs: int) -> Figures:
     return rate("decode_track_x_realtime", len(images) / RATE_HZ, taken)
 
 
-def _points(detector: cv2.SimpleBlobDetector, image: U8) -> F64:
+def _points(detector: Any, image: U8) -> F64:
     return np.array([point.pt for point in detector.detect(image)], np.float64).reshape(-1, 2)
 
 

@@ -1,9 +1,9 @@
 """Training and inference beside Sinabs' own layers in the same run, and cutting windows.
 
 Both sides hold the same weights and see the same windows, cut from a simulated trial. Ours uses all
-threads, as in use; Sinabs has whichever is faster in the run, all threads or one, because threads that
-wait for each other at every step suffer from whatever else runs. One window at a time is timed on one
-thread on both sides. What is trained is arbitrary: only time and spikes count here.
+threads, as in use; Sinabs has whichever is faster in the run, all threads or one, because threads
+that wait for each other at every step suffer from whatever else runs. One window at a time is timed
+on one thread on both sides. What is trained is arbitrary: only time and spikes count here.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from protocols.settings import Network, Training, Windows
 from storage.streams import I64, U8, EventChunk
 
 BATCH = 64
-BATCHES = (16, 64, 256)
+BATCHES = (16, 64)
 
 
-def measure(windows: int = 512, singles: int = 200, runs: int = RUNS) -> Figures:
+def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures:
     """All figures of the network."""
     settings = Windows()
     events = slide_events()
@@ -49,10 +49,10 @@ def _samples(events: EventChunk, count: int, settings: Windows) -> U8:
 
 
 def _training(x: U8, y: I64, settings: Windows, runs: int) -> Figures:
-    """One epoch with its validation, from the uint8 windows to new weights."""
-    split = min(2 * BATCH, len(x) * 3 // 4)
+    """One step of training with its validation, from the uint8 windows to new weights."""
+    split = min(BATCH, len(x) * 3 // 4)
     training = Training(epochs=1, batch=BATCH)
-    x, y = x[: split + 32], y[: split + 32]
+    x, y = x[: split + 16], y[: split + 16]
     train, val = (x[:split], y[:split]), (x[split:], y[split:])
 
     def ours() -> None:
@@ -69,7 +69,7 @@ def _training(x: U8, y: I64, settings: Windows, runs: int) -> Figures:
             out = net(part.flatten(0, 1)).unflatten(0, (len(rows), -1)).sum(dim=1)
             loss = nn.functional.cross_entropy(out, torch.from_numpy(train[1][rows]))
             optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
         spike_counts(net, val[0], batch=BATCH)
 
@@ -113,9 +113,7 @@ def _inference(x: U8, settings: Windows, singles: int, runs: int) -> Figures:
     rivals["sinabs_xalone"] = on_one_thread(rivals["sinabs_x64"])
     taken = alternate(runs, **rivals)
     best = {
-        side: min(
-            (times for name, times in taken.items() if name.startswith(f"{side}_x")), key=median
-        )
+        side: min((taken[name] for name in taken if name.startswith(f"{side}_x")), key=median)
         for side in ("ours", "sinabs")
     }
     mismatches = compared = 0

@@ -1,10 +1,9 @@
 """What Prefect costs a collection of 864 empty trials, in the shape of `flows.collect`.
 
-One flow, a task for every 25 trials. `loop_ms` is the bare loop; `batched_ms` is what the flow takes
-over it, to the flow's end, and with what it leaves for the server to do: the time that an empty flow
-right behind it takes longer than another empty flow after that. Both are for all 864 together. About
-a second of any flow, empty or not, passes while Prefect's heartbeat thread is joined
-(`empty_flow_ms`). The server is started before the clock runs.
+One flow, a task for every 25 trials. `loop_ms` is the bare loop; `batched_ms` is what the flow
+takes over it, to the flow's end, and with what it leaves for the server to do: the time that an
+empty flow right behind it takes longer than another empty flow after that. Both are for all 864
+together. `empty_flow_ms` is what any flow costs. The server is started before the clock runs.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import RUNS, Figures, alternate, spread
-from flows.orchestration import Parcel, prepare
+from flows.orchestration import Parcel, prepare, run
 
 
 def measure(trials: int = 864, runs: int = RUNS) -> Figures:
@@ -45,21 +44,24 @@ def _compare(trials: int, runs: int) -> Figures:
         )
 
     @flow(name="empty", validate_parameters=False, persist_result=False)
-    def empty() -> None:
-        pass
+    def empty(wanted: Parcel[None]) -> None:
+        assert wanted.content is None
 
     def loop() -> int:
         return sum(1 for trial in range(trials) if step(trial) >= 0)
 
     def batched() -> None:
-        done: Any = collect(Parcel(range(trials)))
+        done: Any = run(collect, Parcel(range(trials)))
         if done != trials:
             raise RuntimeError(f"{done} of {trials} steps were taken")
 
-    taken = alternate(runs, loop=loop, batched=batched, behind=empty, empty=empty)
+    def alone() -> None:
+        run(empty, Parcel(None))
+
+    taken = alternate(runs, loop=loop, batched=batched, behind=alone, empty=alone)
     over = [
-        1e3 * (full + max(0.0, behind - alone) - bare)
-        for full, behind, alone, bare in zip(
+        1e3 * (full + max(0.0, behind - empty_s) - bare)
+        for full, behind, empty_s, bare in zip(
             taken["batched"], taken["behind"], taken["empty"], taken["loop"], strict=True
         )
     ]
