@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from analysis.robust_line import line_uncertainty, robust_line, theil_sen
 from storage.clockmap import ClockMap
 
 Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
@@ -37,10 +38,6 @@ _PIECE_TICKS = 400
 _PIECES = 5
 _BINS_A_TICK = 4
 _MAX_BINS = 1 << 22
-_HUBER = 1.345
-# sqrt of the 95 % quantile of chi-squared with 2 degrees: both ends of a fitted line at once
-_BAND_95 = 2.4477
-_STRETCHES = 8
 
 
 class ClockRefused(ValueError):
@@ -133,7 +130,7 @@ def fit_clock(
 
     px, py = x[pairs[0]], y[pairs[1]]
     x_mid = float(np.round(px.mean()))
-    line = _robust_line(px - x_mid, py - px)
+    line = robust_line(px - x_mid, py - px)
     slope, level = line.slope, line.level
     if abs(slope) > max_drift_ppm * 1e-6:
         raise ClockRefused(
@@ -162,7 +159,7 @@ def fit_clock(
         residual_p95_ns=p95,
         residual_max_ns=float(residuals.max()),
         drift_ppm=slope * 1e6,
-        uncertainty_ns=_uncertainty(px - x_mid, line) + resolution_ns / 2,
+        uncertainty_ns=line_uncertainty(px - x_mid, line) + resolution_ns / 2,
         peak_ratio=peak_ratio,
     )
 
@@ -302,23 +299,8 @@ def _first_line(
     if chosen.sum() < MIN_PULSES // 2:
         raise ClockRefused("no_match", "the trains fit nowhere")
     uc = u[which[chosen]]
-    slope, level = _theil_sen(uc, y[partner[chosen]] - x[which[chosen]])
+    slope, level = theil_sen(uc, y[partner[chosen]] - x[which[chosen]])
     return slope, level
-
-
-def _theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
-    """Median of the slopes between pulses half the train apart, and the median level at x = 0.
-
-    Not all pairs, as in Theil (1950) and Sen (1968): the near ones say little of the slope, and
-    there are n**2 of them. It stands a quarter of bad points.
-    """
-    order = np.argsort(x, kind="stable")
-    x, y = x[order], y[order]
-    half = x.size // 2
-    run = x[half : 2 * half] - x[:half]
-    far = run > 0
-    slope = float(np.median((y[half : 2 * half] - y[:half])[far] / run[far])) if far.any() else 0.0
-    return slope, float(np.median(y - slope * x))
 
 
 def _pair(x: Floats, y: Floats, predicted: Floats, gate: float) -> tuple[Ints, Ints]:
@@ -356,60 +338,3 @@ def _gate_share(
         raise ClockRefused(
             "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
         )
-
-
-@dataclass(frozen=True)
-class _Line:
-    slope: float
-    level: float
-    residuals: Floats
-    inside: NDArray[np.bool_]
-    sigma: float
-
-
-def _robust_line(x: Floats, y: Floats) -> _Line:
-    """Theil-Sen, then Huber's M-estimate by reweighting, on what lies inside 5 robust sigma."""
-    slope, level = _theil_sen(x, y)
-    inside = np.ones(x.size, np.bool_)
-    sigma = 1.0
-    for _ in range(20):
-        residuals = y - slope * x - level
-        # the stamps' resolution is a floor: without jitter the median deviation is zero
-        sigma = max(1.4826 * float(np.median(np.abs(residuals))), 250.0)
-        inside = np.abs(residuals) <= 5 * sigma
-        weights = np.where(
-            inside, np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residuals), 1e-9)), 0.0
-        )
-        total = weights.sum()
-        x_mean, y_mean = (weights * x).sum() / total, (weights * y).sum() / total
-        spread = (weights * (x - x_mean) ** 2).sum()
-        new_slope = float((weights * (x - x_mean) * (y - y_mean)).sum() / spread)
-        new_level = float(y_mean - new_slope * x_mean)
-        moved = abs(new_level - level) + abs(new_slope - slope) * float(np.abs(x).max())
-        slope, level = new_slope, new_level
-        if moved < 0.01:
-            break
-    residuals = y - slope * x - level
-    return _Line(slope, level, residuals, inside, sigma)
-
-
-def _uncertainty(x: Floats, line: _Line) -> float:
-    """Half the width of the line's 95 % band (Working, Hotelling 1929) at the train's far end.
-
-    Where the mean residual of an eighth of the train is more than chance, the clocks did not run
-    straight, and the band is wider by that much.
-    """
-    order = np.argsort(x[line.inside], kind="stable")
-    inner = x[line.inside][order]
-    residuals = line.residuals[line.inside][order]
-    sigma = float(np.sqrt((residuals**2).sum() / max(1, inner.size - 2)))
-    mean = float(inner.mean())
-    spread = float(((inner - mean) ** 2).sum())
-    far = max(abs(float(x.min()) - mean), abs(float(x.max()) - mean))
-    # Huber's weights cost 5 % of the efficiency; the map's integers add 1 ns
-    band = 1.0 + _BAND_95 * sigma * float(np.sqrt((1 / inner.size + far**2 / spread) / 0.95))
-    # scatter between neighbours is free of any bend
-    local = float(np.sqrt((np.diff(residuals) ** 2).mean() / 2))
-    stretches = np.array_split(residuals, _STRETCHES)
-    bend = max(abs(float(part.mean())) - 3 * local / part.size**0.5 for part in stretches)
-    return band + max(0.0, bend)

@@ -109,6 +109,9 @@ class FrameCameraSpec(StrictModel):
     """The outside camera."""
 
     scale_px_per_mm: float = Field(gt=0, le=200)
+    width_px: int = Field(default=1920, ge=16)
+    height_px: int = Field(default=1200, ge=16)
+    """Pixels of the whole sensor."""
     spool: bool = False
     """Write raw frames first and encode after the trial, where encoding live is too slow."""
 
@@ -135,6 +138,18 @@ class RigFile(StrictModel):
     def _poll_is_short(self) -> RigFile:
         if self.poll > 1:
             raise KeyedError("poll", self.poll, "must be at most 1 s: a stop waits for it")
+        return self
+
+    @model_validator(mode="after")
+    def _scales_agree(self) -> RigFile:
+        """The simulated camera draws at the scale that the rig file promises."""
+        told, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
+        if told != drawn:
+            raise KeyedError(
+                "frame_camera.scale_px_per_mm",
+                told,
+                f"must be mock.frame_camera.px_per_mm = {drawn:g}",
+            )
         return self
 
     @property
@@ -179,6 +194,16 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
         InputError: the first move that the rig may not make.
     """
     limits = rig.limits
+    frame_px = rig.frame_px(plan)
+    for side, axis in (("width", 0), ("height", 1)):
+        available = getattr(rig.frame_camera, f"{side}_px")
+        if frame_px is not None and frame_px[axis] > available:
+            raise InputError(
+                file,
+                f"frame_camera.{side}_px",
+                available,
+                f"the region of {plan.file} needs {frame_px[axis]} px",
+            )
     for trial in plan:
         for step in plan.program(trial).steps:
             if not isinstance(step, Move):

@@ -44,6 +44,11 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "mock.event_camera.noise_hz",
         "greater than or equal to 0",
     ),
+    "scale that is not drawn": (
+        _set("frame_camera", "scale_px_per_mm", to=20),
+        "frame_camera.scale_px_per_mm",
+        "must be mock.frame_camera.px_per_mm = 12",
+    ),
     "infinite scale": (
         _set("frame_camera", "scale_px_per_mm", to=float("inf")),
         "frame_camera.scale_px_per_mm",
@@ -64,6 +69,15 @@ def test_the_message_names_key_and_cure(case: str, tmp_path: Path) -> None:
     assert caught.value.key.startswith(key)
     assert str(path) in caught.value.message
     assert says in caught.value.message
+
+
+def test_a_region_larger_than_the_sensor_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(MOCK.replace("spool: false", "spool: false, height_px: 400"))
+    rig, _ = load_rig_file(path)
+    plan = load_plan(ROOT / "protocols" / "pilot.yaml")
+    with pytest.raises(InputError, match=r"frame_camera.height_px = 400: .* needs 432 px"):
+        check_plan(rig, plan, str(path))
 
 
 def test_a_plan_beyond_the_rig_is_refused(tmp_path: Path) -> None:

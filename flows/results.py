@@ -1,0 +1,261 @@
+"""The report's results: network, detections, latency, lead, label errors, and how it was made."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from analysis import dataset, figures
+from analysis.detection import detect
+from analysis.metrics import CLASSES
+from analysis.report import Figure, Section, Table, number, percent
+from analysis.training import Fitted
+from flows.campaigns import Collected
+from flows.evaluate import trial_counts
+from protocols.settings import Detection
+from storage.recording import Recording
+from storage.store import Store
+
+_STATISTICS = ("n", "median", "p95", "mean", "std", "min", "max", "missed", "false_early")
+
+
+def seconds(value: int | None, origin: int) -> float | None:
+    """A time of the time line in seconds after `origin`."""
+    return None if value is None else (value - origin) / 1e9
+
+
+def condition_text(row: dict[str, Any]) -> str:
+    """A trial's condition in words."""
+    return ", ".join(f"{name} {text}" for name, text in row["condition"].items())
+
+
+def network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Section:
+    """Accuracy on windows of test trials, with the baselines beside it."""
+    windows = evaluation["windows"]
+    accuracy = windows["accuracy"]
+    beside = windows["baselines"]
+    rows = [
+        [
+            "spiking network",
+            percent(accuracy["argmax"]),
+            percent(accuracy["strict"]),
+            percent(accuracy["margin"]),
+        ],
+        ["logistic regression on the event count", percent(beside["logistic"]), "", ""],
+        ["event-rate threshold", percent(beside["rate_threshold"]), "", ""],
+        ["majority class", percent(beside["majority"]), "", ""],
+    ]
+    classes = [
+        [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
+        for name, word in zip(CLASSES, figures.CLASS_WORDS, strict=True)
+    ]
+    trials = [row["argmax"] for row in windows["by_trial"].values() if row["argmax"] is not None]
+    return Section(
+        "The network on windows of 30 ms" if fitted.windows.length_ms == 30 else "The network",
+        [
+            f"{accuracy['n']} windows of test trials that were used neither for training nor for "
+            "choosing the model. Argmax shares a tie among its classes, strict wants a unique "
+            "winner, margin wants it to lead as a detection must. By trial the argmax accuracy "
+            f"runs from {percent(min(trials, default=None))} to "
+            f"{percent(max(trials, default=None))}.",
+            *(f"Warning: {text}" for text in fitted.warnings),
+        ],
+        [
+            Figure(
+                figures.confusion(np.asarray(windows["confusion"]), simulated=simulated),
+                "Rows are true classes and add up to 100 %. The last column holds windows whose "
+                "two highest spike counts are equal.",
+            ),
+            Figure(
+                figures.training_curves(
+                    [vars(record) for record in fitted.history],
+                    fitted.chosen_epoch,
+                    simulated=simulated,
+                ),
+                "Training; the dashed line is the epoch with the best strict validation accuracy, "
+                "whose weights are used.",
+            ),
+        ],
+        [
+            Table(["method", "argmax", "strict", "margin"], rows, "Accuracy on the same windows."),
+            Table(["class", "precision", "recall"], classes),
+        ],
+    )
+
+
+def outputs(
+    store: Store,
+    evaluation: dict[str, Any],
+    example: tuple[Collected, Recording, dict[str, Any]] | None,
+    simulated: bool,
+) -> Section | None:
+    """The example trial's raw and smoothed outputs; None without an example."""
+    if example is None:
+        return None
+    item, recording, row = example
+    found = trial_counts(store, item.name, recording.trial_id)
+    settings = Detection.model_validate(evaluation["detection"][item.name])
+    detections = detect(found["counts"], found["end_ns"], settings)
+    start, _ = dataset.recorded_span(recording)
+    svg = figures.outputs(
+        (found["end_ns"] - start) / 1e9,
+        found["counts"],
+        detections.smoothed,
+        [seconds(row["incipient_ns"], start), seconds(row["gross_ns"], start)],
+        [seconds(detections.incipient_ns, start), seconds(detections.gross_ns, start)],
+        simulated=simulated,
+    )
+    return Section(
+        "From outputs to detections",
+        [
+            f"Output spikes are averaged over {settings.smoothing} windows; a class is believed "
+            f"when it leads every other by {settings.margin:g} spikes. A detection is dated by "
+            "the end of its newest window."
+        ],
+        [
+            Figure(
+                svg, f"The same trial ({condition_text(row)}): raw outputs above, smoothed below."
+            )
+        ],
+    )
+
+
+def latency(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -> Section:
+    """How late detections are on kinematic test trials."""
+    rows = [row for row in evaluation["trials"] if row["experiment"] == "kinematic"]
+    groups = {}
+    for kind in ("incipient", "gross"):
+        groups[f"{kind} slip"] = [
+            row["latency"][f"latency_{kind}_ms"]
+            for row in rows
+            if row["latency"] is not None and row["latency"][f"latency_{kind}_ms"] is not None
+        ]
+    table = [
+        [f"{kind} slip", *_statistics(summary["kinematic"]["latency_ms"][kind])]
+        for kind in ("incipient", "gross")
+    ]
+    return Section(
+        "Detection latency, kinematic test trials",
+        [
+            "Detection minus true onset. A detection more than 30 ms before the true onset is a "
+            "false early detection: it is counted, and it has no latency."
+        ],
+        [
+            Figure(
+                figures.distributions(
+                    groups, "latency (ms)", simulated=simulated, zero="true onset"
+                ),
+                "Each dot is a trial; the bar is the median.",
+            )
+        ],
+        [Table(["onset", *_names()], table, "Milliseconds; n counts trials.")],
+    )
+
+
+def lead(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -> Section | None:
+    """How far incipient detections are ahead of gross slip; None without such trials."""
+    experiments = [name for name in ("gravity", "disturbance") if summary[name]["trials"]]
+    if not experiments:
+        return None
+    groups: dict[str, list[float]] = {}
+    for row in evaluation["trials"]:
+        if row["experiment"] in experiments:
+            values = groups.setdefault(condition_text(row), [])
+            if row["latency"] is not None and row["latency"]["lead_ms"] is not None:
+                values.append(row["latency"]["lead_ms"])
+    counts = Counter(
+        condition_text(row) for row in evaluation["trials"] if row["experiment"] in experiments
+    )
+    named = {f"{name} ({counts[name]} trials)": groups[name] for name in sorted(groups)}
+    table = []
+    for name in experiments:
+        lead = summary[name]["lead_ms"]
+        table.append([name, *_statistics(lead), number(lead["detected_first"])])
+    return Section(
+        "Lead: incipient slip detected before gross slip",
+        [
+            "True gross onset minus detected incipient onset, for plates that slip by their own "
+            "weight. A false early detection is no lead; a detection after gross slip began "
+            "stands left of zero."
+        ],
+        [
+            Figure(
+                figures.distributions(
+                    named, "lead before gross slip (ms)", simulated=simulated, zero="gross slip"
+                ),
+                "Each dot is a trial, by configuration; the bar is the median.",
+            )
+        ],
+        [
+            Table(
+                ["experiment", *_names(), "detected first"], table, "Milliseconds; n counts trials."
+            )
+        ],
+    )
+
+
+def _names() -> list[str]:
+    return [name.replace("_", " ") for name in _STATISTICS]
+
+
+def _statistics(values: dict[str, Any]) -> list[str]:
+    return [number(values[name]) for name in _STATISTICS]
+
+
+def labels(summary: dict[str, Any]) -> Section | None:
+    """Labels against the simulation's truth; None where there is none."""
+    errors = summary["labels"]["error_ms"]
+    if not errors["incipient"]["n"]:
+        return None
+    rows = [
+        [
+            f"{kind} onset",
+            str(values["n"]),
+            number(values["median"], 2),
+            number(values["median_abs"], 2),
+            number(values["max_abs"], 2),
+        ]
+        for kind, values in ((kind, errors[kind]) for kind in ("incipient", "gross"))
+    ]
+    return Section(
+        "How exact the labels are",
+        [
+            "The mock rig knows when each papilla truly crossed the threshold. Labels are read "
+            "from the video alone; this is their distance from that truth. Nothing else reads it."
+        ],
+        (),
+        [
+            Table(
+                ["label", "trials", "median (ms)", "median distance (ms)", "largest (ms)"],
+                rows,
+                "Label minus simulation truth; one frame is 10 ms.",
+            )
+        ],
+    )
+
+
+def provenance(summary: dict[str, Any]) -> Section:
+    """Hashes, wall times and versions."""
+    timing = [[name, number(value, 1)] for name, value in summary["timing_s"].items()]
+    versions = [[name, value] for name, value in summary["versions"].items()]
+    hashes = [
+        [name, value["collection"][:16], value["analysis"][:16]]
+        for name, value in summary["protocols"].items()
+    ]
+    seeds = summary["seeds"]
+    return Section(
+        "How it was made",
+        [
+            f"Network seeds {', '.join(map(str, seeds['network']))} (used: {seeds['chosen']}). "
+            f"Clocks: {summary['sync']['grade']}, at worst "
+            f"{number(summary['sync']['worst_uncertainty_us'], 1)} µs (95 %)."
+        ],
+        (),
+        [
+            Table(["protocol", "collection hash", "analysis hash"], hashes),
+            Table(["step", "wall time (s)"], timing),
+            Table(["package", "version"], versions),
+        ],
+    )
