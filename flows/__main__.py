@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 
 import typer
 from typer.exceptions import TyperException
 
-from flows import console
+from flows import console, stopping
 from flows.cli import app
 from protocols.errors import InputError
 
 
-def _terminated(number: int, frame: object) -> None:
-    """SIGTERM stops as Ctrl-C does: the arm first."""
-    raise KeyboardInterrupt
-
-
 def main() -> None:
-    """Entry point: maps errors to messages and exit codes."""
-    signal.signal(signal.SIGTERM, _terminated)
+    """Run the command line; ends the process with its exit code."""
+    with stopping.signals():
+        code = _run()
+    sys.exit(code)
+
+
+def _run() -> int:
     try:
         code = app(standalone_mode=False)
         if code == console.INTERRUPTED:
-            _interrupted()
-        sys.exit(code if isinstance(code, int) else console.DONE)
+            return _interrupted()
+        return code if isinstance(code, int) else console.DONE
     except InputError as error:
         console.say(f"error: {error.message}")
-        sys.exit(console.WRONG_INPUT)
+        return console.WRONG_INPUT
     except KeyboardInterrupt:
-        sys.exit(_interrupted())
+        return _interrupted()
     except Exception as error:
-        sys.exit(_explain(error))
+        return _interrupted() if stopping.requested() else _explain(error)
 
 
 def _interrupted() -> int:
@@ -49,7 +48,7 @@ def _explain(error: Exception) -> int:
     if isinstance(error, TyperException):
         console.say(f"error: {error.format_message()} (see --help)")
         return console.WRONG_INPUT
-    expected = {"StoreError", "RigError", "ArmFault", "Locked", "StopRequested"}
+    expected = {"StoreError", "RigError", "ArmFault", "Locked"}
     if type(error).__name__ not in expected:
         console.messages.print_exception(max_frames=8)
     console.say(f"error: {error or type(error).__name__}")

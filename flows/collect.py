@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows import console
+from flows import console, stopping
 from flows.orchestration import Parcel, run
 from flows.orders import (
     Order,
@@ -51,6 +51,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
         campaign = describe_campaign(store, wanted)
         campaign.sweep()
         rig = build_rig(wanted.rig)
+        rig.should_stop = stopping.requested
         session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.bench.operator)
         trials = pending_trials(wanted.plan, campaign)
         campaign.add_bench_record(_bench_record(wanted))
@@ -58,10 +59,11 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
         with console.bar(f"collect {wanted.campaign} ({simulated}trials)", len(trials)) as bar:
             session.on_trial = lambda trial, outcome: bar.advance(1, f"{trial.id} {outcome}")
             try:
-                rig.connect()
-                size = MOCK_BATCH if wanted.rig.simulated else 1
-                for start in range(0, len(trials), size):
-                    take_trials(Parcel(session), Parcel(trials[start : start + size]))
+                with stopping.signals():  # Prefect has handlers of its own inside a flow
+                    rig.connect()
+                    size = MOCK_BATCH if wanted.rig.simulated else 1
+                    for start in range(0, len(trials), size):
+                        take_trials(Parcel(session), Parcel(trials[start : start + size]))
             finally:
                 rig.close()
         return {

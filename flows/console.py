@@ -24,6 +24,8 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from flows import stopping
+
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 messages = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -82,7 +84,12 @@ class Bar:
         self._progress, self._task = progress, task
 
     def advance(self, count: float = 1, note: str = "") -> None:
-        """`count` more are done."""
+        """`count` more are done; a stop request is answered here.
+
+        Raises:
+            KeyboardInterrupt: somebody asked the program to stop.
+        """
+        stopping.check()
         self._progress.update(self._task, advance=count, note=note)
 
 

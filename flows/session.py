@@ -18,7 +18,7 @@ from flows.quality import Assessment, assess
 from protocols import Plan, Task, Trial
 from protocols.hashing import hash_integer
 from rigs.capabilities import RigError
-from rigs.rig import Rig, TrialRun
+from rigs.rig import Rig, StopRequested, TrialRun
 from rigs.rig_file import RigFile
 from storage.store import Campaign
 from storage.streams import Json
@@ -221,6 +221,6 @@ class Session:
 
 def _cause(error: BaseException) -> str:
     """Why a trial ended early, for its quarantine."""
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, (KeyboardInterrupt, StopRequested)):
         return "stopped by a person"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -1,0 +1,55 @@
+"""Ctrl-C and SIGTERM that cannot get lost.
+
+Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
+reference's callback that exception is printed and dropped, and the program goes on, which an arm
+must not. So the handler also raises a flag: the rig looks at it in every poll, progress bars at
+every step.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_requested = threading.Event()
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    _requested.set()
+    raise KeyboardInterrupt
+
+
+def requested() -> bool:
+    """Whether somebody asked the program to stop."""
+    return _requested.is_set()
+
+
+def check() -> None:
+    """Stop here if somebody asked for it.
+
+    Raises:
+        KeyboardInterrupt: a stop was requested.
+    """
+    if _requested.is_set():
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def signals() -> Iterator[None]:
+    """Answer SIGINT and SIGTERM while the block runs; only the main thread can, others pass."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if before[signal.SIGINT] is not _handle:  # a request stands until the outermost block ends
+        _requested.clear()
+    for number in before:
+        signal.signal(number, _handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
