@@ -55,6 +55,22 @@ def _svg(figure: Any, simulated: bool) -> str:
     return text[text.index("<svg") :]
 
 
+def _name_cells(
+    axes: Any,
+    rows: Sequence[object],
+    columns: Sequence[object],
+    row_name: str,
+    column_name: str,
+) -> None:
+    """Names of a table of cells along its left and lower edge."""
+    axes.set_xticks(range(len(columns)), [str(item) for item in columns])
+    axes.set_yticks(range(len(rows)), [str(item) for item in rows])
+    axes.set_xlabel(column_name)
+    axes.set_ylabel(row_name)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+
+
 def collected_grid(
     rows: Sequence[object],
     columns: Sequence[object],
@@ -72,12 +88,7 @@ def collected_grid(
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1.6, aspect="auto")
         for (i, j), value in np.ndenumerate(counts):
             axes.text(j, i, f"{value} of {planned[i, j]}", ha="center", va="center", fontsize=8)
-        axes.set_xticks(range(len(columns)), [str(item) for item in columns])
-        axes.set_yticks(range(len(rows)), [str(item) for item in rows])
-        axes.set_xlabel(column_name)
-        axes.set_ylabel(row_name)
-        axes.spines[:].set_visible(False)
-        axes.tick_params(length=0)
+        _name_cells(axes, rows, columns, row_name, column_name)
         return _svg(figure, simulated)
 
 
@@ -152,12 +163,8 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
                 fontsize=8,
                 color="white" if share[i, j] > 0.6 else "black",
             )
-        axes.set_xticks(range(4), [*CLASS_WORDS, "undecided"])
-        axes.set_yticks(range(3), CLASS_WORDS)
-        axes.set_xlabel("class said by the network")
-        axes.set_ylabel("true class")
-        axes.spines[:].set_visible(False)
-        axes.tick_params(length=0)
+        said = [*CLASS_WORDS, "undecided"]
+        _name_cells(axes, CLASS_WORDS, said, "true class", "class said by the network")
         return _svg(figure, simulated)
 
 

@@ -197,6 +197,9 @@ class Rig:
                 self.arm.stop()
                 middle = depth - speed_mm_s * 0.025  # of those 50 ms
                 return middle - self.touch_mm
+        state = self.arm.state()
+        if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
+            raise _fault(state, "touching off")
         raise RigError(
             "arm",
             f"touching off met nothing within {search_mm:g} mm of the taught plane; "

@@ -206,6 +206,13 @@ def test_touching_off_goes_no_deeper_than_its_limit() -> None:
     assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm <= -1.5 + 1e-6
 
 
+def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
+    rig = make_rig(faults=[{"kind": "arm_protective_stop", "at_s": 1.0, "since": "trial"}])
+    with pytest.raises(ArmFault, match="protective stop in the phase 'touching off'"):
+        rig.touch_off(0.5, 1.5, 1)
+    assert rig.frame.zero_mm == 0.0
+
+
 def test_a_plate_that_is_not_there_cannot_be_moved() -> None:
     from protocols import load_plan
 
