@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigs.mock.arm import MockArm
-from rigs.mock.cameras import MockEventCamera, MockFrameCamera
+from rigs.mock.event_camera import MockEventCamera
+from rigs.mock.frame_camera import MockFrameCamera
 from rigs.mock.people import MockPlate, SimulatedOperator, VirtualClock
 from rigs.mock.settings import MockSettings
 from rigs.mock.sync import MockSyncBox

@@ -1,4 +1,4 @@
-"""Both simulated cameras: what they send when, on which clock, and what gets lost."""
+"""The simulated frame camera: pictures on every tick, on its own clock, and what gets lost."""
 
 from __future__ import annotations
 
@@ -7,96 +7,14 @@ import numpy.typing as npt
 
 from rigs.capabilities import RigError
 from rigs.mock.clocks import Jitter
-from rigs.mock.history import History
 from rigs.mock.settings import MockSettings
-from rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
+from rigs.mock.sync import MockSyncBox
 from rigs.mock.world import World
-from rigs.scene.events import EventOptics, MarkerSensor
 from rigs.scene.frames import FrameOptics, PlateView
-from storage.streams import EventChunk, FrameChunk, PulseChunk
+from storage.streams import FrameChunk
 
 I64 = npt.NDArray[np.int64]
 _NEVER = 1 << 62
-
-
-class MockEventCamera:
-    """The event camera inside the sensor.
-
-    It sends whole blocks of the scene's steps (32 ms by default): that is its latency. After
-    `stop`, what is left can still be read.
-    """
-
-    def __init__(self, world: World, box: MockSyncBox) -> None:
-        self._world = world
-        settings = world.settings.event_camera
-        self.width, self.height = settings.width, settings.height
-        self._sensor = MarkerSensor(
-            EventOptics(**settings.model_dump()), world.skin.layout_mm, world.settings.seed
-        )
-        self._input = SyncInput(world, box, "event_camera")
-        self._begin()
-        world.on_begin.append(self._begin)
-
-    def _begin(self) -> None:
-        self._running = False
-        self._until_ns = 0
-        self._next_step = 0
-        self._loads: History | None = None
-
-    def start(self) -> None:
-        """Begin to stream: every pixel takes the present image as its reference."""
-        world = self._world
-        loads = self._loads = world.keep_loads()
-        self._next_step = loads.base
-        self._sensor.reset(loads.rows(loads.base, loads.base + 1)[0], world.seed)
-        self._begun_ns, self._until_ns, self._running = world.now_ns, _NEVER, True
-        self._input.skip()
-
-    def read(self) -> EventChunk:
-        """Events since the last call, camera clock, whole microseconds."""
-        world = self._world
-        done = world.advance()
-        loads = self._loads
-        if loads is None:
-            return _no_events()
-        # steps that are complete and have not been sent, in whole blocks of the global grid
-        last = min(done - 1, self._until_ns // world.step_ns)
-        if self._running:
-            last -= last % self._sensor.optics.block_steps
-        if last <= self._next_step:
-            return _no_events()
-        rows = loads.rows(self._next_step, last + 1)
-        t_ns, x, y, p = self._sensor.sense(rows, self._next_step, world.step_ns)
-        self._next_step = last
-        loads.forget(last)
-        kept = t_ns >= self._begun_ns
-        for begin, end in world.faults.gaps_ns(world.recording_ns):
-            kept &= (t_ns < begin) | (t_ns >= end)
-        if not kept.all():
-            t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
-        return EventChunk(x, y, p, world.clocks.event_camera.to_reference(t_ns) // 1000)
-
-    def read_pulses(self) -> PulseChunk:
-        """Sync pulses since the last call, camera clock in ns."""
-        t_ns = self._input.edges_ns()
-        if not self._running and self._until_ns == 0:
-            return PulseChunk(np.empty(0, np.int64))
-        kept = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
-        for begin, end in self._world.faults.gaps_ns(self._world.recording_ns):
-            kept &= (t_ns < begin) | (t_ns >= end)
-        stamp = self._world.clocks.event_camera.to_reference(t_ns[kept])
-        return PulseChunk(stamp // 1000 * 1000)
-
-    def stop(self) -> None:
-        """Stop streaming; the rest, up to the last whole step, can still be read."""
-        if self._running:
-            self._world.advance()
-            self._world.loads = None
-            self._running, self._until_ns = False, self._world.now_ns
-
-    def close(self) -> None:
-        """Give the device back."""
-        self.stop()
 
 
 class MockFrameCamera:
@@ -205,8 +123,3 @@ def _optics(settings: MockSettings) -> FrameOptics:
         marker_side_mm=plate.marker_side_mm,
         marker_centre_mm=plate.marker_centre_mm,
     )
-
-
-def _no_events() -> EventChunk:
-    empty = np.empty(0, np.uint16)
-    return EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))
