@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from analysis.pulse_runs import stray_stretch
 from analysis.robust_line import line_uncertainty, robust_line, theil_sen
 from storage.clockmap import ClockMap
 
@@ -65,9 +66,9 @@ class ClockFit:
         pulses_spurious: device pulses without a partner (a second report of a pulse is one).
         residual_median_ns, residual_p95_ns, residual_max_ns: absolute residuals of the pulses seen.
         drift_ppm: what the reference gains on the device.
-        uncertainty_ns: the map's largest error anywhere in the train, 95 %: from the residuals,
-            plus half the stamps' resolution, plus what the residuals bend away from a line. A
-            delay that all pulses share cannot be seen and is not in it.
+        uncertainty_ns: the map's largest error between the first and the last pulse seen, 95 %:
+            from the residuals, plus half the stamps' resolution, plus what the residuals bend away
+            from a line. A delay that all pulses share cannot be seen and is not in it.
         peak_ratio: second correlation peak over the first, 0 to 1; low is unambiguous.
     """
 
@@ -91,6 +92,7 @@ def fit_clock(
     jitter_ns: float = 20_000.0,
     max_drift_ppm: float = 10_000.0,
     resolution_ns: float = 1_000.0,
+    in_order: bool = False,
 ) -> ClockFit:
     """The line from a device's clock to the reference, from pulses that both saw.
 
@@ -103,6 +105,9 @@ def fit_clock(
         max_drift_ppm: clocks that differ by more are refused.
         resolution_ns: the unit to which the device cuts its stamps. A cut that all pulses share
             moves the line unseen, so half of it is added to the uncertainty.
+        in_order: the stamps stand in the order in which the pulses came, so that a clock that
+            jumps back is seen to do so. It must be known: once they are sorted, such a train looks
+            like one that began earlier than the reference and ended earlier.
 
     Raises:
         ClockRefused: with its `reason`.
@@ -115,6 +120,11 @@ def fit_clock(
             f"max_drift_ppm = {max_drift_ppm} in (0, 50000]"
         )
     device, reference = _train(device_ns, "device"), _train(reference_ns, "reference")
+    if in_order:
+        for name, times in (("device", device_ns), ("reference", reference_ns)):
+            back_ns = -int(np.diff(np.asarray(times)).min(initial=0))
+            if back_ns > jitter_ns:
+                raise ClockRefused("residuals", f"the {name} clock jumps back by {back_ns / 1e9} s")
     tick = _tick(reference)
     if jitter_ns > tick / 4:
         raise ValueError(f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart")
@@ -144,6 +154,12 @@ def fit_clock(
             f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
             f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
         )
+    stray = stray_stretch(
+        (x - x_mid) * (1 + slope) + x_mid + level, y,
+        pairs[0][line.inside], pairs[1][line.inside], 5 * line.sigma,
+    )  # fmt: skip
+    if stray is not None:
+        raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
     in_span = (y >= py.min()) & (y <= py.max())
     return ClockFit(
         map=ClockMap(

@@ -22,7 +22,9 @@ app = typer.Typer(
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
-RigOption = Annotated[Path, typer.Option("--rig", help="A rig file (YAML).")]
+RigOption = Annotated[
+    Path, typer.Option("--rig", help="A rig file (YAML), or the name of one that ships: mock.")
+]
 StoreOption = Annotated[Path, typer.Option("--store", help="The store's folder; made if missing.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
@@ -37,7 +39,9 @@ CampaignOption = Annotated[
 
 FULL = ("kinematic", "gravity", "disturbance")
 PILOT = ("pilot", "pilot_gravity")
-SHOWN = ("campaign", "trial", "recorded_s", "events", "frames", "attempt", "simulated")
+SHOWN = (
+    "campaign", "trial", "recorded_s", "events", "frames", "frame_source", "attempt", "simulated"
+)  # fmt: skip
 """Columns of the catalogue that fit a terminal."""
 
 
@@ -50,28 +54,31 @@ def package_file(package: str, name: str) -> Path:
 @app.command()
 def plan(
     protocol: ProtocolArgument,
-    rig: Annotated[Path | None, typer.Option("--rig", help="A rig file, for bytes.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="A rig file or name, for bytes.")
+    ] = None,
     enable: EnableOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
+    from flows import plan_view
     from protocols.plan import load_plan
 
     found = load_plan(protocol, enable or ())
-    needed = None
+    needed, scene = None, None
     if rig is not None:
         from flows.estimate import plan_bytes
+        from flows.plan_scene import scene_of
         from rigs.rig_file import check_plan, load_rig_file
 
         rig_file, _ = load_rig_file(rig)
         check_plan(rig_file, found, str(rig))
         needed = round(plan_bytes(rig_file, found))
-    from flows import plan_view
-
+        scene = scene_of(rig_file, found)
     if as_json:
-        console.print_json(plan_view.as_json(found, needed))
+        console.print_json(plan_view.as_json(found, needed, scene))
     else:
-        plan_view.show(found, needed)
+        plan_view.show(found, needed, scene)
 
 
 @app.command()
@@ -143,7 +150,7 @@ def collect(
 def label(
     store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
 ) -> None:
-    """Find the true onsets of every trial from its video."""
+    """Find the true onsets of every trial from its video, or from the tracks in its place."""
     _step(store, campaign, as_json, "label")
 
 
@@ -196,11 +203,17 @@ def study(
 @app.command()
 def demo(
     folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
+    rig: RigOption = Path("rehearsal"),
     as_json: JsonOption = False,
 ) -> None:
     """Run the pilot study on the simulated rig and say where the report is."""
     protocols = [package_file("protocols", f"{name}.yaml") for name in PILOT]
-    _chain(folder, protocols, package_file("rigs", "mock.yaml"), as_json)
+    if rig == Path("rehearsal"):
+        console.say(
+            "The demo's outside camera hands over simulated tracks of the markers, no video; "
+            "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
+        )
+    _chain(folder, protocols, rig, as_json)
 
 
 @app.command()

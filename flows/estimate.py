@@ -25,8 +25,7 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
     total = known.fixed_bytes + events * known.bytes_per_event
     if rig.frame_px(plan) is not None:
         plate = plan.protocol.collection.plate is not None
-        each = known.bytes_per_plate_frame if plate else known.bytes_per_frame
-        total += each * seconds * plan.protocol.collection.recording.sync_rate
+        total += rig.frame_bytes(plate) * seconds * plan.protocol.collection.recording.sync_rate
     return total
 
 

@@ -12,7 +12,8 @@ from typing import Any
 from flows.estimate import check_space, plan_bytes
 from protocols import InputError, Plan, Trial, load_plan
 from protocols.yaml_file import read_text
-from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash
+from rigs.levels import at_level, with_level
+from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from storage.store import Campaign, Store, StoreError
 
 
@@ -60,11 +61,16 @@ def make_order(
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
         raise InputError(rig, "mock.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
-    order = Order(plan, rig_file, rig_text, store, name, enable, bench)
+    begun = None
     if (store / "store.json").exists():
         found = Store.open(store).campaign(name)
-        if (found.folder / "campaign.json").exists():
-            _check_same(order, found)
+        begun = found if (found.folder / "campaign.json").exists() else None
+    # one campaign, one physics: a level of a factor that is added later must not change it
+    level = begun.info.get("scene_level") if begun else None
+    rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench)
+    if begun:
+        _check_same(order, begun)
     return order
 
 
@@ -76,7 +82,9 @@ def _check_same(order: Order, campaign: Campaign) -> None:
             "analysis, levels or repetitions is fine, anything else would mix two experiments. "
             "Give the new one its own name with --campaign"
         )
-    if info["rig_hash"] != rig_hash(order.rig_text):
+    if info["rig_hash"] != rig_hash(order.rig_text) and not same_rig(
+        read_text(campaign.folder / "rig.yaml", "rig file"), order.rig_text
+    ):
         raise StoreError(
             f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
             "give the new one its own name with --campaign"
@@ -107,6 +115,7 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
         "rig": order.rig.name,
         "rig_hash": rig_hash(order.rig_text),
         "simulated": order.rig.simulated,
+        "scene_level": order.rig.mock.scene.level if order.rig.simulated else None,
         "enabled": list(order.enable),
     }
     campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)

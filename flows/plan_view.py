@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flows import console
 from protocols import Plan
 
+if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
+    from flows.plan_scene import Scene
 
-def as_json(found: Plan, needed: int | None) -> dict[str, Any]:
+
+def as_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, Any]:
     """The plan as one JSON object; `needed` is its bytes, None without a rig."""
     rows = [
         {
@@ -33,12 +36,13 @@ def as_json(found: Plan, needed: int | None) -> dict[str, Any]:
         "count": len(found),
         "seconds": found.total_seconds,
         "bytes": needed,
+        "scene": scene.as_json() if scene else None,
         "stretches": found.stretches(),
         "warnings": found.warnings(),
     }
 
 
-def show(found: Plan, needed: int | None) -> None:
+def show(found: Plan, needed: int | None, scene: Scene | None) -> None:
     """Print the plan as tables."""
     factors = list(found.protocol.collection.factors)
     table = []
@@ -74,5 +78,7 @@ def show(found: Plan, needed: int | None) -> None:
             ),
         },
     )
+    if scene is not None:
+        console.print_pairs("The simulated scene", scene.as_pairs())
     for warning in found.warnings():
         console.say(f"note: {warning}")

@@ -16,11 +16,13 @@ from analysis.clocks import ClockFit, ClockRefused, fit_clock
 from protocols.conditions import Gates
 from rigs.rig import TrialRun
 from storage.hdf5 import StreamReader
-from storage.streams import I64
+from storage.streams import F64, I64, PoseChunk
 from storage.writer import DATA
 
 GRADE = "hardware trigger"
 """How frames are timed: by the sync box's own ticks."""
+BURST_US = 10_000
+"""The stretch in which `gates.event_burst` counts events."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,14 @@ def assess(
         if mid_exposure_ns is not None:
             trains["frames"] = frame_times[reader.column("frames/sync") > 0] - mid_exposure_ns
         event_us = reader.events().t_us
+        poses = reader.poses()
     clocks: dict[str, Any] = {"reference": "sync box", "grade": GRADE}
     limit = float(gates.sync_uncertainty)
     results: dict[str, dict[str, Any]] = {}
     for device, pulses in trains.items():
         name = f"sync_uncertainty_{device}_s"
         try:
-            fit = fit_clock(pulses, reference)
+            fit = fit_clock(pulses, reference, in_order=True)
         except ClockRefused as refusal:
             results[name] = {"value": str(refusal), "limit": limit, "passed": False}
             continue
@@ -87,6 +90,18 @@ def assess(
     gap = _event_gap(event_us, clocks, run)
     gap_limit = float(gates.event_gap)
     results["event_gap_s"] = {"value": gap, "limit": gap_limit, "passed": 0 <= gap <= gap_limit}
+    burst = _event_burst(event_us)
+    results["event_burst"] = {
+        "value": burst,
+        "limit": gates.event_burst,
+        "passed": burst <= gates.event_burst,
+    }
+    away, away_limit = _path_deviation(poses, run), float(gates.path_deviation)
+    results["path_deviation_mm"] = {
+        "value": away,
+        "limit": away_limit,
+        "passed": 0 <= away <= away_limit,
+    }
     return Assessment(
         clocks,
         results,
@@ -133,3 +148,34 @@ def _event_gap(event_us: I64, clocks: dict[str, Any], run: TrialRun) -> float:
     inside = event_us[(event_us >= start) & (event_us <= end)]
     edges = np.concatenate([[start], inside, [end]])
     return float(np.max(np.diff(edges))) / 1e6
+
+
+def _event_burst(event_us: I64) -> int:
+    """Most events in any 10 ms that begin with an event."""
+    if not len(event_us):
+        return 0
+    after = np.searchsorted(event_us, event_us + BURST_US, side="left")
+    return int(np.max(after - np.arange(len(event_us))))
+
+
+def _path_deviation(poses: PoseChunk, run: TrialRun) -> float:
+    """How far the tool was, at most, from the ways of the recorded steps, mm, to a micrometre.
+
+    Only across: along its way an arm may be early or late, as it gathers speed. -1 without poses
+    in some step, or when the arm's clock is not to be believed.
+    """
+    worst = 0.0
+    for way in run.ways:
+        if way.end_ns <= way.start_ns:
+            continue
+        inside = (poses.t_ns >= way.start_ns) & (poses.t_ns <= way.end_ns)
+        if not inside.any():
+            return -1.0
+        begin = np.asarray(way.begin_mm)
+        along = np.asarray(way.end_mm) - begin
+        from_begin = poses.xyz_mm[inside] - begin
+        length_2 = float(along @ along)
+        share = np.zeros(len(from_begin)) if length_2 == 0 else from_begin @ along / length_2
+        across: F64 = from_begin - np.clip(share, 0.0, 1.0)[:, None] * along
+        worst = max(worst, float(np.max(np.linalg.norm(across, axis=1))))
+    return round(worst, 3)

@@ -204,6 +204,19 @@ def _statistics(values: dict[str, Any]) -> list[str]:
     return [number(values[name]) for name in _STATISTICS]
 
 
+def tracks_text(simulated: bool) -> str:
+    """Tracks in words that nobody mistakes for a video."""
+    if simulated:
+        return "simulated tracks of the markers (no video was drawn)"
+    return "the camera's own tracks of the markers (no video was kept)"
+
+
+def source_text(summary: dict[str, Any]) -> str:
+    """What the labels were read from."""
+    words = {"video": "the video", "tracks": tracks_text(summary["simulated"])}
+    return " or ".join(words[name] for name, count in summary["labels"]["source"].items() if count)
+
+
 def labels(summary: dict[str, Any]) -> Section | None:
     """Labels against the simulation's truth; None where there is none."""
     errors = summary["labels"]["error_ms"]
@@ -223,7 +236,8 @@ def labels(summary: dict[str, Any]) -> Section | None:
         "How exact the labels are",
         [
             "The mock rig knows when each papilla truly crossed the threshold. Labels are read "
-            "from the video alone; this is their distance from that truth. Nothing else reads it."
+            f"from {source_text(summary)} alone; this is their distance from that truth. Nothing "
+            "else reads it."
         ],
         (),
         [

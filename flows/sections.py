@@ -140,6 +140,7 @@ def _collected(campaigns: list[Collected], summary: dict[str, Any], simulated: b
             f"{quality['committed']} of {quality['planned']} planned trials are committed; "
             f"{quality['retaken']} attempts failed a quality gate and were taken again or set "
             f"aside, {quality['quarantined']} attempts stand in quarantine.",
+            f"Of the outside camera {results.source_text(summary)} is kept.",
         ],
         pictures,
         [Table(columns, rows, "Minutes are of the trials' own clocks, people's work left out.")],
@@ -181,6 +182,7 @@ def _one_trial(
     keep = (events.p > 0) & (cell >= 0) & (cell < windows.cells)
     to_line = recording.clock("events")
     event_s = (np.asarray(to_line.to_reference(events.t_us[keep] * 1000)) - start) / 1e9
+    tracked = recording.frame_source == "tracks"
     svg = figures.trial_overview(
         (arrays["frame_ns"] - start) / 1e9,
         arrays["displacement_px"],
@@ -198,9 +200,10 @@ def _one_trial(
             Figure(
                 svg,
                 "Top: displacement of every marker since the end of the hold, seen through the "
-                "plate; the outer papillae let go first, the centre last. Middle and bottom: the "
-                "sensor's own positive events. They rise as the skin is sheared and fall as one "
-                "papilla after the other slips.",
+                f"plate{', from ' + results.tracks_text(simulated) if tracked else ''}; the outer "
+                "papillae let go first, the centre last. Middle and bottom: the sensor's own "
+                "positive events. They rise as the skin is sheared and fall as one papilla after "
+                "the other slips.",
             )
         ],
     )

@@ -10,6 +10,7 @@ import platform
 import shutil
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -20,7 +21,8 @@ from protocols.hashing import hash_integer
 from rigs.capabilities import RigError
 from rigs.rig import Rig, StopRequested, TrialRun
 from rigs.rig_file import RigFile
-from storage.store import Campaign
+from storage.files import disk_full
+from storage.store import Campaign, StoreError
 from storage.streams import Json
 from storage.writer import TrialWriter
 
@@ -121,14 +123,16 @@ class Session:
                     self.rig.frames.mid_exposure_ns if frame_px is not None else None,
                 )
             except BaseException as error:
-                writer.abandon()
-                if writer.folder.exists():
-                    self.campaign.quarantine(writer.folder, _cause(error))
+                self._abandon(writer, error)
                 raise
             self.taken += 1
             provenance = self._provenance(started)
             if found.passed:
-                writer.commit(self._record(trial, attempt, run, found, frame_px), provenance)
+                try:
+                    writer.commit(self._record(trial, attempt, run, found, frame_px), provenance)
+                except OSError as error:
+                    self._abandon(writer, error)
+                    raise
                 self.on_trial(trial, "committed")
                 return
             self._reject(trial, attempt, writer, found, provenance, run, frame_px)
@@ -137,6 +141,26 @@ class Session:
                 self.on_trial(trial, "set aside")
                 return
             self.retaken += 1
+
+    def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
+        """Put what there is of a trial aside, with its cause, if that can be written at all.
+
+        What cannot be moved now is found and put aside when the campaign goes on.
+
+        Raises:
+            StoreError: the disk is full, instead of `error`.
+        """
+        with suppress(OSError, RuntimeError):
+            writer.abandon()
+        with suppress(OSError):
+            if writer.folder.exists():
+                self.campaign.quarantine(writer.folder, _cause(error))
+        if disk_full(error):
+            free = shutil.disk_usage(self.campaign.folder).free
+            raise StoreError(
+                f"{self.campaign.folder}: its disk is full ({free / 1e9:.1f} GB free): make room, "
+                "then run the same command to go on; every committed trial is kept"
+            ) from error
 
     def _reject(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from importlib.metadata import version
 from typing import Any
 
@@ -45,7 +46,7 @@ def make_summary(
         "kinematic": kinematic,
         "gravity": experiments["gravity"],
         "disturbance": experiments["disturbance"],
-        "labels": {"error_ms": evaluation["label_error_ms"]},
+        "labels": {"error_ms": evaluation["label_error_ms"], "source": _sources(campaigns)},
         "detection": evaluation["detection"],
         "sync": _sync(campaigns, first),
         "quality": _quality(campaigns),
@@ -65,6 +66,12 @@ def make_summary(
             "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
         },
     }
+
+
+def _sources(campaigns: list[Collected]) -> dict[str, int]:
+    """How many trials there are with a video, and with tracks in its place."""
+    found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
+    return {name: found[name] for name in ("video", "tracks")}
 
 
 def _sync(campaigns: list[Collected], first: Any) -> dict[str, Any]:

@@ -79,6 +79,10 @@ class Gates(StrictModel):
     frames_lost: Annotated[int, Field(ge=0)] = 0
     event_gap: PositiveSeconds = Decimal("0.05")
     """Longest silence of the event camera while the arm moves in contact."""
+    event_burst: Annotated[int, Field(ge=1)] = 50_000
+    """Most events in any 10 ms: more is flicker, not skin."""
+    path_deviation: PositiveMillimetres = Decimal("0.1")
+    """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """How often a trial is taken again before it is set aside."""
 

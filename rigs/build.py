@@ -8,6 +8,7 @@ from rigs.mock.devices import MockDevices, build_mock
 from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig
 from rigs.rig_file import RigFile
+from storage.streams import Sink
 
 
 class _MockSimulation:
@@ -20,6 +21,10 @@ class _MockSimulation:
         """Draw what varies by trial from `seed`."""
         self._devices.begin_trial(seed)
 
+    def sink(self, sink: Sink) -> Sink:
+        """Where the recording goes in this world."""
+        return self._devices.sink(sink)
+
     def truth(self, reference_arm_ns: int) -> dict[str, Any]:
         """What really happened after that moment."""
         clock = self._devices.world.clocks.arm
@@ -28,8 +33,12 @@ class _MockSimulation:
 
 def build_rig(file: RigFile) -> Rig:
     """The rig that a rig file describes, not connected yet."""
+    return simulated_rig(file, build_mock(file.mock))
+
+
+def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
+    """The rig that a rig file describes, on simulated devices that somebody else made."""
     plane = file.calibration.contact_plane
-    devices = build_mock(file.mock)
     return Rig(
         name=file.name,
         clock=devices.clock,

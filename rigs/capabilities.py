@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, Protocol, runtime_checkable
 
 from protocols.program import PlateAction
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
 
 
 class RigError(RuntimeError):
@@ -204,6 +204,9 @@ class Simulation(Protocol):
 
     def begin_trial(self, seed: int) -> None:
         """Draw everything that varies by trial from `seed`, forgetting what ran before."""
+
+    def sink(self, sink: Sink) -> Sink:
+        """`sink` as this world lets it be written: its disk may be full."""
 
     def truth(self, reference_arm_ns: int) -> dict[str, Any]:
         """What really happened in the trial that just ran (JSON), times in ns of the sync box.

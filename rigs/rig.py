@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,6 +45,18 @@ class StopRequested(Exception):
 
 
 @dataclass(frozen=True)
+class Way:
+    """A straight way that the arm was told to take in one recorded step, or a place to stay at."""
+
+    start_ns: int
+    end_ns: int
+    """On the arm's clock."""
+    begin_mm: tuple[float, float, float]
+    end_mm: tuple[float, float, float]
+    """Tool centre point in the arm's base frame."""
+
+
+@dataclass(frozen=True)
 class TrialRun:
     """What the rig can say of a trial besides its streams."""
 
@@ -52,6 +64,8 @@ class TrialRun:
     """Each step with its times, and whether it was recorded."""
     zero_mm: float
     truth: Json | None
+    ways: tuple[Way, ...] = ()
+    """What the arm was told to do in the recorded steps."""
 
     @property
     def recorded_ns(self) -> tuple[int, int]:
@@ -89,10 +103,15 @@ class Rig:
         self.arm.connect()
 
     def close(self) -> None:
-        """Give every device back, the arm first; safe to call more than once."""
-        self.arm.stop()
+        """Give every device back, the arm first; safe to call more than once.
+
+        A device that does not answer has nothing to give back, and must not keep the others.
+        """
+        with suppress(RigError):
+            self.arm.stop()
         for device in (self.arm, self.events, self.frames, self.sync):
-            device.close()
+            with suppress(RigError):
+                device.close()
 
     def run_trial(
         self,
@@ -112,7 +131,9 @@ class Rig:
             if frame_px is not None:
                 self.frames.set_region(*frame_px)
             self._home(program.home, seed)
-            steps = []
+            if self.simulation is not None:
+                sink = self.simulation.sink(sink)
+            steps, ways = [], []
             at, recording, reference = program.home, False, 0
             for index, step in enumerate(program.steps):
                 if step.recorded and not recording:
@@ -125,11 +146,13 @@ class Rig:
                     reference = self.arm.now_ns()
                 times = self._step(index, step, at, sink if recording else None)
                 steps.append((times, step.recorded))
-                at = step_seconds(step, at)[1]
+                began, at = at, step_seconds(step, at)[1]
+                if step.recorded:
+                    ways.append(self._way(times, began, at))
             truth = None
             if self.simulation is not None:
                 truth = self.simulation.truth(reference)
-            return TrialRun(tuple(steps), self.frame.zero_mm, truth)
+            return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(ways))
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm the skin up: press at the plate's centre and let go, `times` times."""
@@ -285,22 +308,36 @@ class Rig:
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
 
+    def _way(self, times: StepTimes, begin: Position, end: Position) -> Way:
+        places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
+        return Way(times.start_ns, times.end_ns, *places)
+
     def _position(self) -> Position:
         return self.frame.position(self.arm.pose().xyz_mm)
 
     @contextmanager
     def _safely(self, clear: Position) -> Iterator[None]:
-        """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras."""
+        """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
+
+        A device that fails while it is stopped does not keep the others from being stopped. Then
+        what went wrong first is raised, unless it is the arm that could not be stopped or moved
+        clear and nobody would hear of it otherwise.
+        """
         try:
             yield
-        except BaseException:
-            self.arm.stop()
+        except BaseException as error:
+            fault: RigError | None = None
             try:
+                self.arm.stop()
                 self._retract(clear)
+            except RigError as second:
+                fault = second
             finally:
-                self.events.stop()
-                self.frames.stop()
-                self.sync.stop()
+                for device in (self.events, self.frames, self.sync):
+                    with suppress(RigError):
+                        device.stop()
+            if fault is not None and not (isinstance(error, RigError) and error.device == "arm"):
+                raise fault from error
             raise
 
     def _retract(self, clear: Position) -> None:

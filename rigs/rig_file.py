@@ -14,8 +14,9 @@ from protocols.hashing import hash_text
 from protocols.plan import Plan
 from protocols.program import Move
 from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
-from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
+from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
 from rigs.mock.settings import MockSettings
+from rigs.rig_inheritance import read_rig, rig_path
 
 
 def _mm(raw: object) -> float:
@@ -101,6 +102,8 @@ class Estimates(StrictModel):
     """Of one frame without the plate's marker: its papillae; the dark ground costs little."""
     bytes_per_plate_frame: float = Field(ge=0)
     """Of one frame with the plate's marker."""
+    bytes_per_tracked_frame: float = Field(ge=0)
+    """Of one frame that is kept as the places of its markers."""
     fixed_bytes: float = Field(ge=0)
     """Of one trial: poses, pulses, record."""
 
@@ -162,6 +165,18 @@ class RigFile(StrictModel):
         """Whether the plate hangs on a slider that can be raised, released and caught."""
         return self.driver == "mock"
 
+    @property
+    def frame_source(self) -> str:
+        """``video`` or ``tracks``: what the outside camera hands over."""
+        return self.mock.frame_camera.level
+
+    def frame_bytes(self, with_plate: bool) -> float:
+        """What one frame is expected to take on disk, with or without the plate's marker."""
+        known = self.estimates
+        if self.frame_source == "tracks":
+            return known.bytes_per_tracked_frame
+        return known.bytes_per_plate_frame if with_plate else known.bytes_per_frame
+
     def frame_px(self, plan: Plan) -> tuple[int, int] | None:
         """(width, height) of the recorded region in pixels, multiples of 16; None without video."""
         recording = plan.protocol.collection.recording
@@ -173,18 +188,39 @@ class RigFile(StrictModel):
 
 
 def load_rig_file(path: Path) -> tuple[RigFile, str]:
-    """A checked rig file and its text.
+    """A checked rig file and its text, what it extends merged in.
+
+    Args:
+        path: a file, or the name of a rig that ships with the package, such as ``mock``.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
-    text = read_text(path, "rig file")
-    return validate(RigFile, parse_yaml(text, path), path), text
+    found = read_rig(rig_path(path))
+    try:
+        return validate(RigFile, found.data, found.path), found.text
+    except InputError as error:
+        raise error.in_file(found.blame(error.key)) from None
 
 
 def rig_hash(text: str) -> str:
-    """Hash of a rig file's content."""
+    """Hash of a rig file's content, as `load_rig_file` gives it."""
     return hash_text(text)
+
+
+def same_rig(one: str, other: str) -> bool:
+    """Whether two contents of rig files describe one rig.
+
+    The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
+    ended goes on without it.
+    """
+    if one == other:
+        return True
+    first, second = (parse_yaml(text, "rig.yaml") for text in (one, other))
+    for data in (first, second):
+        if isinstance(data.get("mock"), dict):
+            data["mock"].pop("faults", None)
+    return first == second
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:

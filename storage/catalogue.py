@@ -31,6 +31,7 @@ def catalogue(store: Store) -> pd.DataFrame:
                 "recorded_s": record["recorded_s"],
                 "events": record["counts"]["events"],
                 "frames": record["counts"]["frames"],
+                "frame_source": recording.frame_source,
                 "sync_uncertainty_us": record["clocks"]["events"]["uncertainty_ns"] / 1000,
                 "passed": record["quality"]["passed"],
             }

@@ -6,6 +6,7 @@ disk, then renamed over it, then the folder flushed too.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -13,6 +14,15 @@ from pathlib import Path
 from typing import Any
 
 _BLOCK = 1 << 20
+
+
+def disk_full(error: BaseException | None) -> bool:
+    """Whether `error`, or what caused it, is a disk or a quota without room."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            return True
+        error = error.__cause__
+    return False
 
 
 def sync_folder(folder: Path) -> None:

@@ -42,6 +42,11 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...], str]] = {
     "frames/host": ("int64", (), "ns of the host's monotonic clock"),
     "frames/sync": ("uint8", (), "level of the sync line during exposure"),
 }
+# only there once something came, a row a frame; -1 stands for the number of markers
+TRACKS: dict[str, tuple[str, tuple[int, ...], str]] = {
+    "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
+    "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
+}
 
 
 class StreamFile:
@@ -57,16 +62,19 @@ class StreamFile:
         self._held = dict.fromkeys(COLUMNS, 0)
         self.counts = dict.fromkeys(COLUMNS, 0)
         for name, (dtype, shape, unit) in COLUMNS.items():
-            rows = EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
-            data = self._file.create_dataset(
-                name,
-                (0, *shape),
-                dtype,
-                maxshape=(None, *shape),
-                chunks=(rows, *shape),
-                **hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
-            )
-            data.attrs["unit"] = unit
+            self._create(name, dtype, shape, unit)
+
+    def _create(self, name: str, dtype: str, shape: tuple[int, ...], unit: str) -> None:
+        rows = EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
+        data = self._file.create_dataset(
+            name,
+            (0, *shape),
+            dtype,
+            maxshape=(None, *shape),
+            chunks=(rows, *shape),
+            **hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
+        )
+        data.attrs["unit"] = unit
 
     def _append(self, name: str, values: Array) -> None:
         """Gather whole chunks before writing: a partial chunk would be compressed twice."""
@@ -123,6 +131,28 @@ class StreamFile:
         self._append("frames/t", chunk.t_ns)
         self._append("frames/host", chunk.host_ns)
         self._append("frames/sync", chunk.sync)
+
+    def add_tracks(self, chunk: FrameChunk) -> None:
+        """Append the places that a camera found in its frames instead of handing them over.
+
+        The frames' times come first. Every column of tracks gets a row a frame: NaN where a plate's
+        marker came later than the first frame, or went.
+        """
+        before, after = self.counts["frames/t"] - len(chunk), self.counts["frames/t"]
+        found = {"tracks/markers": chunk.markers_px, "tracks/plate": chunk.plate_px}
+        for name, values in found.items():
+            if values is None and name not in self.counts:
+                continue
+            if values is not None and name not in self.counts:
+                dtype, _, unit = TRACKS[name]
+                self._create(name, dtype, values.shape[1:], unit)
+                self._pending[name], self._held[name], self.counts[name] = [], 0, 0
+            shape = self._file[name].shape[1:]
+            missing = (before if values is not None else after) - self.counts[name]
+            if missing:
+                self._append(name, np.full((missing, *shape), np.nan, np.float32))
+            if values is not None:
+                self._append(name, values)
 
     def finish(self) -> None:
         """Write what is held back and the index, and close the file."""
@@ -199,9 +229,16 @@ class StreamReader:
         """One column by its name in the file, such as ``frames/t``."""
         return np.asarray(self._file[name][:])
 
+    def has(self, name: str) -> bool:
+        """Whether the file has a column of this name; those of `TRACKS` may be missing."""
+        return name in self._file
+
     def counts(self) -> dict[str, int]:
-        """Rows of every column."""
-        return {name: int(self._file[name].shape[0]) for name in COLUMNS}
+        """Rows of every column; 0 for one that is missing."""
+        return {
+            name: int(self._file[name].shape[0]) if name in self._file else 0
+            for name in (*COLUMNS, *TRACKS)
+        }
 
 
 def _bracket(marks: Any, t_us: int, count: int) -> tuple[int, int]:

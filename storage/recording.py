@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,19 @@ import numpy as np
 from storage.clockmap import ClockMap
 from storage.files import read_json
 from storage.hdf5 import StreamReader
-from storage.streams import I64, U8, EventChunk, Json
+from storage.streams import F64, I64, U8, EventChunk, Json
 from storage.video import read_frame, read_frames
 from storage.writer import CHECKSUMS, DATA, FRAMES, RECORD
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Where the markers were in each of n frames, by the camera's own account; pixels."""
+
+    markers_px: F64
+    """(n, m, 2) in the order of the record's layout, NaN where a marker was not seen whole."""
+    plate_px: F64 | None
+    """(n, 2), NaN where the plate's marker was not seen; None without one."""
 
 
 class Recording:
@@ -41,8 +52,19 @@ class Recording:
 
     @property
     def has_video(self) -> bool:
-        """Whether frames were recorded."""
+        """Whether the frames themselves were recorded."""
         return (self.folder / FRAMES).exists()
+
+    @cached_property
+    def has_tracks(self) -> bool:
+        """Whether the markers' places were recorded instead of a video."""
+        with self.open() as reader:
+            return reader.has("tracks/markers")
+
+    @property
+    def frame_source(self) -> str:
+        """``video``, ``tracks`` or ``none``: what is there of the outside camera."""
+        return "video" if self.has_video else "tracks" if self.has_tracks else "none"
 
     def open(self) -> StreamReader:
         """The HDF5 file, as a context manager."""
@@ -78,6 +100,21 @@ class Recording:
     def frame(self, index: int) -> U8:
         """One decoded frame."""
         return read_frame(self.folder / FRAMES, index)
+
+    def tracks(self) -> Tracks:
+        """The markers' places, where they were recorded instead of a video.
+
+        Raises:
+            ValueError: the trial has none.
+        """
+        if not self.has_tracks:
+            raise ValueError(f"{self.folder}: holds no tracks")
+        with self.open() as reader:
+            plate = reader.column("tracks/plate") if reader.has("tracks/plate") else None
+            markers = reader.column("tracks/markers")
+        return Tracks(
+            markers.astype(np.float64), None if plate is None else plate.astype(np.float64)
+        )
 
     def step(self, phase: str) -> tuple[int, int]:
         """Start and end of a phase of the motion on the time line, ns.

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 I64 = npt.NDArray[np.int64]
+F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
@@ -66,10 +67,10 @@ class PoseChunk:
 
 @dataclass(frozen=True)
 class FrameChunk:
-    """Frames of the outside camera in order, n of them."""
+    """Frames of the outside camera in order, n of them: pictures, or the places found in them."""
 
     images: U8
-    """Grey levels, shape (n, height, width)."""
+    """Grey levels, shape (n, height, width); (n, 0, 0) from a camera that hands over tracks."""
     number: I64
     """The camera's own frame counter, shape (n,); a gap is a lost frame."""
     t_ns: I64
@@ -78,6 +79,11 @@ class FrameChunk:
     """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
     sync: U8
     """Level of the sync line during the exposure: 0 or 1, shape (n,)."""
+    markers_px: F32 | None = None
+    """Instead of pictures: column and row of every papilla's marker in the order of the skin's
+    layout, shape (n, m, 2), NaN where it was not seen whole."""
+    plate_px: F32 | None = None
+    """Beside `markers_px`: the centre of the plate's marker, shape (n, 2); None without one."""
 
     def __len__(self) -> int:
         return len(self.t_ns)

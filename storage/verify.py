@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from storage.files import read_json, sha256
-from storage.hdf5 import StreamReader
+from storage.hdf5 import TRACKS, StreamReader
 from storage.recording import Recording
 from storage.store import Campaign, Store
 from storage.video import count_frames
@@ -97,10 +97,27 @@ def _contents(folder: Path) -> list[Problem]:
                     str(folder / DATA), f"{count} {name}, the record says {record['counts'][name]}"
                 )
             )
-    if recording.has_video and count_frames(folder / FRAMES) != found["frames"]:
-        problems.append(Problem(str(folder / FRAMES), f"does not hold {found['frames']} frames"))
+    problems += _frame_problems(folder, recording, counts)
     if not record["quality"]["passed"]:
         problems.append(Problem(str(folder / RECORD), "was committed although a gate failed"))
+    return problems
+
+
+def _frame_problems(folder: Path, recording: Recording, counts: dict[str, int]) -> list[Problem]:
+    """A row of tracks, or a picture in the video, for every frame."""
+    frames, problems = counts["frames/t"], []
+    if recording.has_tracks:
+        with recording.open() as reader:
+            there = [name for name in TRACKS if reader.has(name)]
+        problems += [
+            Problem(str(folder / DATA), f"{counts[name]} rows of {name}, not {frames}")
+            for name in there
+            if counts[name] != frames
+        ]
+    elif frames and not recording.has_video:
+        problems.append(Problem(str(folder / DATA), "has frames, but neither video nor tracks"))
+    if recording.has_video and count_frames(folder / FRAMES) != frames:
+        problems.append(Problem(str(folder / FRAMES), f"does not hold {frames} frames"))
     return problems
 
 

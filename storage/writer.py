@@ -23,7 +23,8 @@ class TrialWriter:
     Args:
         folder: the trial's folder aside; must not exist.
         target: where it stands once committed.
-        frame_px: (width, height) of the frames, or None without a video.
+        frame_px: (width, height) of the frames, or None without a frame camera. Whether there will
+            be a video shows with the first frame: a camera may hand over tracks instead.
         spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
             encode as fast as their camera delivers.
     """
@@ -44,9 +45,7 @@ class TrialWriter:
         self._rate_hz = rate_hz
         self._spool = folder / "frames.raw" if spool and frame_px else None
         self._spool_file = self._spool.open("wb") if self._spool else None
-        self._video = None
-        if frame_px is not None and not spool:
-            self._video = VideoWriter(folder / FRAMES, *frame_px, rate_hz)
+        self._video: VideoWriter | None = None
         self._sealed = False
 
     @property
@@ -75,13 +74,17 @@ class TrialWriter:
         self._streams.add_poses(chunk)
 
     def add_frames(self, chunk: FrameChunk) -> None:
-        """Append frames and their times."""
+        """Append frames, or the tracks that stand for them, and their times."""
         if self._frame_px is None or not len(chunk):
             return
         self._streams.add_frame_times(chunk)
-        if self._spool_file is not None:
+        if chunk.markers_px is not None:
+            self._streams.add_tracks(chunk)
+        elif self._spool_file is not None:
             self._spool_file.write(np.ascontiguousarray(chunk.images).data)
-        elif self._video is not None:
+        else:
+            if self._video is None:
+                self._video = VideoWriter(self.folder / FRAMES, *self._frame_px, self._rate_hz)
             self._video.write(chunk.images)
 
     def seal(self) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
-from rigs.mock.clocks import Jitter, Noise
+from rigs.mock.clocks import FaultyClock, Jitter, Noise, undisturbed
 from rigs.mock.path import Leg
 from rigs.mock.sync import MockSyncBox, SyncInput
 from rigs.mock.world import World
@@ -32,7 +32,8 @@ class MockArm:
     def _begin(self) -> None:
         world = self._world
         self._legs = []
-        self._first = -(-world.clocks.arm.to_reference(world.now_ns) // self._period_ns)
+        self._cycles = undisturbed(world.clocks.arm)
+        self._first = -(-self._cycles.to_reference(world.now_ns) // self._period_ns)
         self._read = self._first
         self._noise = Noise(world.seed, "pose noise", 3)
         self._late = Jitter(world.seed, "arm reception", 50.0)
@@ -78,9 +79,12 @@ class MockArm:
         return Progress(self.state(), finished, not world.path.moving(world.now_ns))
 
     def read_poses(self) -> PoseChunk:
-        """Poses since the last call, one a controller cycle."""
+        """Poses since the last call, one a controller cycle.
+
+        A clock at fault stamps them wrongly; the cycles themselves go on.
+        """
         world, settings = self._world, self._world.settings.arm
-        clock, latency = world.clocks.arm, settings.latency_us * 1000
+        clock, latency = self._cycles, settings.latency_us * 1000
         oldest = clock.to_reference(max(world.now_ns - BACKLOG_NS, 0))
         first = max(self._read, -(-oldest // self._period_ns))
         end = clock.to_reference(world.now_ns) // self._period_ns + 1
@@ -92,7 +96,10 @@ class MockArm:
         cycles, true, host = cycles[:here], true[:here], host[:here]
         state = world.path.states(true)
         xyz = state[:, :3] + self._noise.of(cycles - self._first) * (settings.pose_noise_um * 1e-3)
-        return PoseChunk(cycles * self._period_ns, host, xyz, state[:, 3:6].copy())
+        stamps = cycles * self._period_ns
+        if isinstance(world.clocks.arm, FaultyClock):
+            stamps = world.clocks.arm.to_reference(true)
+        return PoseChunk(stamps, host, xyz, state[:, 3:6].copy())
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses seen by the digital input, controller clock."""

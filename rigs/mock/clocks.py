@@ -6,11 +6,14 @@ is known to the simulated devices and to nobody else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
+from rigs.mock.fault_settings import ClockDrift, ClockJump, Device
+from rigs.mock.faults import FaultBook
 from rigs.mock.settings import Clocks
 from rigs.scene.randomness import generator
 from storage.clockmap import ClockMap
@@ -43,6 +46,138 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
         for start, share, ppm in zip(offset, drift, largest, strict=False)
     )
     return TrialClocks(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
+
+
+@dataclass(frozen=True)
+class FaultyClock(ClockMap):
+    """True time to device time by a clock that drifts more, or jumps, at known moments.
+
+    The map of its superclass is the undisturbed clock: what the device's cycles run by.
+    """
+
+    device: Device
+    faults: FaultBook
+
+    @overload
+    def to_reference(self, times: int) -> int: ...
+    @overload
+    def to_reference(self, times: npt.NDArray[np.integer[Any]]) -> I64: ...
+    def to_reference(self, times: int | npt.NDArray[np.integer[Any]]) -> int | I64:
+        """What the clock shows at true times, ns: an int or an int64 array of any shape.
+
+        Raises:
+            TypeError, OverflowError: as the undisturbed map.
+        """
+        shown = super().to_reference(times)
+        gained = np.zeros(np.shape(times), np.int64)
+        for fault, due in self._drifts():
+            since = np.maximum(np.asarray(times) - due, 0).astype(np.int64)
+            gained += ClockMap(0, 0, round(fault.ppm * 1000)).to_reference(since) - since
+        gained += self.jumped_ns(np.asarray(times, np.int64))
+        return shown + int(gained) if isinstance(shown, int) else shown + gained
+
+    @overload
+    def to_device(self, times: int) -> int: ...
+    @overload
+    def to_device(self, times: npt.NDArray[np.integer[Any]]) -> I64: ...
+    def to_device(self, times: int | npt.NDArray[np.integer[Any]]) -> int | I64:
+        """The first true time, to the ns, at which the clock shows at least `times`.
+
+        A clock that jumps back shows some times twice, one that jumps on leaves some out.
+        """
+        if not isinstance(times, int | np.integer):
+            flat = [self._first(int(t)) for t in np.asarray(times).ravel()]
+            return np.array(flat, np.int64).reshape(np.shape(times))
+        return self._first(int(times))
+
+    def jumped_ns(self, true_ns: I64) -> I64:
+        """By how much the clock has jumped at true times, ns, shape of `true_ns`."""
+        gained = np.zeros(true_ns.shape, np.int64)
+        for fault, due, _ in self.faults.spans(ClockJump):
+            if fault.device == self.device:
+                gained += np.where(true_ns >= due, round(fault.seconds * 1e9), 0)
+        return gained
+
+    def cycle_ns(self, true_ns: I64) -> I64:
+        """True times at which cycles come that an undisturbed clock has at `true_ns`.
+
+        A clock that gains comes to them sooner. Jumps change what a clock shows, not its pace.
+        """
+        result = true_ns
+        for fault, due in self._drifts():
+            after = ClockMap(due, due, round(fault.ppm * 1000)).to_device(result)
+            result = np.where(result > due, after, result)
+        return result
+
+    def _drifts(self) -> list[tuple[ClockDrift, int]]:
+        return [
+            (fault, due)
+            for fault, due, _ in self.faults.spans(ClockDrift)
+            if fault.device == self.device
+        ]
+
+    def _first(self, shown: int) -> int:
+        jumps = {due for fault, due, _ in self.faults.spans(ClockJump)}
+        low = -(1 << 61)
+        for high in [*sorted(jumps), 1 << 61]:
+            # between jumps the clock never runs backwards, so that halving finds the time
+            if self.to_reference(high - 1) >= shown:
+                while low < high - 1:
+                    middle = (low + high - 1) // 2
+                    if self.to_reference(middle) >= shown:
+                        high = middle + 1
+                    else:
+                        low = middle + 1
+                return low
+            low = high
+        raise OverflowError(f"the clock never shows {shown} ns")
+
+
+def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
+    """The same clocks, disturbed where the trial's faults say so; otherwise as they are."""
+    if not faults.of(ClockDrift) and not faults.of(ClockJump):
+        return clocks
+    return replace(
+        clocks,
+        arm=faulty(clocks.arm, "arm", faults),
+        event_camera=faulty(clocks.event_camera, "event_camera", faults),
+        frame_camera=faulty(clocks.frame_camera, "frame_camera", faults),
+    )
+
+
+def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
+    """`clock`, as the trial's faults disturb it."""
+    hit = [fault for fault in faults.of(ClockDrift) if fault.device == device]
+    jumps = [fault for fault in faults.of(ClockJump) if fault.device == device]
+    if not hit and not jumps:
+        return clock
+    return FaultyClock(
+        clock.device_anchor_ns, clock.reference_anchor_ns, clock.drift_ppb, device, faults
+    )
+
+
+def undisturbed(clock: ClockMap) -> ClockMap:
+    """What the device's cycles run by: `clock` without its faults."""
+    return ClockMap(clock.device_anchor_ns, clock.reference_anchor_ns, clock.drift_ppb)
+
+
+class HighestStamp:
+    """Keeps the stamps of a stream from running backwards.
+
+    The contract of event streams, which every consumer of events relies on. While a clock that
+    jumped back has not caught up, events keep their order and carry the highest stamp so far; the
+    sync pulses show the jump, so that no such trial is taken for good.
+    """
+
+    def __init__(self) -> None:
+        self._highest = -(1 << 62)
+
+    def of(self, stamps: I64) -> I64:
+        """Stamps (n,) that do not decrease, from one call to the next either."""
+        if len(stamps):
+            stamps = np.maximum(np.maximum.accumulate(stamps), self._highest)
+            self._highest = int(stamps[-1])
+        return stamps
 
 
 class Noise:

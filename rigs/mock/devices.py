@@ -8,11 +8,13 @@ from typing import Any
 from rigs.mock.arm import MockArm
 from rigs.mock.event_camera import MockEventCamera
 from rigs.mock.frame_camera import MockFrameCamera
+from rigs.mock.guard import on_cable, on_disk
 from rigs.mock.people import MockPlate, SimulatedOperator, VirtualClock
 from rigs.mock.settings import MockSettings
 from rigs.mock.sync import MockSyncBox
 from rigs.mock.truth import truth_of
 from rigs.mock.world import World
+from storage.streams import Sink
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,10 @@ class MockDevices:
         """Make what follows depend on `seed` and the program alone; see `World.begin_trial`."""
         self.world.begin_trial(seed)
 
+    def sink(self, sink: Sink) -> Sink:
+        """Where streams go in this world, whose disk may be full."""
+        return on_disk(sink, self.world)
+
     def truth(self, reference_true_ns: int, threshold_px: float = 2.0) -> dict[str, Any]:
         """What really happened since `reference_true_ns`; see `rigs.mock.truth.truth_of`."""
         return truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px)
@@ -43,10 +49,10 @@ def build_mock(settings: MockSettings) -> MockDevices:
     sync = MockSyncBox(world)
     return MockDevices(
         clock=VirtualClock(world),
-        arm=MockArm(world, sync),
-        events=MockEventCamera(world, sync),
-        frames=MockFrameCamera(world, sync),
-        sync=sync,
+        arm=on_cable(MockArm(world, sync), "arm", world),
+        events=on_cable(MockEventCamera(world, sync), "event_camera", world),
+        frames=on_cable(MockFrameCamera(world, sync), "frame_camera", world),
+        sync=on_cable(sync, "sync_box", world),
         plate=MockPlate(world),
         operator=SimulatedOperator(world),
         world=world,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigs.mock.bursts import Bursts
+from rigs.mock.clocks import HighestStamp
 from rigs.mock.history import History
 from rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from rigs.mock.world import World
@@ -27,6 +29,7 @@ class MockEventCamera:
         self._sensor = MarkerSensor(
             EventOptics(**settings.model_dump()), world.skin.layout_mm, world.settings.seed
         )
+        self._bursts = Bursts(world, self.width, self.height)
         self._input = SyncInput(world, box, "event_camera")
         self._begin()
         world.on_begin.append(self._begin)
@@ -34,49 +37,59 @@ class MockEventCamera:
     def _begin(self) -> None:
         self._running = False
         self._until_ns = 0
-        self._next_step = 0
+        self._next_ns = 0
         self._loads: History | None = None
+        self._stamps = HighestStamp()
 
     def start(self) -> None:
         """Begin to stream: every pixel takes the present image as its reference."""
         world = self._world
         loads = self._loads = world.keep_loads()
-        self._next_step = loads.base
-        self._sensor.reset(loads.rows(loads.base, loads.base + 1)[0], world.seed)
+        self._next_ns = loads.end_ns
+        self._sensor.reset(loads.between(self._next_ns, self._next_ns)[1][0], world.seed)
         self._begun_ns, self._until_ns, self._running = world.now_ns, _NEVER, True
         self._input.skip()
 
     def read(self) -> EventChunk:
         """Events since the last call, camera clock, whole microseconds."""
         world = self._world
-        done = world.advance()
+        done_ns = world.advance()
         loads = self._loads
         if loads is None:
             return _no_events()
-        # steps that are complete and have not been sent, in whole blocks of the global grid
-        last = min(done - 1, self._until_ns // world.step_ns)
+        # what is complete and has not been sent, in whole blocks of the global grid
+        last_ns = done_ns
         if self._running:
-            last -= last % self._sensor.optics.block_steps
-        if last <= self._next_step:
+            last_ns -= last_ns % self._sensor.optics.block_ns
+        elif done_ns > self._until_ns:
+            last_ns = int(loads.between(self._until_ns, self._until_ns)[0][0])
+        sent_ns = world.faults.sent_until_ns(world.now_ns)
+        if sent_ns < last_ns:
+            last_ns = sent_ns - sent_ns % self._sensor.optics.block_ns
+        if last_ns <= self._next_ns:
             return _no_events()
-        rows = loads.rows(self._next_step, last + 1)
-        t_ns, x, y, p = self._sensor.sense(rows, self._next_step, world.step_ns)
-        self._next_step = last
-        loads.forget(last)
+        row_ns, rows = loads.between(self._next_ns, last_ns)
+        t_ns, x, y, p = self._sensor.sense(rows, row_ns)
+        t_ns, x, y, p = self._bursts.into(
+            (t_ns, x, y, p), self._next_ns, last_ns, self._sensor.scans
+        )
+        self._next_ns = last_ns
+        loads.forget(last_ns)
         kept = t_ns >= self._begun_ns
-        for begin, end in world.faults.gaps_ns(world.recording_ns):
+        for begin, end in world.faults.gaps_ns():
             kept &= (t_ns < begin) | (t_ns >= end)
         if not kept.all():
             t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
-        return EventChunk(x, y, p, world.clocks.event_camera.to_reference(t_ns) // 1000)
+        stamps = world.clocks.event_camera.to_reference(t_ns) // 1000
+        return EventChunk(x, y, p, self._stamps.of(stamps))
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses since the last call, camera clock in ns."""
-        t_ns = self._input.edges_ns()
+        t_ns = self._input.edges_ns(self._world.faults.sent_until_ns(self._world.now_ns))
         if not self._running and self._until_ns == 0:
             return PulseChunk(np.empty(0, np.int64))
         kept = (t_ns >= self._begun_ns - REPORT_NS) & (t_ns <= self._until_ns)
-        for begin, end in self._world.faults.gaps_ns(self._world.recording_ns):
+        for begin, end in self._world.faults.gaps_ns():
             kept &= (t_ns < begin) | (t_ns >= end)
         stamp = self._world.clocks.event_camera.to_reference(t_ns[kept])
         return PulseChunk(stamp // 1000 * 1000)
@@ -85,7 +98,7 @@ class MockEventCamera:
         """Stop streaming; the rest, up to the last whole step, can still be read."""
         if self._running:
             self._world.advance()
-            self._world.loads = None
+            self._world.drop_loads()
             self._running, self._until_ns = False, self._world.now_ns
 
     def close(self) -> None:

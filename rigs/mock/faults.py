@@ -1,44 +1,199 @@
-"""Faults on purpose: everything that a campaign must survive can be asked for by name."""
+"""Which faults of a trial happen when: one book that all simulated devices look into.
+
+Every fault has one true time at which it happens, whatever the devices do in which pieces; what it
+does then stands where it happens: with the pulses, the clocks, the frames, the arm.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
-from rigs.mock.settings import Fault, FaultKind
+import numpy as np
+import numpy.typing as npt
+
+from rigs.mock.fault_settings import (
+    AnyFault,
+    ArmProtectiveStop,
+    Device,
+    DeviceGone,
+    EventGap,
+    EventStall,
+    PapillaTorn,
+)
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+F = TypeVar("F", bound=AnyFault)
+
+NEVER = 1 << 62
+"""True ns that no trial reaches."""
+_GRID_NS = 1_000_000
+_RESOLUTION_NS = 1_000
+_PM = 1e9
+"""Picometres in a millimetre: whole ones add up to the same sum in any pieces."""
 
 
 class FaultBook:
-    """The faults of one trial, and which of them have happened."""
+    """The faults of one trial, and which of them have happened.
 
-    def __init__(self, faults: Sequence[Fault], trial: int) -> None:
-        self._faults = [fault for fault in faults if fault.trial in {None, trial}]
+    Attributes:
+        recording_ns: true time at which the sync box first started; None until then.
+    """
+
+    def __init__(self, faults: Sequence[AnyFault], trial: int) -> None:
+        # before the first trial begins nothing goes wrong
+        self._faults = [fault for fault in faults if trial and fault.trial in {None, trial}]
         self._happened: set[int] = set()
+        self._travels: dict[int, _Travel] = {}
+        self.recording_ns: int | None = None
 
-    def of(self, kind: FaultKind) -> list[Fault]:
+    def of(self, kind: type[F]) -> list[F]:
         """The trial's faults of one kind."""
-        return [fault for fault in self._faults if fault.kind == kind]
+        return [fault for fault in self._faults if isinstance(fault, kind)]
 
-    @staticmethod
-    def due_ns(fault: Fault, recording_ns: int | None) -> int | None:
-        """True time at which `fault` happens; None while its recording has not begun."""
-        origin = 0 if fault.since == "trial" else recording_ns
-        return None if origin is None else origin + round(fault.at_s * 1e9)
+    def due_ns(self, fault: AnyFault) -> int | None:
+        """True time at which `fault` happens; None while its recording has not begun.
 
-    def arm_stop_due(self, begin_ns: int, end_ns: int, recording_ns: int | None) -> int | None:
-        """When, after `begin_ns` and up to `end_ns`, the arm stops; each fault happens once."""
+        A fault without a time of its own is there from the trial's first moment.
+        """
+        since, at_s = getattr(fault, "since", "trial"), getattr(fault, "at_s", 0.0)
+        origin = 0 if since == "trial" else self.recording_ns
+        return None if origin is None else origin + round(at_s * 1e9)
+
+    def spans(self, kind: type[F]) -> list[tuple[F, int, int]]:
+        """Faults of one kind whose time is known, each with its true begin and end, ns.
+
+        The end is `NEVER` for a fault that lasts.
+        """
+        found = []
+        for fault in self.of(kind):
+            begin = self.due_ns(fault)
+            if begin is not None:
+                seconds = getattr(fault, "seconds", None)
+                found.append((fault, begin, NEVER if seconds is None else begin + _ns(seconds)))
+        return found
+
+    # -- the arm ---------------------------------------------------------------------------
+
+    def arm_halt(
+        self, begin_ns: int, end_ns: int, places: Callable[[I64], F64]
+    ) -> tuple[int, bool] | None:
+        """When, from `begin_ns` up to `end_ns`, the arm stops by itself; each fault does it once.
+
+        Args:
+            places: true times (n,) to places of the tool (n, 3), mm, on the path as it is known.
+
+        Returns:
+            The true time, and whether it is a protective stop; an arm whose connection is gone
+            stands still, too, but may move again.
+        """
+        found: list[tuple[int, bool, int]] = []
         for index, fault in enumerate(self._faults):
-            due = self.due_ns(fault, recording_ns)
-            wanted = fault.kind == "arm_protective_stop" and index not in self._happened
-            if wanted and due is not None and due <= end_ns:
-                self._happened.add(index)
-                return max(due, begin_ns)
+            if index in self._happened:
+                continue
+            if isinstance(fault, ArmProtectiveStop):
+                due = self._stop_due(index, fault, end_ns, places)
+            elif isinstance(fault, DeviceGone) and fault.device == "arm":
+                due = self.due_ns(fault)
+            else:
+                continue
+            if due is not None and due <= end_ns:
+                found.append((max(due, begin_ns), isinstance(fault, ArmProtectiveStop), index))
+        if not found:
+            return None
+        at_ns, protective, _ = min(found, key=lambda item: (item[0], not item[1]))
+        self._happened |= {index for due, _, index in found if due == at_ns}
+        return at_ns, protective
+
+    def _stop_due(
+        self, index: int, fault: ArmProtectiveStop, end_ns: int, places: Callable[[I64], F64]
+    ) -> int | None:
+        if fault.at_mm is None:
+            return self.due_ns(fault)
+        origin = 0 if fault.since == "trial" else self.recording_ns
+        if origin is None or end_ns <= origin:
+            return None
+        travel = self._travels.setdefault(index, _Travel(origin, fault.at_mm))
+        return travel.reached_ns(end_ns, places)
+
+    # -- the event camera ------------------------------------------------------------------
+
+    def gaps_ns(self) -> list[tuple[int, int]]:
+        """True times between which the event camera loses what it sees."""
+        gone = [span for span in self.spans(DeviceGone) if span[0].device == "event_camera"]
+        gaps = [(begin, end) for _, begin, end in self.spans(EventGap)]
+        return gaps + [(begin, end) for _, begin, end in gone]
+
+    def sent_until_ns(self, now_ns: int) -> int:
+        """Up to which true time the event camera has sent what it has: earlier while it stalls."""
+        stalls = [begin for _, begin, end in self.spans(EventStall) if begin <= now_ns < end]
+        return min(stalls, default=now_ns)
+
+    # -- the skin --------------------------------------------------------------------------
+
+    def torn(self) -> list[tuple[int, int]]:
+        """Papillae that tear off, and the true times at which they do, ns."""
+        return [(fault.papilla, begin) for fault, begin, _ in self.spans(PapillaTorn)]
+
+    # -- any device ------------------------------------------------------------------------
+
+    def gone(self, device: Device, now_ns: int) -> bool:
+        """Whether `device` has lost its power or its cable."""
+        return any(
+            fault.device == device and begin <= now_ns < end
+            for fault, begin, end in self.spans(DeviceGone)
+        )
+
+    def lost_power_ns(self, device: Device, since_ns: int) -> int:
+        """When `device` first loses its power from `since_ns` on; `NEVER` if it does not."""
+        times = [begin for fault, begin, _ in self.spans(DeviceGone) if fault.device == device]
+        return min((begin for begin in times if begin >= since_ns), default=NEVER)
+
+
+class _Travel:
+    """How far the tool has gone since a moment, on a grid of true time that no caller decides."""
+
+    def __init__(self, origin_ns: int, target_mm: float) -> None:
+        self._cell_ns, self._travelled, self._target = origin_ns, 0, round(target_mm * _PM)
+
+    def reached_ns(self, end_ns: int, places: Callable[[I64], F64]) -> int | None:
+        """When the target is reached, if that is not after `end_ns`."""
+        first = self._cell_ns - self._cell_ns % _GRID_NS + _GRID_NS
+        inner = np.arange(first, end_ns, _GRID_NS, dtype=np.int64)
+        edges = np.concatenate([[self._cell_ns], inner, [end_ns]]).astype(np.int64)
+        way_mm = np.linalg.norm(np.diff(places(edges), axis=0), axis=1)
+        total = self._travelled + np.cumsum(np.rint(way_mm * _PM).astype(np.int64))
+        over = np.flatnonzero(total >= self._target)
+        if len(over):
+            cell = int(over[0])
+            before = self._travelled if cell == 0 else int(total[cell - 1])
+            low, high = edges[cell : cell + 2].tolist()
+            return _first_beyond(low, high, (self._target - before) / _PM, places)
+        if len(inner):  # the last, partial cell is measured again, from its beginning
+            self._travelled, self._cell_ns = int(total[-2]), int(inner[-1])
         return None
 
-    def gaps_ns(self, recording_ns: int | None) -> list[tuple[int, int]]:
-        """True times between which the event camera sends nothing."""
-        gaps = []
-        for fault in self.of("event_gap"):
-            due = self.due_ns(fault, recording_ns)
-            if due is not None:
-                gaps.append((due, due + round(fault.seconds * 1e9)))
-        return gaps
+
+def _first_beyond(
+    low_ns: int, high_ns: int, distance_mm: float, places: Callable[[I64], F64]
+) -> int:
+    """First time, to a microsecond, at which the tool is `distance_mm` from its place at the low.
+
+    Within a cell of the grid the way is as good as straight, so that halving finds it; the halves
+    are cut on a fixed grid, so that the answer does not depend on where the cell was cut off.
+    """
+    origin, base = places(np.array([low_ns], np.int64))[0], low_ns
+    steps_low, steps_high = 0, -(-(high_ns - low_ns) // _RESOLUTION_NS)
+    while steps_high - steps_low > 1:
+        middle = (steps_low + steps_high) // 2
+        here = places(np.array([base + middle * _RESOLUTION_NS], np.int64))[0]
+        if float(np.linalg.norm(here - origin)) >= distance_mm:
+            steps_high = middle
+        else:
+            steps_low = middle
+    return base + steps_high * _RESOLUTION_NS
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

@@ -1,4 +1,8 @@
-"""The simulated frame camera: pictures on every tick, on its own clock, and what gets lost."""
+"""The simulated frame camera: pictures or tracks on every tick, on its own clock, and losses.
+
+At the level `tracks` no picture is drawn: every frame gives the places that tracking its picture
+would have found, with the noise that was measured there. Times, numbers and sync bits are the same.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,22 @@ import numpy.typing as npt
 
 from rigs.capabilities import RigError
 from rigs.mock.clocks import Jitter
+from rigs.mock.frame_faults import FrameFaults
 from rigs.mock.settings import MockSettings
 from rigs.mock.sync import MockSyncBox
 from rigs.mock.world import World
+from rigs.scene.exposure import Exposures, expose
 from rigs.scene.frames import FrameOptics, PlateView
+from rigs.scene.randomness import generator
+from rigs.scene.reflections import Reflections
 from storage.streams import FrameChunk
 
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 _NEVER = 1 << 62
+_NOISE_FRAMES = 256
+"""Frames whose centroid noise is drawn together."""
 
 
 class MockFrameCamera:
@@ -22,6 +34,7 @@ class MockFrameCamera:
 
     def __init__(self, world: World, box: MockSyncBox) -> None:
         self._world, self._box = world, box
+        self._faults = FrameFaults(world, box)
         settings = world.settings.frame_camera
         self.px_per_mm, self.rate_hz = settings.px_per_mm, settings.rate_hz
         self.mid_exposure_ns = settings.exposure_us * 500
@@ -37,6 +50,7 @@ class MockFrameCamera:
         self._jitter = Jitter(
             self._world.seed, "frame stamps", self._world.settings.clocks.frame_jitter_us
         )
+        self._noise: tuple[int, F64] | None = None
 
     def set_region(self, width_px: int, height_px: int) -> None:
         """Read out a centred region only.
@@ -68,28 +82,37 @@ class MockFrameCamera:
         world.advance()
         if box.run != self._run:
             self._run, self._next_tick = box.run, 0
-        after_ns = 2 * self.mid_exposure_ns + settings.latency_us * 1000
-        seen_ns = world.now_ns - max(after_ns, self.mid_exposure_ns + world.step_ns)
+        exposed_ns = 2 * self.mid_exposure_ns
+        after_ns = exposed_ns + settings.latency_us * 1000
+        seen_ns = world.now_ns - max(after_ns, exposed_ns + world.step_ns)
         ticks = box.ticks(self._next_tick, min(seen_ns, self._until_ns))
         if self._until_ns == 0:
             ticks = ticks[:0]
+        host = box.true_ns(ticks) + after_ns if len(ticks) else ticks
+        host = self._faults.arrival_ns(ticks, host)
+        host = host[host <= world.now_ns]
+        ticks = ticks[: len(host)]
         number = self._number + np.arange(len(ticks), dtype=np.int64)
         self._next_tick += len(ticks)
         self._number += len(ticks)
-        kept = ~np.isin(ticks, self._lost())
-        ticks, number = ticks[kept], number[kept]
+        kept = ~self._faults.lost(ticks)
+        ticks, number, host = ticks[kept], number[kept], host[kept]
         mid = box.true_ns(ticks) + self.mid_exposure_ns if len(ticks) else ticks
+        stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
+        sync = box.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
+        if self._view is None:
+            self._view = PlateView(_optics(world.settings), *self._size)
+        seen = expose(world.tips_at, mid, exposed_ns, self.px_per_mm)
+        seen = self._faults.hide(mid, seen)
+        if settings.level == "tracks":
+            empty = np.empty((len(ticks), 0, 0), np.uint8)
+            return FrameChunk(
+                empty, number, stamp, host, sync, *self._tracks(self._view, seen, number)
+            )
         width, height = self._size
         images = np.empty((len(ticks), height, width), np.uint8)
-        if len(ticks):
-            if self._view is None:
-                self._view = PlateView(_optics(world.settings), width, height)
-            tips, plate_mm = world.tips_at(mid)
-            marked = plate_mm if world.plate_marked else None
-            self._view.draw(images, tips, marked, number, world.seed)
-        stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
-        host = mid + (after_ns - self.mid_exposure_ns)
-        sync = box.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
+        marked = seen.plate_mm if world.plate_marked else None
+        self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.ways)
         return FrameChunk(images, number, stamp, host, sync)
 
     def stop(self) -> None:
@@ -101,25 +124,55 @@ class MockFrameCamera:
         """Give the device back."""
         self.stop()
 
-    def _lost(self) -> I64:
-        lost: list[int] = []
-        for fault in self._world.faults.of("frames_lost"):
-            due = self._world.faults.due_ns(fault, self._world.recording_ns)
-            if due is not None:
-                first = self._box.tick_at(due)
-                lost += range(first, first + fault.count)
-        return np.array(lost, np.int64)
+    def _tracks(self, view: PlateView, seen: Exposures, number: I64) -> tuple[F32, F32 | None]:
+        """What tracking the pictures of `seen` would give: markers and, if it is there, plate."""
+        settings = self._world.settings.frame_camera
+        noise = self._centroid_noise(number)
+        markers = view.centre_px(seen.tips_mm)
+        # as the tracker does it: a marker cut by the picture's edge is not measured
+        markers[~_inside(markers, view.radius_px(seen.tips_mm) + 1.0, self._size)] = np.nan
+        markers += settings.centroid_noise_px * noise[:, 1:]
+        if not self._world.plate_marked:
+            return markers.astype(np.float32), None
+        plate = view.marker.centre_px(seen.plate_mm)
+        whole = np.full(len(plate), 0.5 * view.marker.size_px)
+        plate[~_inside(plate, whole, self._size)] = np.nan
+        plate += settings.plate_noise_px * noise[:, 0]
+        return markers.astype(np.float32), plate.astype(np.float32)
+
+    def _centroid_noise(self, number: I64) -> F64:
+        """Unit noise of the plate's marker and every papilla, (k, 1 + m, 2), by frame number."""
+        things = 1 + len(self._world.skin)
+        result = np.empty((len(number), things, 2))
+        for block in np.unique(number // _NOISE_FRAMES).tolist():
+            if self._noise is None or self._noise[0] != block:
+                draw = generator(self._world.seed, "centroid noise", block)
+                self._noise = block, draw.standard_normal((_NOISE_FRAMES, things, 2))
+            mine = number // _NOISE_FRAMES == block
+            result[mine] = self._noise[1][number[mine] % _NOISE_FRAMES]
+        return result
+
+
+def _inside(place_px: F64, reach_px: F64, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Whether squares of that half side about (..., 2) places lie in the picture, (...,)."""
+    low = place_px >= reach_px[..., None]
+    high = place_px <= np.array(size) - 1 - reach_px[..., None]
+    return np.asarray((low & high).all(axis=-1))
 
 
 def _optics(settings: MockSettings) -> FrameOptics:
     camera, plate = settings.frame_camera, settings.scene.plate
     return FrameOptics(
         px_per_mm=camera.px_per_mm,
-        tip_radius_mm=settings.frame_camera.tip_radius_mm,
+        tip_radius_mm=camera.tip_radius_mm,
         tip_level=camera.tip_level,
         ground_level=camera.ground_level,
         noise=camera.noise,
         marker_id=plate.marker_id,
         marker_side_mm=plate.marker_side_mm,
         marker_centre_mm=plate.marker_centre_mm,
+        tilt_deg=camera.tilt_deg,
+        k1=camera.k1,
+        distance_mm=camera.distance_mm,
+        reflections=Reflections(**camera.reflections.model_dump()),
     )

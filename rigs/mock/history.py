@@ -1,4 +1,4 @@
-"""Rows of a simulated state, one a step of the global grid, kept as long as somebody needs them."""
+"""Rows of a simulated state and their times, kept as long as somebody needs them."""
 
 from __future__ import annotations
 
@@ -6,27 +6,37 @@ import numpy as np
 import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
 
 
 class History:
-    """A growing table whose first row belongs to step `base`."""
+    """A growing table of rows at rising times; it is never asked before it has a row."""
 
-    def __init__(self, width: int, base: int) -> None:
-        self.base = base
+    def __init__(self, width: int) -> None:
         self._length = 0
         self._rows = np.empty((1024, width))
+        self._t_ns = np.empty(1024, np.int64)
 
     @property
-    def end(self) -> int:
-        """The step after the last row."""
-        return self.base + self._length
+    def begin_ns(self) -> int:
+        """Time of the first row kept."""
+        return int(self._t_ns[0])
 
-    def grow(self, n: int) -> F64:
-        """Room for `n` more rows, to be filled at once by the caller, shape (n, width)."""
+    @property
+    def end_ns(self) -> int:
+        """Time of the last row."""
+        return int(self._t_ns[self._length - 1])
+
+    def grow(self, t_ns: I64) -> F64:
+        """Room for rows at times after the last one, to be filled by the caller, (k, width)."""
+        n = len(t_ns)
         if self._length + n > len(self._rows):
-            larger = np.empty((max(2 * len(self._rows), self._length + n), self._rows.shape[1]))
-            larger[: self._length] = self._rows[: self._length]
-            self._rows = larger
+            size = max(2 * len(self._rows), self._length + n)
+            rows, times = np.empty((size, self._rows.shape[1])), np.empty(size, np.int64)
+            rows[: self._length] = self._rows[: self._length]
+            times[: self._length] = self._t_ns[: self._length]
+            self._rows, self._t_ns = rows, times
+        self._t_ns[self._length : self._length + n] = t_ns
         self._length += n
         return self._rows[self._length - n : self._length]
 
@@ -34,20 +44,44 @@ class History:
         """Take back the last `n` rows of room."""
         self._length -= n
 
-    def rows(self, first: int, last: int) -> F64:
-        """Rows of the steps from `first` up to and without `last`, a view.
+    def between(self, first_ns: int, last_ns: int) -> tuple[I64, F64]:
+        """Times and rows from the last row at or before `first_ns` to the first at or after
+        `last_ns`, or to the end; views, (k,) and (k, width).
 
         Raises:
-            IndexError: a row is not there.
+            IndexError: `first_ns` lies before the first row.
         """
-        if not self.base <= first <= last <= self.end:
-            raise IndexError(f"steps {first} to {last} of a history from {self.base} to {self.end}")
-        return self._rows[first - self.base : last - self.base]
+        times = self._t_ns[: self._length]
+        if not self._length or first_ns < times[0]:
+            raise IndexError(f"nothing is known of the time {first_ns} ns")
+        first = int(np.searchsorted(times, first_ns, side="right")) - 1
+        last = int(np.searchsorted(times, last_ns, side="left")) + 1
+        return times[first:last], self._rows[first : min(last, self._length)]
 
-    def forget(self, before: int) -> None:
-        """Drop the rows of steps before `before`."""
-        drop = min(max(before - self.base, 0), self._length)
-        if drop > len(self._rows) // 2 or drop == self._length:
+    def at(self, t_ns: I64) -> F64:
+        """Rows at rising times by straight lines; after the end the last row, (k, width).
+
+        Raises:
+            IndexError: a time lies before the first row.
+        """
+        if not len(t_ns):
+            return np.empty((0, self._rows.shape[1]))
+        times, rows = self.between(int(t_ns[0]), int(t_ns[-1]))
+        if len(rows) == 1:
+            return np.repeat(rows, len(t_ns), axis=0)
+        after = np.clip(np.searchsorted(times, t_ns, side="left"), 1, len(times) - 1)
+        gap = (times[after] - times[after - 1]).astype(np.float64)
+        share = np.clip((t_ns - times[after - 1]) / gap, 0.0, 1.0)[:, None]
+        before = rows[after - 1]
+        result: F64 = before + share * (rows[after] - before)
+        return result
+
+    def forget(self, before_ns: int) -> None:
+        """Drop rows that nobody needs who asks from `before_ns` on."""
+        times = self._t_ns[: self._length]
+        drop = max(int(np.searchsorted(times, before_ns, side="right")) - 1, 0)
+        if drop > len(self._rows) // 2:
             kept = self._length - drop
             self._rows[:kept] = self._rows[drop : self._length].copy()
-            self._length, self.base = kept, self.base + drop
+            self._t_ns[:kept] = times[drop:].copy()
+            self._length = kept

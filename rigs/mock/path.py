@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rigs.capabilities import Pose, Segment
+from rigs.mock.deviation import Deviation
 from rigs.mock.geometry import ContactPlane
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 TURN_DEG_PER_S = 30.0
+FADE_NS = 200_000_000
+"""How long a tremor takes to build up and to die away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +28,14 @@ class Leg:
     end_ns: int
     start: F64
     end: F64
+    planned: tuple[int, F64] | None = None
+    """When and where it would have ended, had the arm not been stopped."""
 
     def at(self, t_ns: I64) -> F64:
         """States at times within the leg, shape (n, 11)."""
-        share = (t_ns - self.start_ns) / (self.end_ns - self.start_ns)
-        result: F64 = self.start + share[:, None] * (self.end - self.start)
+        end_ns, end = self.planned or (self.end_ns, self.end)
+        share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
+        result: F64 = self.start + share[:, None] * (end - self.start)
         return result
 
 
@@ -40,15 +46,16 @@ class ArmPath:
         self._plane = plane
         self._rest = self._state(pose)
         self.legs: list[Leg] = []
+        self.deviation: Deviation | None = None
 
     def restart(self, now_ns: int) -> None:
-        """Forget the legs; the arm stands where it is at `now_ns`."""
-        self._rest = self.states(np.array([now_ns], np.int64))[0]
+        """Forget the legs; the arm stands where it should be at `now_ns`."""
+        self._rest = self.commanded(np.array([now_ns], np.int64))[0]
         self.legs = []
 
     def follow(self, segments: Sequence[Segment], now_ns: int) -> list[Leg]:
         """Append legs that begin at `now_ns`; returns them."""
-        state, begin, legs = self.states(np.array([now_ns], np.int64))[0], now_ns, []
+        state, begin, legs = self.commanded(np.array([now_ns], np.int64))[0], now_ns, []
         for segment in segments:
             target = self._state(segment.to)
             travel = math.dist(state[:3], target[:3]) / segment.speed_mm_s
@@ -65,11 +72,20 @@ class ArmPath:
         if kept and kept[-1].end_ns > now_ns:
             leg = kept[-1]
             here = leg.at(np.array([now_ns], np.int64))[0]
-            kept[-1] = Leg(leg.start_ns, now_ns, leg.start, here)
+            # the way there stays the same to the bit
+            planned = leg.planned or (leg.end_ns, leg.end)
+            kept[-1] = replace(leg, end_ns=now_ns, end=here, planned=planned)
         self.legs = kept
+        if self.deviation is not None:
+            self.deviation.freeze(now_ns)
 
     def states(self, t_ns: I64) -> F64:
         """xyz (mm), rotation vector (deg) and sensor vector at rising times, shape (n, 11)."""
+        states = self.commanded(t_ns)
+        return states + self.deviation.at(t_ns) if self.deviation else states
+
+    def commanded(self, t_ns: I64) -> F64:
+        """The same, as the arm was told: without its deviation."""
         result = np.empty((len(t_ns), 11))
         result[:] = self._rest
         if self.legs:
@@ -81,6 +97,21 @@ class ArmPath:
                 result[here] = leg.end
                 if leg.end_ns > leg.start_ns:
                     result[inside] = leg.at(t_ns[inside])
+        return result
+
+    def stirred(self, t_ns: I64) -> F64:
+        """How much the arm trembles at rising times, 0 to 1: it fades in and out with motion."""
+        runs: list[tuple[int, int]] = []
+        for leg in self.legs:
+            if runs and runs[-1][1] == leg.start_ns:
+                runs[-1] = (runs[-1][0], leg.end_ns)
+            else:
+                runs.append((leg.start_ns, leg.end_ns))
+        result = np.zeros(len(t_ns))
+        for start, end in runs:
+            risen = np.clip((np.minimum(t_ns, end) - start) / FADE_NS, 0.0, 1.0)
+            fallen = np.maximum(t_ns - end, 0) / FADE_NS
+            np.maximum(result, risen - fallen, out=result)
         return result
 
     def moving(self, now_ns: int) -> bool:

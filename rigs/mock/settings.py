@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from protocols.yaml_file import KeyedError, StrictModel
+from rigs.mock.fault_settings import Fault, check_papillae
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]
@@ -38,9 +39,9 @@ class Skin(StrictModel):
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.49
     bending: Positive = 12.0
     """Denominator of the bending term: 12 for a guided end, 3 for a free one."""
-    base_normal_n_per_m: Positive = 150.0
-    """Stiffness of the membrane under a papilla; without it the centre would buckle."""
-    base_tangential_n_per_m: Positive = 200.0
+    base_normal_n_per_m: Positive | None = 150.0
+    """Stiffness of the membrane under a papilla; null is a rigid one: the centre may buckle."""
+    base_tangential_n_per_m: Positive | None = 200.0
     height_scatter_mm: NonNegative = 0.08
     """Half the range of a uniform deviation of each height."""
     position_scatter_mm: NonNegative = 0.05
@@ -65,7 +66,10 @@ class Friction(StrictModel):
 
     kinetic: Positive = 0.85
     static_excess: Share = 0.03
-    """How much more a stuck tip withstands than a sliding one."""
+    """How much more a stuck tip withstands than a slowly sliding one."""
+    strengthening: NonNegative = 0.01
+    """Friction at sliding speed w is kinetic times 1 + strengthening ln(1 + w / weak_mm_s)."""
+    weak_mm_s: Positive = 0.1
     path_variation: Annotated[float, Field(ge=0, le=0.3)] = 0.05
     """Relative standard deviation of friction along each tip's path, drawn anew every trial."""
     correlation_mm: Positive = 0.5
@@ -86,10 +90,10 @@ class Plate(StrictModel):
     gravity_m_s2: Positive = 9.81
     marker_id: Annotated[int, Field(ge=0, le=49)] = 0
     """Identity in OpenCV's DICT_4X4_50."""
-    marker_side_mm: Positive = 6.6
+    marker_side_mm: Positive = 6.0
     """Side of the black square; the white quiet zone of one module comes on top."""
-    marker_centre_mm: tuple[Finite, Finite] = (15.8, 15.8)
-    """In plate coordinates; clear of the skin and inside a region of 42 mm."""
+    marker_centre_mm: tuple[Finite, Finite] = (16.6, 16.6)
+    """In plate coordinates; inside a region of 41.6 mm, and beside the skin however far it fell."""
 
 
 class Contact(StrictModel):
@@ -118,8 +122,10 @@ class Contact(StrictModel):
 class Scene(StrictModel):
     """The physics: what is there, whether or not anything looks at it."""
 
-    step_us: Annotated[int, Field(ge=100, le=10_000)] = 1000
-    """Step of the scene's grid of virtual time."""
+    level: Literal["auto", "L1", "L2", "L3"] = "auto"
+    """How much physics the contact has (`rigs.scene.springs`); `auto` takes what a plan needs."""
+    step_ms: Literal[1, 2, 4, 8, 16, 32] = 4
+    """Step of the contact while the plate is held; while it may fall, a millisecond."""
     skin: Skin = Skin()
     friction: Friction = Friction()
     plate: Plate = Plate()
@@ -146,23 +152,60 @@ class EventCamera(StrictModel):
     """Spread between pixels, cut at three of them."""
     refractory_us: NonNegative = 500.0
     noise_hz: Annotated[float, Field(ge=0, le=100)] = 0.01
-    """Noise events a pixel and second."""
+    """Noise events a second of a dark pixel."""
     leak_share: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Share of the noise that is leakage (always positive); the rest is shot noise of both."""
-    block_steps: Literal[1, 2, 4, 8, 16, 32, 64] = 32
-    """Steps that the camera sends together: its latency, and the longest chord of a path."""
-    chord_px: Positive = 0.005
-    """Largest distance of a marker's path from its chord."""
+    """Share of that noise that is leakage (always positive, however bright); the rest is shot noise
+    of both polarities, of which the brightest pixels have a quarter."""
+    hot_pixels: Annotated[int, Field(ge=0, le=4096)] = 8
+    """Pixels that fire all the time; the rig's seed chooses them."""
+    hot_hz: Annotated[float, Field(ge=0, le=1000)] = 10.0
+    """Mean rate of each of them, always positive."""
+    readout_hz: Literal[0] | Annotated[float, Field(ge=1000, le=10_000)] = 1000.0
+    """Scans a second: an event has the time of the next scan, and in one scan a pixel sends one
+    event at most. 0: every event has its own time."""
+    block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
+    """What the camera sends together: its latency."""
+    path: Literal["cubic", "chord"] = "cubic"
+    """How markers go from one step of the contact to the next: smoothly, or straight."""
+
+
+class Reflections(StrictModel):
+    """Light mirrored by the acrylic, still in the picture: a nuisance for the labels.
+
+    To be expected at the default level: onsets move by a few milliseconds. Above about 40 (a
+    quarter of the contrast) the tracker takes reflections for markers, and labels mean nothing.
+    """
+
+    count: Annotated[int, Field(ge=0, le=100)] = 0
+    """Soft blobs and streaks a trial, placed by its seed; 0 switches them off."""
+    level: Annotated[float, Field(ge=0, le=255)] = 10.0
+    """Grey levels that they add at most."""
+    size_mm: Positive = 3.0
+    """Standard deviation along each of them, more or less."""
+
+
+Tilt = Annotated[float, Field(ge=-30, le=30)]
 
 
 class FrameCamera(StrictModel):
     """The camera that looks through the plate."""
 
+    level: Literal["video", "tracks"] = "video"
+    """`video`: pictures are drawn and stored. `tracks`: every frame gives the places of the markers
+    with the noise of tracking a video, and no picture; a fraction of the time and the bytes."""
     width: Annotated[int, Field(ge=32, le=8192)] = 1920
     height: Annotated[int, Field(ge=32, le=8192)] = 1200
-    px_per_mm: Positive = 12.0
+    px_per_mm: Positive = 20.0
+    """At the picture's centre."""
+    tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
+    """How the plate is turned against the picture: about its x, then about its y."""
+    k1: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Radial distortion of the lens, OpenCV's first coefficient."""
+    distance_mm: Positive = 300.0
+    """From lens to plate; only matters with a tilt or a distortion."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     exposure_us: Annotated[int, Field(ge=10, le=100_000)] = 2000
+    """What moves while the shutter is open is smeared."""
     tip_radius_mm: Positive = 1.0
     """Of the white spot on each papilla's top. The tips of this scene do not push each other aside,
     so a spot as wide as its papilla (2 mm) would run into its neighbour's."""
@@ -170,6 +213,13 @@ class FrameCamera(StrictModel):
     ground_level: Annotated[int, Field(ge=15, le=255)] = 25
     noise: Annotated[float, Field(ge=0, le=3)] = 1.5
     """Standard deviation of the grey levels, in patches round what is looked at."""
+    reflections: Reflections = Reflections()
+    centroid_noise_px: NonNegative = 0.0045
+    """Root mean square error of a tracked papilla's column and row, for the level `tracks`;
+    measured on the level `video` with the settings above, along a slide."""
+    plate_noise_px: NonNegative = 0.04
+    """The same of the centre of the plate's marker, along a fall. It is mostly what refining the
+    corners does with fractions of a pixel; where nothing moves it is a tenth of this."""
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 4000
     """From the end of exposure to the host."""
 
@@ -181,6 +231,11 @@ class Arm(StrictModel):
     pose_noise_um: NonNegative = 2.0
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1000
     """From a controller's cycle to the host."""
+    vibration_um: NonNegative = 15.0
+    """Largest tremor along each axis while the arm moves, of which each trial has a random share;
+    the reported poses do not show it."""
+    vibration_hz: Positive = 5.0
+    """Its frequencies lie within 30 % of this one."""
     input_sampling_us: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Grid on which the digital input is sampled; 0 stamps each edge when it comes."""
     start_xyz_mm: Triple | None = None
@@ -202,27 +257,6 @@ class Clocks(StrictModel):
     frame_jitter_us: NonNegative = 1.0
 
 
-FaultKind = Literal["arm_protective_stop", "frames_lost", "pulses_lost", "event_gap"]
-
-
-class Fault(StrictModel):
-    """Something that goes wrong on purpose."""
-
-    kind: FaultKind
-    trial: Annotated[int, Field(ge=1)] | None = None
-    """Which trial begun on this rig, counting from 1; left out, every one."""
-    at_s: NonNegative = 0.5
-    """When it happens, after the moment that `since` names."""
-    since: Literal["trial", "recording"] = "recording"
-    """`trial`: the trial's first moment; `recording`: the start of the sync box."""
-    count: Annotated[int, Field(ge=1, le=100_000)] = 1
-    """How many frames or pulses are lost."""
-    seconds: Positive = 0.1
-    """How long a gap lasts."""
-    device: Literal["event_camera", "arm"] = "event_camera"
-    """Whose pulses are lost."""
-
-
 class MockSettings(StrictModel):
     """A simulated rig."""
 
@@ -234,3 +268,9 @@ class MockSettings(StrictModel):
     arm: Arm = Arm()
     clocks: Clocks = Clocks()
     faults: tuple[Fault, ...] = ()
+    """What goes wrong on purpose; docs/faults.md lists the kinds."""
+
+    @model_validator(mode="after")
+    def _papillae(self) -> MockSettings:
+        check_papillae(self.faults, sum(self.scene.skin.ring_counts))
+        return self

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import numpy.typing as npt
 
 from rigs.capabilities import RigError
-from rigs.mock.clocks import Jitter
+from rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
+from rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, PulsesLost
+from rigs.mock.faults import NEVER
 from rigs.mock.world import World
 from rigs.pulse_code import PERIOD, code_bits
 from storage.clockmap import ClockMap
@@ -38,9 +38,11 @@ class MockSyncBox:
         self.rate_hz = 0.0
         self.started_ns = 0
         self.stopped_ns: int | None = 0
+        self._dark_ns = NEVER
         self.clock = ClockMap(0, 0, 0)
         self._read = 0
         self._bits: U8 = np.zeros(0, np.uint8)
+        self._reports = _PulseFaults(self._world, self, "sync_box")
 
     def start(self, rate_hz: float, seed: int) -> None:
         """Begin ticks and code; a train that runs is given up."""
@@ -51,16 +53,28 @@ class MockSyncBox:
         world = self._world
         self.run += 1
         self.rate_hz, self.started_ns, self.stopped_ns, self._read = rate_hz, world.now_ns, None, 0
-        self.clock = ClockMap(self.started_ns, 0, world.clocks.sync_box_ppb)
+        clock = ClockMap(self.started_ns, 0, world.clocks.sync_box_ppb)
+        self.clock = faulty(clock, "sync_box", world.faults)
         self._bits = code_bits(seed, PERIOD)
-        if world.recording_ns is None:
-            world.recording_ns = self.started_ns
+        self._reports = _PulseFaults(world, self, "sync_box")
+        if world.faults.recording_ns is None:
+            world.faults.recording_ns = self.started_ns
+        # a box without power does not tick, and does not go on by itself when it has some again
+        self._dark_ns = world.faults.lost_power_ns("sync_box", self.started_ns)
 
     def read_pulses(self) -> PulseChunk:
         """Pulses sent since the last call, box clock, whole microseconds."""
-        ticks = self.ticks(self._read, self._world.now_ns - REPORT_NS)
+        now_ns = self._world.now_ns
+        if self.rate_hz == 0.0:
+            return PulseChunk(np.empty(0, np.int64))
+        ticks = self.ticks(self._read, now_ns - REPORT_NS)
         self._read += len(ticks)
-        sent = self.box_ns(ticks[self.bits(ticks) == 1])
+        ticks = ticks[self.bits(ticks) == 1]
+        true_ns, sent = self._reports.of(
+            ticks, self.true_ns(ticks), self.box_ns(ticks), now_ns - 2 * REPORT_NS
+        )
+        if isinstance(self.clock, FaultyClock):
+            sent = sent + self.clock.jumped_ns(true_ns)
         return PulseChunk(sent // 1000 * 1000)
 
     def stop(self) -> None:
@@ -78,6 +92,7 @@ class MockSyncBox:
         """Numbers of the ticks from `first` on that came up to the true time `until_ns`."""
         if self.rate_hz == 0.0:
             return np.empty(0, np.int64)
+        until_ns = min(until_ns, self._dark_ns - 1)
         if self.stopped_ns is not None:
             until_ns = min(until_ns, self.stopped_ns)
         end = max(self.tick_at(until_ns + 1), first)
@@ -87,8 +102,10 @@ class MockSyncBox:
         """Number of the first tick at or after a true time, 0 at the least."""
         if self.rate_hz == 0.0:
             return 0
-        box = self.clock.to_reference(true_ns)
+        box = undisturbed(self.clock).to_reference(true_ns)
         guess = max(int(box * self.rate_hz / 1e9) - 1, 0)
+        while guess and int(self.true_ns(np.array([guess - 1], np.int64))[0]) >= true_ns:
+            guess -= 1
         while int(self.true_ns(np.array([guess], np.int64))[0]) < true_ns:
             guess += 1
         return guess
@@ -99,7 +116,8 @@ class MockSyncBox:
 
     def true_ns(self, ticks: I64) -> I64:
         """True times of ticks, ns."""
-        return self.clock.to_device(self.box_ns(ticks))
+        true_ns = undisturbed(self.clock).to_device(self.box_ns(ticks))
+        return self.clock.cycle_ns(true_ns) if isinstance(self.clock, FaultyClock) else true_ns
 
     def bits(self, ticks: I64) -> U8:
         """The code at ticks."""
@@ -109,15 +127,14 @@ class MockSyncBox:
 class SyncInput:
     """A device's input on the sync line: which edges it saw, in true time with its own jitter."""
 
-    def __init__(
-        self, world: World, box: MockSyncBox, device: Literal["event_camera", "arm"]
-    ) -> None:
+    def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
         self._world, self._box, self._device = world, box, device
         self._reset()
         world.on_begin.append(self._reset)
 
     def _reset(self) -> None:
         self._run, self._read = self._box.run, 0
+        self._faults = _PulseFaults(self._world, self._box, self._device)
         self._jitter = Jitter(
             self._world.seed, f"{self._device} pulses", self._world.settings.clocks.pulse_jitter_us
         )
@@ -125,24 +142,72 @@ class SyncInput:
     def skip(self) -> None:
         """Forget the edges up to now."""
         self._run, self._read = self._box.run, self._box.tick_at(self._world.now_ns)
+        self._faults = _PulseFaults(self._world, self._box, self._device)
 
-    def edges_ns(self) -> I64:
-        """True times of the edges since the last call, with jitter, ns."""
-        box = self._box
+    def edges_ns(self, until_ns: int | None = None) -> I64:
+        """True times of the edges since the last call, with jitter, ns.
+
+        Args:
+            until_ns: edges after this true time are left for a later call.
+        """
+        box, limit = self._box, self._world.now_ns
+        if until_ns is not None:
+            limit = min(limit, until_ns)
         if box.run != self._run:
             self._run, self._read = box.run, 0
-        ticks = box.ticks(self._read, self._world.now_ns - REPORT_NS)
+            self._faults = _PulseFaults(self._world, box, self._device)
+        ticks = box.ticks(self._read, limit - REPORT_NS)
         self._read += len(ticks)
         ticks = ticks[box.bits(ticks) == 1] if len(ticks) else ticks
-        ticks = ticks[~np.isin(ticks, self._lost())]
-        return box.true_ns(ticks) + self._jitter.ns(ticks) if len(ticks) else ticks
+        edges = box.true_ns(ticks) + self._jitter.ns(ticks) if len(ticks) else ticks
+        return self._faults.of(ticks, edges, edges, limit - 2 * REPORT_NS)[1]
 
-    def _lost(self) -> I64:
-        lost: list[int] = []
-        for fault in self._world.faults.of("pulses_lost"):
-            due = self._world.faults.due_ns(fault, self._world.recording_ns)
+
+class _PulseFaults:
+    """What becomes of the pulses of one train on their way through one device."""
+
+    def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
+        self._box, self._device, self._book = box, device, world.faults
+        self._waiting = np.empty((2, 0), np.int64)
+        doubled = [fault.device for fault in self._book.of(PulsesDuplicated)]
+        late = [fault.device for fault in self._book.of(PulsesLate)]
+        self._reorders = device in doubled + late
+
+    def of(self, ticks: I64, true_ns: I64, stamps: I64, until_ns: int) -> tuple[I64, I64]:
+        """True times and stamps of what is reported of the pulses on `ticks`.
+
+        Pulses are reported in the order of their times. Where some come late or twice, whatever
+        lies after the true time `until_ns` waits for the next call.
+        """
+        kept = ~np.isin(ticks, self._hit(PulsesLost)[0])
+        ticks, pulses = ticks[kept], np.stack([true_ns[kept], stamps[kept]])
+        if not self._reorders:
+            return pulses[0], pulses[1]
+        hit, late_ns = self._hit(PulsesLate)
+        for tick, delay in zip(hit.tolist(), late_ns.tolist(), strict=True):
+            pulses[:, ticks == tick] += delay
+        hit, after_ns = self._hit(PulsesDuplicated)
+        doubles = [pulses[:, ticks == tick] + gap for tick, gap in zip(hit, after_ns, strict=True)]
+        pulses = np.concatenate([self._waiting, pulses, *doubles], axis=1)
+        pulses = pulses[:, np.lexsort((pulses[1], pulses[0]))]
+        there = int(np.searchsorted(pulses[0], until_ns, side="right"))
+        self._waiting = pulses[:, there:]
+        return pulses[0, :there], pulses[1, :there]
+
+    def _hit(
+        self, kind: type[PulsesLost] | type[PulsesLate] | type[PulsesDuplicated]
+    ) -> tuple[I64, I64]:
+        """Ticks whose pulses suffer from a kind of fault, and by how much, ns."""
+        ticks: list[int] = []
+        shift: list[int] = []
+        for fault in self._book.of(kind) if self._box.rate_hz else ():
+            due = self._book.due_ns(fault)
             if fault.device == self._device and due is not None:
                 first = self._box.tick_at(due)
+                # the code never stays 0 for more than 15 ticks
                 after = np.arange(first, first + 16 * fault.count + 16, dtype=np.int64)
-                lost += after[self._box.bits(after) == 1][: fault.count].tolist()
-        return np.array(lost, np.int64)
+                hit = after[self._box.bits(after) == 1][: fault.count].tolist()
+                seconds = 0.0 if isinstance(fault, PulsesLost) else fault.seconds
+                ticks += hit
+                shift += [round(seconds * 1e9)] * len(hit)
+        return np.array(ticks, np.int64), np.array(shift, np.int64)

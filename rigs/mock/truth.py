@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rigs.capabilities import RigError
+from rigs.mock.faults import NEVER
 from rigs.mock.world import World
 from storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
 SLIP_MM = 1e-6
 """A tip has slipped once it slid this far: beyond rounding, and microseconds of sliding."""
 
@@ -31,8 +33,9 @@ def truth_of(
         JSON, times in ns or None: `per_papilla_ns`, when each marker's displacement relative to
         the plate exceeded the threshold; `incipient_ns`, the first of them; `gross_ns`, the
         centre's; `first_slip_ns` and `slip_per_papilla_ns`, when tips physically began to slide;
-        `reference_ns`; `threshold_mm`; and `simulated`, which is true. Between steps of the
-        scene's grid the displacement is taken as linear.
+        `reference_ns`; `threshold_mm`; `level` of physics; and `simulated`, which is true.
+        Markers' displacements are taken as linear between the rows; the onsets of sliding are
+        located within them.
 
     Raises:
         RigError: the reference is older than the history that is kept (minutes).
@@ -40,23 +43,36 @@ def truth_of(
     world.advance()
     n = len(world.skin)
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
-    first = reference_true_ns // world.step_ns
-    if first < world.track.base:
+    history = world.physics.track
+    if reference_true_ns < history.begin_ns:
         raise RigError("simulation", "the trial is too long: its beginning is forgotten")
-    rows = world.track.rows(first, world.track.end)
-    share = min(max(reference_true_ns / world.step_ns - first, 0.0), 1.0)
-    start = rows[0] + share * (rows[min(1, len(rows) - 1)] - rows[0])
+    start = history.at(np.array([reference_true_ns], np.int64))[0]
+    t_ns, rows = history.between(reference_true_ns, history.end_ns)
+    t_ns = t_ns.copy()
+    t_ns[0] = reference_true_ns
     places = rows[:, : 2 * n].reshape(-1, n, 2) - start[: 2 * n].reshape(n, 2)
     moved = np.hypot(places[:, :, 0], places[:, :, 1])
     slid = rows[:, 2 * n : 3 * n] - start[2 * n : 3 * n]
     moved[0], slid[0] = 0.0, 0.0
 
-    def times(distance: F64, limit: float) -> list[int | None]:
-        return [_crossing(world, box, distance[:, i], limit, first) for i in range(n)]
+    def on_box(true_ns: float | None) -> int | None:
+        return None if true_ns is None else int(box.to_reference(round(true_ns)))
 
-    markers, slips = times(moved, threshold_mm), times(slid, SLIP_MM)
+    torn_ns = dict(world.faults.torn())
+
+    def there(i: int, true_ns: float | None) -> float | None:
+        """What happened to a papilla after it was torn off is no slip."""
+        late = true_ns is not None and true_ns >= torn_ns.get(i, NEVER)
+        return None if late else true_ns
+
+    markers = [on_box(there(i, _crossing(t_ns, moved[:, i], threshold_mm))) for i in range(n)]
+    slips = [
+        on_box(there(i, _first_slip(t_ns, slid[:, i], rows[:, 3 * n + i], reference_true_ns)))
+        for i in range(n)
+    ]
     return {
         "simulated": True,
+        "level": world.settings.scene.level,
         "threshold_mm": threshold_mm,
         "reference_ns": box.to_reference(reference_true_ns),
         "incipient_ns": min((t for t in markers if t is not None), default=None),
@@ -67,14 +83,21 @@ def truth_of(
     }
 
 
-def _crossing(
-    world: World, box: ClockMap, distance: F64, limit: float, first_step: int
-) -> int | None:
+def _crossing(t_ns: I64, distance: F64, limit: float) -> float | None:
+    """When a distance first exceeds a limit, straight between the rows."""
     above = np.flatnonzero(distance > limit)
     if not len(above):
         return None
     k = int(above[0])
     low, high = float(distance[k - 1]), float(distance[k])
     share = (limit - low) / (high - low)
-    step = first_step + k - 1
-    return box.to_reference(step * world.step_ns + round(share * world.step_ns))
+    return float(t_ns[k - 1]) + share * float(t_ns[k] - t_ns[k - 1])
+
+
+def _first_slip(t_ns: I64, slid: F64, slipped_s: F64, reference_ns: int) -> float | None:
+    """When a tip first went from stick to slip, as the solver located it within its step."""
+    above = np.flatnonzero(slid > SLIP_MM)
+    if not len(above):
+        return None
+    # a row or two may pass before the way slid counts; the tip began where it last stuck
+    return max(float(slipped_s[above[0]]) * 1e9, float(reference_ns))

@@ -16,25 +16,18 @@ import numpy.typing as npt
 
 from protocols.program import PlateAction
 from rigs.capabilities import ArmFault, ArmState, RigError, Segment
-from rigs.mock.clocks import TrialClocks, trial_clocks
+from rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
+from rigs.mock.deviation import Deviation
+from rigs.mock.fault_settings import PlateStuck
 from rigs.mock.faults import FaultBook
 from rigs.mock.geometry import ContactPlane
 from rigs.mock.history import History
 from rigs.mock.path import ArmPath, Leg
+from rigs.mock.physics import Physics
 from rigs.mock.settings import MockSettings
-from rigs.scene.contact import (
-    Springs,
-    Tips,
-    advance,
-    friction_field,
-    make_springs,
-    new_scratch,
-    new_tips,
-    record,
-    track_width,
-)
-from rigs.scene.plate import advance_free
-from rigs.scene.skin import Skin, SkinGeometry, make_skin
+from rigs.mock.skins import skin_of
+from rigs.scene.skin import Skin
+from rigs.scene.vibration import Vibration
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -42,9 +35,6 @@ I64 = npt.NDArray[np.int64]
 CLEARANCE_MM = 60.0
 MOST_TURNED_DEG = 20.0
 NEAR_MM = 5.0
-TRACK_LIMIT_STEPS = 300_000
-"""Steps of history kept at least, twice as many at most; a trial is a few tens of thousands."""
-_CHUNK = 8192
 
 
 class World:
@@ -59,9 +49,8 @@ class World:
 
     def __init__(self, settings: MockSettings) -> None:
         self.settings = settings
-        self.skin: Skin = _skin(settings)
+        self.skin: Skin = skin_of(settings)
         self.plane = ContactPlane.from_settings(settings.scene.contact)
-        self.step_ns = settings.scene.step_us * 1000
         self.mass_kg = settings.scene.plate.mass_kg
         self.now_ns = self.past_ns = 0
         self.trials = 0
@@ -93,76 +82,45 @@ class World:
             callback()
 
     def _prepare(self, seed: int) -> None:
-        scene = self.settings.scene
+        settings = self.settings
         self.seed = seed
-        self.clocks: TrialClocks = trial_clocks(self.settings.clocks, self.settings.seed, seed)
-        self.faults = FaultBook(self.settings.faults, self.trials)
-        self.springs: Springs = make_springs(
-            self.skin,
-            friction=friction_field(
-                self.skin, scene.friction.kinetic, scene.friction.path_variation,
-                scene.friction.correlation_mm, seed,
-            ),
-            static_excess=scene.friction.static_excess,
-            relaxation_share=scene.skin.relaxation_share,
-            relaxation_s=scene.skin.relaxation_s,
-        )  # fmt: skip
-        n = len(self.skin)
-        self.tips: Tips = new_tips(n)
-        self._scratch = new_scratch(n)
-        self.track = History(track_width(n), 0)
-        self.loads: History | None = None
+        self.faults = FaultBook(settings.faults, self.trials)
+        clocks = trial_clocks(settings.clocks, settings.seed, seed)
+        self.clocks: TrialClocks = with_faults(clocks, self.faults)
+        self.path.deviation = Deviation(self.faults, self.plane, self.path.commanded)
+        self._vibration = Vibration(
+            settings.arm.vibration_um, settings.arm.vibration_hz, settings.seed, seed
+        )
+        self.physics = Physics(settings, self.skin, seed, self._sensor_at, self.faults.torn)
         self.plate_marked = False
-        self.plate_free = False
-        self.recording_ns: int | None = None
-        """When the sync box first started in this trial."""
-        self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
-        self._plate_motion = np.zeros(2)
-        self._release = (0, 0)
+
+    def _sensor_at(self, t_ns: I64) -> F64:
+        """x, y and depth (mm) of the sensor and the slopes of depth at rising times, (k, 5)."""
+        sensor = self.path.states(t_ns)[:, 6:]
+        if self._vibration:
+            strength = self.path.stirred(t_ns)[:, None]
+            sensor[:, :3] += strength * self._vibration.at(t_ns)
+        return sensor
 
     # -- time ------------------------------------------------------------------------------
 
     def pass_time(self, ns: int) -> None:
         """Let true time pass; faults that fall due in it happen."""
-        due = self.faults.arm_stop_due(self.now_ns, self.now_ns + ns, self.recording_ns)
-        if due is not None:
-            self.halt_arm(due, ArmState.PROTECTIVE_STOP)
-        self.now_ns += ns
+        end_ns = self.now_ns + ns
+        halt = self.faults.arm_halt(self.now_ns, end_ns, lambda t_ns: self.path.states(t_ns)[:, :3])
+        if halt is not None:
+            at_ns, protective = halt
+            self.halt_arm(at_ns, ArmState.PROTECTIVE_STOP if protective else self.arm_state)
+        self.now_ns = end_ns
 
     def advance(self) -> int:
-        """Bring the scene up to the present; returns the steps done, the last of them included."""
-        target = self.now_ns // self.step_ns + 1
-        while self.track.end < target:
-            self._advance(min(target - self.track.end, _CHUNK))
-        if target - self.track.base > 2 * TRACK_LIMIT_STEPS:
-            self.track.forget(target - TRACK_LIMIT_STEPS)
-        return target
+        """Let the physics follow to the present; returns the time of the last row, ns."""
+        return self.physics.advance(self.now_ns)
 
-    def _advance(self, count: int) -> None:
-        first = self.track.end
-        steps = np.arange(first, first + count, dtype=np.int64) * self.step_ns
-        sensor = np.ascontiguousarray(self.path.states(steps)[:, 6:])
-        track = self.track.grow(count)
-        load = np.empty((count, 0)) if self.loads is None else self.loads.grow(count)
-        h = self.step_ns * 1e-9
-        if not self.plate_free:
-            height = np.empty(count + 1)
-            height[0] = self._plate_motion[0]
-            height[1:] = self._prescribed(steps)
-            advance(self.springs, self.tips, self._scratch, h, sensor, height, track, load)
-            self._plate_motion[:] = height[-1], 0.0
-            return
-        plate = self.settings.scene.plate
-        done = advance_free(
-            self.springs, self.tips, self._scratch, h, sensor, self._plate_motion, self.mass_kg,
-            self._weight(steps), plate.stiction_n, -plate.stroke_mm, track, load,
-        )  # fmt: skip
-        if done < count or self._plate_motion[0] <= -plate.stroke_mm:
-            self._hold_plate(-plate.stroke_mm)
-        if done < count:
-            self.track.shrink(count - done)
-            if self.loads is not None:
-                self.loads.shrink(count - done)
+    @property
+    def step_ns(self) -> int:
+        """The last row is never further behind the present than this."""
+        return self.physics.step_ns
 
     # -- the arm ---------------------------------------------------------------------------
 
@@ -194,71 +152,24 @@ class World:
 
     def act(self, action: PlateAction, seconds: float) -> None:
         """Raise the plate and hold it, release it over a ramp, or catch it where it is."""
-        self.advance()
         self.plate_marked = True
-        length = round(seconds * 1e9)
-        height = float(self._plate_motion[0])
-        if action == "release":
-            self.springs = self.springs._replace(damping_s=self.settings.scene.plate.damping_s)
-            self.plate_free = True
-            self._release = (self.now_ns, length)
+        if action == "release" and self.faults.of(PlateStuck):
             return
-        self._hold_plate(height)
-        if action == "raise":
-            self._plate_ramp = (self.now_ns, length, height, 0.0)
-
-    def _hold_plate(self, height: float) -> None:
-        self.plate_free = False
-        self._plate_ramp = (0, 0, height, height)
-        self._plate_motion[:] = height, 0.0
-        self.springs = self.springs._replace(damping_s=0.0)
-
-    def _prescribed(self, t_ns: I64) -> F64:
-        start, length, low, high = self._plate_ramp
-        share = np.clip((t_ns - start) / max(length, 1), 0.0, 1.0)
-        result: F64 = low + share * (high - low)
-        return result
-
-    def _weight(self, t_ns: I64) -> F64:
-        start, length = self._release
-        share = np.clip((t_ns - start) / max(length, 1), 0.0, 1.0)
-        result: F64 = share * (self.mass_kg * self.settings.scene.plate.gravity_m_s2)
-        return result
+        self.physics.act(action, seconds, self.now_ns, self.mass_kg)
 
     # -- what devices look at --------------------------------------------------------------
 
     def keep_loads(self) -> History:
-        """Keep the forces of every step from the present one on, until `loads` is let go."""
-        done, n = self.advance(), len(self.skin)
-        self.loads = History(3 * n, done - 1)
-        record(self.tips, 0.0, np.empty(track_width(n)), self.loads.grow(1)[0])
-        return self.loads
+        """Keep the forces of every row from the last one on, until `drop_loads`."""
+        return self.physics.keep_loads(self.now_ns)
+
+    def drop_loads(self) -> None:
+        """Nobody looks at the forces any longer."""
+        self.physics.loads = None
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
         """Places of the tips in the world and heights of the plate, mm: (k, n, 2) and (k,).
 
-        `t_ns` are rising true times not after the last step; between steps the line is straight.
+        `t_ns` are rising true times not after the last row; between rows the line is straight.
         """
-        n = len(self.skin)
-        step = t_ns // self.step_ns
-        share = ((t_ns - step * self.step_ns) / self.step_ns)[:, None]
-        if not len(t_ns):
-            return np.empty((0, n, 2)), np.empty(0)
-        rows = self.track.rows(int(step[0]), min(int(step[-1]) + 2, self.track.end))
-        before = rows[step - step[0]]
-        after = rows[np.minimum(step - step[0] + 1, len(rows) - 1)]
-        here = before + share * (after - before)
-        tips = here[:, : 2 * n].reshape(-1, n, 2).copy()
-        height = here[:, 3 * n]
-        tips[:, :, 1] += height[:, None]
-        return tips, height
-
-
-def _skin(settings: MockSettings) -> Skin:
-    made, friction = settings.scene.skin, settings.scene.friction
-    seed = settings.seed if made.seed is None else made.seed
-    geometry = SkinGeometry(
-        **made.model_dump(exclude={"seed", "relaxation_share", "relaxation_s"}),
-        friction_scatter=friction.papilla_scatter,
-    )
-    return make_skin(geometry, seed)
+        return self.physics.tips_at(t_ns)

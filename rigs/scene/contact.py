@@ -1,279 +1,363 @@
-"""Tips of papillae that stick to the plate and slide on it: one Jenkins element each.
+"""Tips of papillae that stick to the plate and slide on it: one nonlinear Jenkins element each.
 
 A spring in series with a Coulomb slider is the least that shows incipient slip: tips with little
 normal force let go first, so slip runs from the outer layer to the centre by itself. The update
 is a return mapping (Simo and Hughes, Computational Inelasticity, 1998, ch. 1): assume that the
-tip sticks, and project the force back onto the friction cone if it left it. That is stable at any
-step and stiffness, exact on straight paths, of first order on curved ones, and does not creep.
+tip sticks; if its force left the friction cone, find the slip that puts it back onto the cone.
+That is stable at any step and stiffness, does not creep, and is exact on straight paths.
+
+Where the direction turns, the tip is dragged behind its base on a line of the cone's radius: a
+tractrix, tan(theta/2) = tan(theta0/2) exp(-s / rho). That is exact for linear springs also while
+the radius grows or shrinks linearly, rho being then its logarithmic mean.
+
+Large deflection comes from one potential, so that it cannot create energy: with the bend b, the
+papilla is compressed by c = depth - 0.6 b^2 / h, and N = k_n c, T = b (k_b - 1.2 N / h). The
+second term is the softening of an axially loaded column, which buckles at 10 E I / h^2 (exact:
+pi^2 E I / h^2); the stiffness left is clamped at 5 % of k_b.
 
 All places are in the plate's frame: millimetres, newtons, seconds. Forces are those of the skin
-on the plate. The state advances on a fixed grid of steps, so chunks cannot matter.
+on the plate. Rows may be any time apart; the same rows give the same bits in any pieces.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.randomness import generator
-from rigs.scene.skin import Skin
+from rigs.scene.friction import grip_at
+from rigs.scene.springs import (
+    ACROSS,
+    ALONG,
+    BASE_X,
+    BASE_Y,
+    BENDING,
+    BENT,
+    BRANCH_X,
+    BRANCH_Y,
+    COMPLIANCE,
+    FORCE_X,
+    FORCE_Y,
+    FREE,
+    GAP,
+    INDENTATION,
+    LAYOUT_X,
+    LAYOUT_Y,
+    MODE,
+    NORMAL,
+    NORMAL_BRANCH,
+    PATH,
+    PLACE_X,
+    PLACE_Y,
+    SHORTER,
+    SLID_S,
+    SLIDING,
+    SLIPPED,
+    SPEED,
+    STUCK,
+)
 
-F64 = npt.NDArray[np.float64]
-I8 = npt.NDArray[np.int8]
-
-FREE, STUCK, SLIDING = 0, 1, 2
 # a force this little over its limit is rounding, not slip: a tip at rest must stay to the bit
 _ROUNDING = 1.0 + 1e-13
+_LEAST_STIFFNESS = 0.05
+_ITERATIONS = 60
+_CLOSE = 1e-8
 
 
-class Springs(NamedTuple):
-    """What does not change during a trial; n papillae."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-untyped-def]
+    """Tangential and normal force of a bent column, and their slopes over the bend.
 
-    layout: F64
-    """Places in the sensor's plane, mm, shape (n, 2)."""
-    gap: F64
-    """Indentation at which each tip touches, mm, shape (n,)."""
-    normal: F64
-    """Relaxed normal stiffness, N/mm, shape (n,)."""
-    tangential: F64
-    """Relaxed tangential stiffness, N/mm, shape (n,)."""
-    friction: F64
-    """Kinetic coefficient, knots along each tip's path (periodic), shape (n, knots)."""
-    knot_mm: float
-    """Distance of the knots."""
-    static_excess: float
-    """Static over kinetic friction, less one."""
-    maxwell: float
-    """Stiffness of the relaxing branch over the relaxed stiffness."""
-    relaxation_s: float
-    damping_s: float
-    """Viscous part of the tangential spring over its stiffness."""
+    N = pressed - pressing * shortening * bent^2, not negative.
+    """
+    loss = pressing * shortening * bent
+    normal = pressed - loss * bent
+    normal_slope = -2.0 * loss
+    if normal <= 0.0:
+        normal, normal_slope = 0.0, 0.0
+    stiffness = bending - 2.0 * shortening * normal
+    slope = stiffness - 2.0 * shortening * bent * normal_slope
+    if stiffness < _LEAST_STIFFNESS * bending:
+        stiffness = slope = _LEAST_STIFFNESS * bending
+    return stiffness * bent, normal, slope, normal_slope
 
 
-class Tips(NamedTuple):
-    """The state of n tips; arrays that the kernels write in place."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+    """The bend of a papilla whose tip is `stretch` mm from under its base."""
+    if shortening == 0.0:
+        return stretch / (1.0 + compliance * bending)
+    low, high = 0.0, stretch
+    bent = min(guess, stretch)
+    for _ in range(_ITERATIONS):
+        force, _, slope, _ = _column(bent, bending, shortening, pressed, pressing)
+        miss = bent + compliance * force - stretch
+        if abs(miss) <= 1e-14 * stretch:
+            return bent
+        if miss > 0.0:
+            high = bent
+        else:
+            low = bent
+        following = bent - miss / (1.0 + compliance * slope)
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        if following == bent:
+            return bent
+        bent = following
+    return bent
 
-    place: F64
-    """Tip in the plate's frame, mm, shape (n, 2)."""
-    base: F64
-    """Unloaded tip (sensor plus layout) in the plate's frame, mm, shape (n, 2)."""
-    branch: F64
-    """Tangential force in the relaxing branch, N, shape (n, 2)."""
-    force: F64
-    """Tangential force on the plate, N, shape (n, 2)."""
-    normal: F64
-    """Normal force, N, shape (n,)."""
-    normal_branch: F64
-    indentation: F64
-    path: F64
-    """Length of the way slid since the trial began, mm, shape (n,)."""
-    mode: I8
-    """FREE, STUCK or SLIDING, shape (n,)."""
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
+    """Share of a step at which the force f + s d last leaves a cone from `start` to `end`."""
+    a = dx * dx + dy * dy - (end - start) ** 2
+    half_b = fx * dx + fy * dy - start * (end - start)
+    c = min(fx * fx + fy * fy - start * start, 0.0)
+    if a == 0.0:
+        return min(max(-0.5 * c / half_b, 0.0), 1.0) if half_b > 0.0 else 0.0
+    root = np.sqrt(max(half_b * half_b - a * c, 0.0))
+    # the larger root if the force outruns the cone, without cancellation
+    share = -c / (half_b + root) if half_b > 0.0 else (root - half_b) / a
+    return min(max(share, 0.0), 1.0)
 
 
-def new_tips(n: int) -> Tips:
-    """`n` tips clear of the plate."""
-    return Tips(
-        np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n),
-        np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n, np.int8),
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+    """Direction of a sliding tip's force after the drive d: the tractrix.
+
+    `before`, `after`: the cone's radius at both ends. Returns a unit vector.
+    """
+    size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
+    if drive == 0.0:
+        return fx / size, fy / size
+    ux, uy = dx / drive, dy / drive
+    if size == 0.0:
+        return ux, uy
+    along, across = (fx * ux + fy * uy) / size, (ux * fy - uy * fx) / size
+    if abs(across) < 1e-300 or after <= 0.0:
+        return (fx / size, fy / size) if after > 0.0 else (ux, uy)
+    ratio = after / before - 1.0
+    mean = before if abs(ratio) < 1e-12 else (after - before) / np.log1p(ratio)
+    # along < 0 beyond a right angle: 1 + along cancels there
+    half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
+    half *= np.exp(-drive / mean)
+    square = half * half
+    cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
+    return cosine * ux - sine * uy, sine * ux + cosine * uy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):  # type: ignore[no-untyped-def]
+    """Where tip `i` is after its base moved linearly to a place and depth within `h` seconds.
+
+    `decay` and `gain` are the relaxing branch's exact factors for linear motion over `h`.
+
+    Returns:
+        mode, place x and y, force x and y, normal force, bend, slip (mm), and the share of the
+        step at which the tip went from stick to slip (negative if it did not). Nothing is
+        written.
+    """
+    along, bending = table[i, ALONG], table[i, BENDING]
+    shortening, compliance = table[i, SHORTER], table[i, COMPLIANCE]
+    maxwell = law.maxwell
+    pressed = (
+        along * deep + state[i, NORMAL_BRANCH] * decay
+        + maxwell * along * gain * (deep - state[i, INDENTATION])
+    )  # fmt: skip
+    if deep <= 0.0 or pressed <= 0.0:
+        # clear of the plate, or the skin comes back more slowly than the sensor
+        return FREE, base_x, base_y, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
+    mode = state[i, MODE]
+    if mode == FREE:
+        # touching: the tip stands under its base
+        return STUCK, base_x, base_y, 0.0, 0.0, pressed, 0.0, 0.0, -1.0
+    old_x, old_y = state[i, BASE_X] - state[i, PLACE_X], state[i, BASE_Y] - state[i, PLACE_Y]
+    new_x, new_y = base_x - state[i, PLACE_X], base_y - state[i, PLACE_Y]
+    branch_x, branch_y = state[i, BRANCH_X] * decay, state[i, BRANCH_Y] * decay
+    soft = table[i, ACROSS] * (maxwell * gain + law.damping_s / h)
+    stretch = np.sqrt(new_x * new_x + new_y * new_y)
+    bent = _bend_for(stretch, state[i, BENT], bending, shortening, compliance, pressed, along)
+    force, normal, _, _ = _column(bent, bending, shortening, pressed, along)
+    secant = force / stretch if stretch > 0.0 else 0.0
+    trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
+    trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
+    grip, _ = grip_at(field, i, state[i, PATH])
+    from_x, from_y = state[i, FORCE_X], state[i, FORCE_Y]
+    drive_x, drive_y = trial_x - from_x, trial_y - from_y
+    static, before = 1.0 + law.static_excess, grip * state[i, NORMAL]
+    # a sliding tip slides on if the drive takes its force outwards faster than the cone grows
+    outwards = from_x * drive_x + from_y * drive_y
+    keeps_on = mode == SLIDING and outwards >= before * (grip * normal - before)
+    limit = grip * normal * (1.0 if keeps_on else static)
+    size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
+    if size <= limit * _ROUNDING:
+        return (
+            STUCK,
+            state[i, PLACE_X],
+            state[i, PLACE_Y],
+            trial_x,
+            trial_y,
+            normal,
+            bent,
+            0.0,
+            -1.0,
+        )
+    share, left = -1.0, 1.0
+    if not keeps_on:
+        share = _leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
+        left = 1.0 - share
+        from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
+        before += share * (grip * normal - before)
+    if law.exact_turns:
+        unit_x, unit_y = _turned(
+            from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
+        )
+    else:
+        unit_x, unit_y = trial_x / size, trial_y / size
+    # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
+    # left by a bend decides on the coefficient of friction, and so on F
+    rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
+    towards_x, towards_y = unit_x, unit_y
+    low, high = 0.0, bent
+    bent = min(state[i, BENT], bent)
+    slip, limit, stretch = 0.0, 0.0, 0.0
+    # speed at the end of the step, from the means of this one and the last: second order
+    slid_s = left * h
+    ahead = slid_s / (slid_s + state[i, SLID_S]) if keeps_on and state[i, SLID_S] > 0.0 else 0.0
+    for _ in range(_ITERATIONS):
+        spring, normal, slope, normal_slope = _column(bent, bending, shortening, pressed, along)
+        stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
+        slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
+        slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
+        grip, grip_slope = grip_at(field, i, state[i, PATH] + slip)
+        if law.strengthening != 0.0 and slid_s > 0.0:
+            speed = (1.0 + ahead) * slip / slid_s - ahead * state[i, SPEED]
+            if speed > 0.0:
+                faster = 1.0 + law.strengthening * np.log1p(speed / law.weak_mm_s)
+                rate = law.strengthening / (law.weak_mm_s + speed) * (1.0 + ahead) / slid_s
+                grip_slope = grip_slope * faster + grip * rate
+                grip *= faster
+        limit, limit_slope = (
+            grip * normal,
+            grip * normal_slope - normal * grip_slope * stretch_slope,
+        )
+        pull, pull_slope = limit, limit_slope
+        if soft != 0.0:
+            pull_x, pull_y = limit * unit_x + rest_x, limit * unit_y + rest_y
+            pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
+            if pull > 0.0:
+                towards_x, towards_y = pull_x / pull, pull_y / pull
+        miss, steepness = spring + soft * stretch - pull, slope + soft * stretch_slope - pull_slope
+        if miss > 0.0:
+            high = bent
+        else:
+            low = bent
+        change = -miss / steepness if steepness > 0.0 else 0.5 * (low + high) - bent
+        if not low <= bent + change <= high:
+            change = 0.5 * (low + high) - bent
+        bent += change
+        if abs(change) <= _CLOSE * bent:
+            # the next change would be of the order of its square: rounding
+            stretch += stretch_slope * change
+            slip = max(slip - stretch_slope * change, 0.0)
+            limit += limit_slope * change
+            normal += normal_slope * change
+            break
+    return (
+        SLIDING, base_x - stretch * towards_x, base_y - stretch * towards_y,
+        limit * unit_x, limit * unit_y, normal, bent, slip, share,
     )  # fmt: skip
 
 
-def make_springs(
-    skin: Skin,
-    *,
-    friction: F64,
-    knot_mm: float = 0.1,
-    static_excess: float = 0.0,
-    relaxation_share: float = 0.0,
-    relaxation_s: float = 1.0,
-    damping_s: float = 0.0,
-) -> Springs:
-    """Springs of a skin.
+@njit(cache=True, nogil=True, error_model="numpy")
+def move_tips(table, field, law, state, sensor, plate_y, start_s, h, decay, gain):  # type: ignore[no-untyped-def]
+    """Advance every tip by one step in which sensor and plate move linearly.
 
     Args:
-        friction: coefficient of each papilla at knots along its path, shape (n, knots).
-        relaxation_share: share of a suddenly applied force that relaxes away, below 1; the
-            skin's own stiffnesses are those that remain.
+        sensor: x, y, depth (mm) at the end of the step, and the two slopes of depth, (5,).
+        plate_y: height of the plate at the end of the step, mm.
+        start_s: when the step begins, s.
     """
-    return Springs(
-        skin.layout_mm, skin.gap_mm, skin.normal_n_per_mm, skin.tangential_n_per_mm,
-        np.ascontiguousarray(friction), knot_mm, static_excess,
-        relaxation_share / (1.0 - relaxation_share), relaxation_s, damping_s,
-    )  # fmt: skip
-
-
-def friction_field(
-    skin: Skin,
-    kinetic: float,
-    variation: float,
-    correlation_mm: float,
-    seed: int,
-    knot_mm: float = 0.1,
-    knots: int = 1024,
-) -> F64:
-    """Kinetic friction along each tip's path: Gaussian, periodic, shape (n, knots).
-
-    Its autocorrelation over a distance d is exp(-(d / correlation_mm)^2); it is kept at or above
-    a fifth of the mean.
-    """
-    mean = (kinetic * skin.friction_factor)[:, None]
-    if variation == 0.0:
-        return np.ascontiguousarray(np.broadcast_to(mean, (len(skin), 1)).astype(np.float64))
-    white = generator(seed, "friction").standard_normal((len(skin), knots))
-    away = np.minimum(np.arange(knots), knots - np.arange(knots)) * knot_mm
-    kernel = np.exp(-2.0 * (away / correlation_mm) ** 2)
-    kernel /= np.sqrt(np.sum(kernel**2))
-    smooth = np.zeros_like(white)
-    # summed term by term in a fixed order: an FFT's rounding would depend on its build
-    for shift in np.flatnonzero(kernel > 1e-7):
-        smooth += kernel[shift] * np.roll(white, shift, axis=1)
-    return np.maximum(mean * (1.0 + variation * smooth), 0.2 * mean)
-
-
-class Scratch(NamedTuple):
-    """What one step works with before the plate's motion is known; n papillae."""
-
-    trial: F64
-    """Force if every tip stuck and the plate stood, shape (n, 2)."""
-    stiffness: F64
-    """Force per base motion within this step, N/mm, shape (n,)."""
-    limit: F64
-    """Radius of the friction cone, N, shape (n,)."""
-    move: F64
-    """Base motion of this step in the plate's frame, the plate standing, shape (n, 2)."""
-    base: F64
-    """Where the base comes to in the plate's frame, the plate standing, mm, shape (n, 2)."""
-
-
-def new_scratch(n: int) -> Scratch:
-    """Room for one step."""
-    return Scratch(np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2)))
-
-
-@njit(cache=True, nogil=True)
-def begin_step(springs, tips, scratch, h, decay, gain, sensor, plate_y):  # type: ignore[no-untyped-def]
-    """Normal forces, cones and trial forces of one step with the plate standing at `plate_y`.
-
-    `sensor`: x, y, depth, and the slopes of depth over x and y of the layout. `decay` and `gain`
-    are the relaxing branch's exact factors for linear motion over `h`.
-    """
-    maxwell = springs.maxwell
-    for i in range(springs.gap.shape[0]):
-        lx, ly = springs.layout[i, 0], springs.layout[i, 1]
+    for i in range(state.shape[0]):
+        lx, ly = table[i, LAYOUT_X], table[i, LAYOUT_Y]
         base_x, base_y = sensor[0] + lx, sensor[1] + ly - plate_y
-        deep = sensor[2] + sensor[3] * lx + sensor[4] * ly - springs.gap[i]
-        deep = max(deep, 0.0)
-        branch = tips.normal_branch[i] * decay
-        branch += maxwell * springs.normal[i] * gain * (deep - tips.indentation[i])
-        normal = springs.normal[i] * deep + branch
-        if deep <= 0.0:
-            normal, branch = 0.0, 0.0
-        elif normal <= 0.0:
-            # the skin comes back more slowly than the sensor: it hangs clear of the plate
-            normal, branch = 0.0, -springs.normal[i] * deep
-        tips.indentation[i] = deep
-        tips.normal_branch[i] = branch
-        tips.normal[i] = normal
-        if normal <= 0.0 or tips.mode[i] == FREE:
-            # clear of the plate, or touching it first: the tip stands under its base
-            tips.mode[i] = STUCK if normal > 0.0 else FREE
-            tips.place[i, 0], tips.place[i, 1] = base_x, base_y
-            tips.base[i, 0], tips.base[i, 1] = base_x, base_y
-            tips.branch[i, 0] = tips.branch[i, 1] = 0.0
-        stiffness = springs.tangential[i]
-        own = stiffness * (1.0 + springs.damping_s / h) + maxwell * stiffness * gain
-        move_x, move_y = base_x - tips.base[i, 0], base_y - tips.base[i, 1]
-        scratch.move[i, 0], scratch.move[i, 1] = move_x, move_y
-        scratch.base[i, 0], scratch.base[i, 1] = base_x, base_y
-        scratch.stiffness[i] = own
-        scratch.trial[i, 0] = (
-            stiffness * (tips.base[i, 0] - tips.place[i, 0])
-            + tips.branch[i, 0] * decay + own * move_x
-        )  # fmt: skip
-        scratch.trial[i, 1] = (
-            stiffness * (tips.base[i, 1] - tips.place[i, 1])
-            + tips.branch[i, 1] * decay + own * move_y
-        )  # fmt: skip
-        along = tips.path[i] / springs.knot_mm
-        knot = int(along)
-        share = along - knot
-        count = springs.friction.shape[1]
-        knot %= count
-        following = knot + 1 if knot + 1 < count else 0
-        grip = (1.0 - share) * springs.friction[i, knot] + share * springs.friction[i, following]
-        if tips.mode[i] == STUCK:
-            grip *= 1.0 + springs.static_excess
-        scratch.limit[i] = grip * normal
-
-
-@njit(cache=True, nogil=True)
-def end_step(springs, tips, scratch, decay, gain, plate_move):  # type: ignore[no-untyped-def]
-    """Project the trial forces onto the cones, the plate having moved up by `plate_move` mm."""
-    for i in range(springs.gap.shape[0]):
-        move_x, move_y = scratch.move[i, 0], scratch.move[i, 1] - plate_move
-        tips.base[i, 0] = scratch.base[i, 0]
-        tips.base[i, 1] = scratch.base[i, 1] - plate_move
-        if tips.mode[i] == FREE:
-            tips.place[i, 0], tips.place[i, 1] = tips.base[i, 0], tips.base[i, 1]
-            tips.force[i, 0] = tips.force[i, 1] = 0.0
-            continue
-        own = scratch.stiffness[i]
-        force_x, force_y = scratch.trial[i, 0], scratch.trial[i, 1] - own * plate_move
-        size = np.hypot(force_x, force_y)
-        limit = scratch.limit[i]
-        if size > limit * _ROUNDING:
-            held = limit / size
-            slip_x, slip_y = force_x * (1.0 - held) / own, force_y * (1.0 - held) / own
-            force_x, force_y = force_x * held, force_y * held
-            tips.place[i, 0] += slip_x
-            tips.place[i, 1] += slip_y
-            tips.path[i] += np.hypot(slip_x, slip_y)
-            move_x, move_y = move_x - slip_x, move_y - slip_y
-            tips.mode[i] = SLIDING
+        deep = sensor[2] + sensor[3] * lx + sensor[4] * ly - table[i, GAP]
+        mode, x, y, force_x, force_y, normal, bent, slip, share = tip_step(
+            table, field, law, state, i, base_x, base_y, deep, h, decay, gain
+        )
+        if mode == FREE:
+            deep = max(deep, 0.0)
+            state[i, BRANCH_X] = state[i, BRANCH_Y] = 0.0
+            state[i, NORMAL_BRANCH] = -table[i, ALONG] * deep
         else:
-            tips.mode[i] = STUCK
-        soft = springs.maxwell * springs.tangential[i] * gain
-        tips.branch[i, 0] = tips.branch[i, 0] * decay + soft * move_x
-        tips.branch[i, 1] = tips.branch[i, 1] * decay + soft * move_y
-        tips.force[i, 0], tips.force[i, 1] = force_x, force_y
+            soft = law.maxwell * gain
+            state[i, NORMAL_BRANCH] = state[i, NORMAL_BRANCH] * decay + (
+                soft * table[i, ALONG] * (deep - state[i, INDENTATION])
+            )
+            if state[i, MODE] == FREE:
+                state[i, BASE_X] = state[i, PLACE_X] = x
+                state[i, BASE_Y] = state[i, PLACE_Y] = y
+            soft *= table[i, ACROSS]
+            stretch_x = base_x - x - state[i, BASE_X] + state[i, PLACE_X]
+            stretch_y = base_y - y - state[i, BASE_Y] + state[i, PLACE_Y]
+            state[i, BRANCH_X] = state[i, BRANCH_X] * decay + soft * stretch_x
+            state[i, BRANCH_Y] = state[i, BRANCH_Y] * decay + soft * stretch_y
+        state[i, INDENTATION] = deep
+        state[i, MODE] = mode
+        state[i, BASE_X], state[i, BASE_Y] = base_x, base_y
+        state[i, PLACE_X], state[i, PLACE_Y] = x, y
+        state[i, FORCE_X], state[i, FORCE_Y] = force_x, force_y
+        state[i, NORMAL], state[i, BENT] = normal, bent
+        state[i, SPEED] = state[i, SLID_S] = 0.0
+        if share >= 0.0:
+            state[i, SLIPPED] = start_s + share * h
+        if slip > 0.0:
+            state[i, PATH] += slip
+            state[i, SLID_S] = h * (1.0 - max(share, 0.0))
+            state[i, SPEED] = slip / state[i, SLID_S] if state[i, SLID_S] > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
-def record(tips, plate_y, track, load):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy")
+def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
+    """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
+
+    q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.
+    """
+    share = h / relaxation_s
+    return np.exp(-share), -np.expm1(-share) / share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def record(state, plate_y, track, load):  # type: ignore[no-untyped-def]
     """Write the state into a row of `track` (see `track_width`) and of `load` if that has room."""
-    n = tips.path.shape[0]
+    n = state.shape[0]
     for i in range(n):
-        track[2 * i], track[2 * i + 1] = tips.place[i, 0], tips.place[i, 1]
-        track[2 * n + i] = tips.path[i]
-    track[3 * n] = plate_y
+        track[2 * i], track[2 * i + 1] = state[i, PLACE_X], state[i, PLACE_Y]
+        track[2 * n + i], track[3 * n + i] = state[i, PATH], state[i, SLIPPED]
+    track[4 * n] = plate_y
     if load.shape[0] == 3 * n:
         for i in range(n):
-            load[3 * i], load[3 * i + 1] = tips.force[i, 0], tips.force[i, 1]
-            load[3 * i + 2] = tips.normal[i]
+            load[3 * i], load[3 * i + 1] = state[i, FORCE_X], state[i, FORCE_Y]
+            load[3 * i + 2] = state[i, NORMAL]
 
 
-def track_width(n: int) -> int:
-    """Columns of a track of `n` tips: x and y of each tip, its path, then the plate's height."""
-    return 3 * n + 1
-
-
-@njit(cache=True, nogil=True)
-def advance(springs, tips, scratch, h, sensor, plate_y, track, load):  # type: ignore[no-untyped-def]
-    """Advance `tips` through len(sensor) steps of `h` seconds with the plate where it is told.
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance(table, field, law, state, t_ns, sensor, plate_y, track, load):  # type: ignore[no-untyped-def]
+    """Advance `tips` from row to row with the plate where it is told.
 
     Args:
+        t_ns: when the first step begins and when each ends, rising, int64, (m + 1,).
         sensor: x, y, depth (mm) and the two slopes of depth at the end of each step, (m, 5).
         plate_y: height of the plate, mm: before the first step, and after each, (m + 1,).
         track: filled with one row a step, (m, track_width(n)).
         load: tangential force x, y and normal force of each tip, N, (m, 3 n); or (m, 0).
     """
-    decay = np.exp(-h / springs.relaxation_s)
-    gain = springs.relaxation_s * -np.expm1(-h / springs.relaxation_s) / h
+    step_ns, h, decay, gain = np.int64(0), 0.0, 1.0, 1.0
     for k in range(sensor.shape[0]):
-        begin_step(springs, tips, scratch, h, decay, gain, sensor[k], plate_y[k])
-        end_step(springs, tips, scratch, decay, gain, plate_y[k + 1] - plate_y[k])
-        record(tips, plate_y[k + 1], track[k], load[k])
+        if t_ns[k + 1] - t_ns[k] != step_ns:
+            step_ns = t_ns[k + 1] - t_ns[k]
+            h = step_ns * 1e-9
+            decay, gain = relaxing(h, law.relaxation_s)
+        move_tips(
+            table, field, law, state, sensor[k], plate_y[k + 1], t_ns[k] * 1e-9, h, decay, gain
+        )
+        record(state, plate_y[k + 1], track[k], load[k])

@@ -2,8 +2,8 @@
 
 A pixel of such a camera fires when its log intensity has changed by its threshold. For a disc
 with a known edge that happens when the disc's rim is at a known distance, so the times are roots
-of a quadratic: exact to well under a microsecond, where frames at 1 kHz give half a millisecond
-(v2e, Hu, Liu and Delbruck 2021), and a hundred times cheaper. Only pixels near a rim are looked at.
+on the disc's path: exact to a microsecond where frames at 1 kHz give half a millisecond (v2e, Hu,
+Liu and Delbruck 2021), and hundreds of times cheaper. Only pixels that may fire are looked at.
 
 Discs must not come so near to each other that their edges overlap.
 """
@@ -11,12 +11,18 @@ Discs must not come so near to each other that their edges overlap.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.edges import reset_pixels, trace
+from rigs.scene.agenda import BUCKETS, MOVED, REACH, REACH_PX
+from rigs.scene.edges import CUT, dark_pixels, see_discs
+from rigs.scene.marker_path import markers_in_image
+from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
 from rigs.scene.randomness import generator
+from rigs.scene.readout import NEVER_NS
+from rigs.scene.trace import trace
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -24,8 +30,6 @@ U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 Events = tuple[I64, U16, U16, U8]
 """True time in ns, column, row, polarity; each of shape (n,)."""
-
-NOISE_BIN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,21 @@ class EventOptics:
     refractory_us: float = 500.0
     noise_hz: float = 0.01
     leak_share: float = 0.5
-    block_steps: int = 32
-    chord_px: float = 0.005
+    hot_pixels: int = 8
+    hot_hz: float = 10.0
+    readout_hz: float = 1000.0
+    block_ms: int = 32
+    path: Literal["cubic", "chord"] = "cubic"
+
+    @property
+    def block_ns(self) -> int:
+        """Length of a block: what the camera hands over together."""
+        return self.block_ms * 1_000_000
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two scans of the read-out; 0 where every event has its own time."""
+        return round(1e9 / self.readout_hz) if self.readout_hz > 0 else 0
 
 
 class MarkerSensor:
@@ -54,89 +71,109 @@ class MarkerSensor:
 
     def __init__(self, optics: EventOptics, layout_mm: F64, seed: int) -> None:
         self.optics = optics
-        self._layout_mm = layout_mm
+        self._layout_mm = np.ascontiguousarray(layout_mm, np.float64)
         shape = (optics.height, optics.width)
         spread = np.clip(generator(seed, "thresholds").standard_normal(shape), -3.0, 3.0)
         threshold = optics.threshold + optics.threshold_sigma * spread
         self.threshold: F64 = np.maximum(threshold, 0.1 * optics.threshold)
         self._lowest = float(self.threshold.min())
-        # rim distances (px, outwards positive) of the next event of either sign, and of the last
-        self._next_on, self._next_off, self._last = np.empty((3, *shape))
-        self._level = np.empty(shape)
-        self._fired_ns = np.empty(shape)
+        self._noise = NoiseRates(
+            optics.width, optics.height, optics.noise_hz, optics.leak_share, optics.hot_hz,
+            hot_places(optics.width, optics.height, optics.hot_pixels, seed),
+        )  # fmt: skip
+        self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
+        self._state = self._dark.copy()
+        self._fired_ns = np.empty(shape, np.int64)
+        self._agenda = _empty_agenda(len(self._layout_mm), 0)
+        self._pending = np.empty(0, np.int64)
+        self._phase_ns = 0
         self._trial = 0
-        self._bin: tuple[int, Events] | None = None
+        self._bin: tuple[int, Candidates] | None = None
+
+    @property
+    def scans(self) -> tuple[int, int]:
+        """Time between two scans of the read-out, 0 where it has none, and when one begins, ns."""
+        return self.optics.period_ns, self._phase_ns
 
     def path(self, loads: F64) -> F64:
-        """Markers in the image: column, row and radius in px, (m, n, 3).
-
-        A papilla is dragged along by friction, which is opposite to its force on the plate.
+        """Markers in the image: column, row and radius in px, (n, 3, m).
 
         Args:
             loads: tangential force on the plate x, y and normal force, N, (m, 3 n).
         """
-        optics, force = self.optics, loads.reshape(len(loads), -1, 3)
-        moved = self._layout_mm - optics.shift_mm_per_n * force[:, :, :2]
-        path = np.empty(force.shape)
-        path[:, :, 0] = 0.5 * (optics.width - 1) + optics.px_per_mm * moved[:, :, 0]
-        path[:, :, 1] = 0.5 * (optics.height - 1) - optics.px_per_mm * moved[:, :, 1]
-        grown = optics.radius_mm + optics.growth_mm_per_n * force[:, :, 2]
-        path[:, :, 2] = optics.px_per_mm * grown
-        return path
+        optics = self.optics
+        result: F64 = markers_in_image(
+            np.ascontiguousarray(loads), self._layout_mm, optics.px_per_mm, optics.shift_mm_per_n,
+            optics.growth_mm_per_n, optics.radius_mm, 0.5 * (optics.width - 1),
+            0.5 * (optics.height - 1),
+        )  # fmt: skip
+        return result
 
     def reset(self, load: F64, seed: int) -> None:
-        """Every pixel takes the image under `load`, (3 n,), as its reference; `seed`: noise."""
-        optics = self.optics
-        self._trial, self._bin = seed, None
-        reset_pixels(
-            self.path(load[None])[0], optics.contrast, optics.edge_px, self.threshold,
-            self._next_on, self._next_off, self._last, self._level, self._fired_ns,
-        )  # fmt: skip
-
-    def sense(self, loads: F64, first_step: int, step_ns: int) -> Events:
-        """Events between the first and the last row of `loads`, in order of time.
-
-        Steps are joined to chords inside blocks of the global grid, so that the result does not
-        depend on how a trial is cut into calls.
+        """Every pixel takes the image under `load`, (3 n,), as its reference.
 
         Args:
-            loads: as in `path`; row k belongs to the step `first_step + k`.
+            seed: the trial's: noise, and when the read-out scans.
         """
-        optics, last_step = self.optics, first_step + len(loads) - 1
-        noise = self._noise(first_step * step_ns, last_step * step_ns)
-        return trace(
-            self.path(loads), first_step, step_ns, optics.block_steps, optics.chord_px,
-            optics.contrast, optics.edge_px, optics.refractory_us * 1e3,
-            self.threshold, self._lowest,
-            self._next_on, self._next_off, self._last, self._level, self._fired_ns, *noise,
-        )  # fmt: skip
-
-    def _noise(self, begin_ns: int, end_ns: int) -> Events:
-        """Noise of a span of true time, cut from whole bins that belong to the trial's seed."""
-        parts = []
-        for index in range(begin_ns // NOISE_BIN_NS, -(-end_ns // NOISE_BIN_NS)):
-            if self._bin is None or self._bin[0] != index:
-                self._bin = (index, self._noise_bin(index))
-            events = self._bin[1]
-            low, high = np.searchsorted(events[0], [begin_ns, end_ns])
-            parts.append(tuple(column[low:high] for column in events))
-        t_ns, x, y, p = (
-            (np.concatenate(columns) for columns in zip(*parts, strict=True)) if parts else _none()
-        )
-        return t_ns, x, y, p
-
-    def _noise_bin(self, index: int) -> Events:
         optics = self.optics
-        rng = generator(self._trial, "event noise", index)
-        mean = optics.noise_hz * optics.width * optics.height * (NOISE_BIN_NS * 1e-9)
-        n = int(rng.poisson(mean))
-        t_ns = np.sort(rng.integers(0, NOISE_BIN_NS, n)) + index * NOISE_BIN_NS
-        x = rng.integers(0, optics.width, n, np.uint16)
-        y = rng.integers(0, optics.height, n, np.uint16)
-        positive = rng.random(n) < 0.5 * (1.0 + optics.leak_share)
-        return t_ns, x, y, positive.astype(np.uint8)
+        self._trial, self._bin = seed, None
+        discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
+        self._state[:] = self._dark
+        see_discs(discs, optics.contrast, optics.edge_px, self.threshold, self._state)
+        self._fired_ns[:] = NEVER_NS
+        self._pending = np.empty(0, np.int64)
+        if optics.period_ns:
+            self._phase_ns = int(generator(seed, "read-out").integers(optics.period_ns))
+        # room for rims half as wide again; where that is not enough, trace does without the agenda
+        band = CUT * optics.edge_px + REACH_PX + 1.0
+        slots = int(4.0 * np.pi * band * (1.5 * float(discs[:, 2].max()) + band))
+        if self._agenda[-1].shape[1] < slots:
+            self._agenda = _empty_agenda(len(discs), slots)
+        self._agenda[0][:, MOVED], self._agenda[0][:, REACH] = 0.0, -1.0
+
+    def sense(self, loads: F64, t_ns: I64) -> Events:
+        """Events between the first and the last row of `loads`, in order of time.
+
+        Between rows markers move on smooth curves, block by block of a global grid of true time,
+        so that the result does not depend on how a trial is cut into calls. With a read-out that
+        scans, times are those of scans; of the last one what is not complete comes with the next
+        call.
+
+        Args:
+            loads: as in `path`; the first row is the last one of the call before.
+            t_ns: true time of each row, int64, (m,), strictly rising; every multiple of the
+                optics' `block_ns` between the first and the last one is among them.
+        """
+        optics = self.optics
+        *events, self._pending = trace(
+            self.path(loads), t_ns, optics.block_ns, optics.path == "chord", optics.contrast,
+            optics.edge_px, round(optics.refractory_us * 1e3), optics.period_ns, self._phase_ns,
+            self._lowest, self.threshold, self._state, self._fired_ns, *self._agenda,
+            self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])), self._noise.leak_below,
+        )  # fmt: skip
+        when, x, y, p = events
+        return when, x, y, p
+
+    def _candidates(self, begin_ns: int, end_ns: int) -> Candidates:
+        """Possible noise of a span of true time, cut from whole bins of the trial."""
+        parts = []
+        for index in range(begin_ns // BIN_NS, -(-end_ns // BIN_NS)):
+            if self._bin is None or self._bin[0] != index:
+                self._bin = (index, candidates(self._noise, self._trial, index))
+            t_ns, place, lot = self._bin[1]
+            low, high = np.searchsorted(t_ns, (begin_ns, end_ns))
+            parts.append((t_ns[low:high], place[low:high], lot[low:high]))
+        if len(parts) == 1:
+            return parts[0]
+        if not parts:
+            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+        t_ns, place, lot = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return t_ns, place, lot
 
 
-def _none() -> Events:
-    empty = np.empty(0, np.uint16)
-    return np.empty(0, np.int64), empty, empty, np.empty(0, np.uint8)
+def _empty_agenda(markers: int, slots: int) -> tuple[npt.NDArray[np.generic], ...]:
+    """See `rigs.scene.agenda`: way, head, following, place."""
+    return (
+        np.full((markers, 2), -1.0), np.full((markers, BUCKETS), -1, np.int32),
+        np.empty((markers, slots), np.int32), np.empty((markers, slots), np.int32),
+    )  # fmt: skip

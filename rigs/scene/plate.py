@@ -11,71 +11,84 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.contact import FREE, begin_step, end_step, record
+from rigs.scene.contact import move_tips, record, relaxing, tip_step
+from rigs.scene.springs import FREE, GAP, LAYOUT_X, LAYOUT_Y
 
 _ITERATIONS = 200
 
 
-@njit(cache=True, nogil=True)
-def _pull(tips, scratch, move):  # type: ignore[no-untyped-def]
-    """Upward force of all tips on the plate after it moved up by `move` mm, N, and its slope."""
-    total, slope = 0.0, 0.0
-    for i in range(tips.mode.shape[0]):
-        if tips.mode[i] == FREE:
+@njit(cache=True, nogil=True, error_model="numpy")
+def _pull(table, field, law, state, sensor, plate_y, h, decay, gain):  # type: ignore[no-untyped-def]
+    """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N."""
+    total = 0.0
+    for i in range(state.shape[0]):
+        lx, ly = table[i, LAYOUT_X], table[i, LAYOUT_Y]
+        deep = sensor[2] + sensor[3] * lx + sensor[4] * ly - table[i, GAP]
+        if deep <= 0.0:
             continue
-        own = scratch.stiffness[i]
-        force_x, force_y = scratch.trial[i, 0], scratch.trial[i, 1] - own * move
-        size, limit = np.hypot(force_x, force_y), scratch.limit[i]
-        if size > limit:
-            total += force_y * (limit / size)
-            slope -= own * (limit / size) * (force_x / size) ** 2
-        else:
-            total += force_y
-            slope -= own
-    return total, slope
+        step = tip_step(
+            table,
+            field,
+            law,
+            state,
+            i,
+            sensor[0] + lx,
+            sensor[1] + ly - plate_y,
+            deep,
+            h,
+            decay,
+            gain,
+        )
+        if step[0] != FREE:
+            total += step[4]
+    return total
 
 
-@njit(cache=True, nogil=True)
-def _solve(tips, scratch, h, mass, speed, weight, stiction):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _solve(table, field, law, state, sensor, motion, h, decay, gain, mass, weight, stiction):  # type: ignore[no-untyped-def]
     """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N."""
     inertia = mass * 1e-3 / h  # N per mm/s
-    rest, _ = _pull(tips, scratch, 0.0)
+    plate_y, speed = motion[0], motion[1]
+    rest = _pull(table, field, law, state, sensor, plate_y, h, decay, gain)
     push = rest - weight + inertia * speed
     if abs(push) <= stiction:
         return 0.0
-    push_sign = 1.0 if push > 0.0 else -1.0
-    drag = stiction * push_sign
+    drag = stiction if push > 0.0 else -stiction
     # f(v) = inertia (v - speed) + weight + drag - pull(v h) grows with v; its root lies between 0
     # and the speed that the plate would have if the tips' force stayed as it is at rest
-    low, high = (0.0, (push - drag) / inertia) if push > 0 else ((push - drag) / inertia, 0.0)
-    v = min(max(speed, low), high)
+    zero, far = 0.0, (push - drag) / inertia
+    f_zero, f_far = drag - push, np.nan
+    v = speed if min(zero, far) < speed < max(zero, far) else far
     for _ in range(_ITERATIONS):
-        pull, slope = _pull(tips, scratch, v * h)
-        f = inertia * (v - speed) + weight + drag - pull
-        if f > 0.0:
-            high = v
-        elif f < 0.0:
-            low = v
-        else:
+        f = inertia * (v - speed) + weight + drag
+        f -= _pull(table, field, law, state, sensor, plate_y + v * h, h, decay, gain)
+        if f == 0.0:
             return v
-        following = v - f / (inertia - slope * h)
-        if not low < following < high:
-            following = 0.5 * (low + high)
-        if following in (v, low, high):
-            return following
-        if abs(following - v) <= 1e-15 * abs(v):
+        if (f > 0.0) == (f_zero > 0.0):
+            slope = (f - f_zero) / (v - zero)
+            zero, f_zero = v, f
+        else:
+            slope = (f - f_far) / (v - far) if f_far == f_far and v != far else np.nan
+            if not slope > 0.0:
+                slope = (f - f_zero) / (v - zero)
+            far, f_far = v, f
+        following = v - f / slope if slope > 0.0 else 0.5 * (zero + far)
+        if not min(zero, far) < following < max(zero, far):
+            following = 0.5 * (zero + far)
+        if following in (v, zero, far) or abs(following - v) <= 1e-15 * abs(v):
             return following
         v = following
     return v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def advance_free(  # type: ignore[no-untyped-def]
-    springs, tips, scratch, h, sensor, motion, mass, weight, stiction, stop, track, load
+    table, field, law, state, t_ns, sensor, motion, mass, weight, stiction, stop, track, load
 ):
     """Advance tips and plate together until the steps end or the plate meets its stop.
 
     Args:
+        t_ns: when the first step begins and when each ends, rising, int64, (m + 1,).
         sensor: as in `rigs.scene.contact.advance`, (m, 5).
         motion: height (mm) and upward speed (mm/s) of the plate, (2,); written in place.
         mass: kg.
@@ -87,19 +100,22 @@ def advance_free(  # type: ignore[no-untyped-def]
     Returns:
         steps taken; less than m when the plate came to rest on its stop in the last of them.
     """
-    decay = np.exp(-h / springs.relaxation_s)
-    gain = springs.relaxation_s * -np.expm1(-h / springs.relaxation_s) / h
+    step_ns, h, decay, gain = np.int64(0), 0.0, 1.0, 1.0
     for k in range(sensor.shape[0]):
-        begin_step(springs, tips, scratch, h, decay, gain, sensor[k], motion[0])
-        speed = _solve(tips, scratch, h, mass, motion[1], weight[k], stiction)
-        move = speed * h
-        landed = motion[0] + move <= stop
+        if t_ns[k + 1] - t_ns[k] != step_ns:
+            step_ns = t_ns[k + 1] - t_ns[k]
+            h = step_ns * 1e-9
+            decay, gain = relaxing(h, law.relaxation_s)
+        speed = _solve(
+            table, field, law, state, sensor[k], motion, h, decay, gain, mass, weight[k], stiction
+        )
+        height = motion[0] + speed * h
+        landed = height <= stop
         if landed:
-            move, speed = stop - motion[0], 0.0
-        end_step(springs, tips, scratch, decay, gain, move)
-        motion[0] = stop if landed else motion[0] + move
-        motion[1] = speed
-        record(tips, motion[0], track[k], load[k])
+            height, speed = stop, 0.0
+        move_tips(table, field, law, state, sensor[k], height, t_ns[k] * 1e-9, h, decay, gain)
+        motion[0], motion[1] = height, speed
+        record(state, height, track[k], load[k])
         if landed:
             return k + 1
     return sensor.shape[0]

@@ -17,10 +17,17 @@ from rigs.scene.randomness import generator
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
+SHORTENING = 0.6
+"""A column with guided ends and height h whose tip moved aside by b is shorter by 0.6 b^2 / h:
+half the integral of the squared slope of its cubic shape."""
+
 
 @dataclass(frozen=True)
 class SkinGeometry:
-    """What a skin is made as. Lengths mm, modulus MPa (N/mm2), base stiffnesses N/m."""
+    """What a skin is made as. Lengths mm, modulus MPa (N/mm2), base stiffnesses N/m.
+
+    A base stiffness of None is a rigid base.
+    """
 
     ring_counts: tuple[int, ...] = (1, 6, 12)
     heights_mm: tuple[float, ...] = (10.1, 9.0, 7.9)
@@ -29,8 +36,8 @@ class SkinGeometry:
     youngs_modulus_mpa: float = 0.6
     poisson_ratio: float = 0.49
     bending: float = 12.0
-    base_normal_n_per_m: float = 150.0
-    base_tangential_n_per_m: float = 200.0
+    base_normal_n_per_m: float | None = 150.0
+    base_tangential_n_per_m: float | None = 200.0
     height_scatter_mm: float = 0.0
     position_scatter_mm: float = 0.0
     friction_scatter: float = 0.0
@@ -46,13 +53,24 @@ class Skin:
     """How much deeper than the highest tip the sensor must go to touch, shape (n,)."""
     ring: I64
     """Layer, 0 is the centre, shape (n,)."""
+    height_mm: F64
+    """Of each papilla as made, shape (n,)."""
     normal_n_per_mm: F64
-    tangential_n_per_mm: F64
+    """Along the papilla, base included."""
+    bending_n_per_mm: F64
+    """Across the unloaded papilla, of its bending alone."""
+    compliance_mm_per_n: F64
+    """Across the papilla, in series with its bending: shear, and the base."""
     friction_factor: F64
     """This tip's friction over the mean, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.ring)
+
+    @property
+    def tangential_n_per_mm(self) -> F64:
+        """Stiffness across the unloaded papilla, everything in series, shape (n,)."""
+        return 1.0 / (1.0 / self.bending_n_per_mm + self.compliance_mm_per_n)
 
 
 def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
@@ -79,7 +97,9 @@ def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
         gap_mm=height.max() - height,
         ring=np.array(ring, np.int64),
         normal_n_per_mm=normal_stiffness(geometry, height),
-        tangential_n_per_mm=tangential_stiffness(geometry, height),
+        height_mm=height,
+        bending_n_per_mm=bending_stiffness(geometry, height),
+        compliance_mm_per_n=series_compliance(geometry, height),
         friction_factor=1.0 + geometry.friction_scatter * grip,
     )
 
@@ -87,24 +107,27 @@ def make_skin(geometry: SkinGeometry, seed: int) -> Skin:
 def normal_stiffness(geometry: SkinGeometry, height_mm: F64) -> F64:
     """Stiffness along the papilla, N/mm: 1/k = h / (E A) + 1/k_base."""
     area = math.pi * geometry.radius_mm**2
-    return 1.0 / (
-        height_mm / (geometry.youngs_modulus_mpa * area) + 1000.0 / geometry.base_normal_n_per_m
-    )
+    column = height_mm / (geometry.youngs_modulus_mpa * area)
+    return 1.0 / (column + _base_mm_per_n(geometry.base_normal_n_per_m))
 
 
-def tangential_stiffness(geometry: SkinGeometry, height_mm: F64) -> F64:
-    """Stiffness across the papilla, N/mm: Timoshenko bending and shear, and the base, in series.
+def bending_stiffness(geometry: SkinGeometry, height_mm: F64) -> F64:
+    """Bending stiffness across the papilla, N/mm: c E I / h^3 with I = pi r^4 / 4."""
+    inertia = math.pi * geometry.radius_mm**4 / 4
+    return geometry.bending * geometry.youngs_modulus_mpa * inertia / height_mm**3
 
-    1/k = h^3 / (c E I) + h / (kappa G A) + 1/k_base with I = pi r^4 / 4,
+
+def series_compliance(geometry: SkinGeometry, height_mm: F64) -> F64:
+    """Compliance of shear and base across the papilla, mm/N: h / (kappa G A) + 1/k_base.
+
     kappa = 6 (1 + nu) / (7 + 6 nu) (Cowper 1966, circular section), G = E / (2 (1 + nu)).
     """
-    nu, modulus = geometry.poisson_ratio, geometry.youngs_modulus_mpa
-    inertia = math.pi * geometry.radius_mm**4 / 4
+    nu = geometry.poisson_ratio
     area = math.pi * geometry.radius_mm**2
     kappa = 6 * (1 + nu) / (7 + 6 * nu)
-    shear = modulus / (2 * (1 + nu))
-    return 1.0 / (
-        height_mm**3 / (geometry.bending * modulus * inertia)
-        + height_mm / (kappa * shear * area)
-        + 1000.0 / geometry.base_tangential_n_per_m
-    )
+    shear = geometry.youngs_modulus_mpa / (2 * (1 + nu))
+    return height_mm / (kappa * shear * area) + _base_mm_per_n(geometry.base_tangential_n_per_m)
+
+
+def _base_mm_per_n(stiffness_n_per_m: float | None) -> float:
+    return 0.0 if stiffness_n_per_m is None else 1000.0 / stiffness_n_per_m

@@ -61,5 +61,5 @@ def write(path: Path, data: dict[str, Any]) -> Path:
 
 @pytest.fixture(scope="session")
 def rig_path() -> Path:
-    """The shipped mock rig."""
-    return ROOT / "rigs" / "mock.yaml"
+    """The shipped rig for rehearsals: tracks in place of videos, which take most of the time."""
+    return ROOT / "rigs" / "rehearsal.yaml"

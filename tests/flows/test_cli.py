@@ -76,12 +76,26 @@ def test_a_store_that_is_none_is_said() -> None:
 
 def test_a_plan_that_does_not_fit_the_disk_is_refused(tmp_path: Path) -> None:
     rig = (ROOT / "rigs" / "mock.yaml").read_text()
-    assert "bytes_per_frame: 14600" in rig
+    assert "bytes_per_frame: 27400" in rig
     path = tmp_path / "rig.yaml"
-    path.write_text(rig.replace("bytes_per_frame: 14600", "bytes_per_frame: 1.0e+9"))
+    path.write_text(rig.replace("bytes_per_frame: 27400", "bytes_per_frame: 1.0e+9"))
     done = sliplab("collect", "protocols/pilot.yaml", "--rig", path, "--store", tmp_path / "s")
     assert done.returncode == 2
     assert "in reserve, the disk has" in done.stderr
+
+
+def test_rigs_that_ship_are_known_by_name() -> None:
+    needed = {}
+    for name in ("mock", "rehearsal", "rigs/mock.yaml"):
+        done = sliplab("plan", "protocols/pilot.yaml", "--rig", name, "--json")
+        assert done.returncode == 0, done.stderr
+        needed[name] = json.loads(done.stdout)["bytes"]
+    assert needed["mock"] == needed["rigs/mock.yaml"]
+    # tracks instead of a video of 100 frames a second
+    assert needed["rehearsal"] < 0.2 * needed["mock"]
+    done = sliplab("plan", "protocols/pilot.yaml", "--rig", "abacus")
+    assert done.returncode == 2
+    assert "abacus: no such file, nor a rig that ships: mock, mock_noisy, rehearsal" in done.stderr
 
 
 def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:

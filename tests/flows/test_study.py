@@ -69,6 +69,7 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Out
     assert lead["n"] + lead["missed"] + lead["false_early"] == 2
     assert {"min", "mean", "std", "median", "detected_first"} <= set(lead)
     assert summary["disturbance"]["trials"] == 0
+    assert summary["labels"]["source"] == {"video": 0, "tracks": 8}
     assert summary["sync"]["grade"] == "hardware trigger"
     assert summary["quality"] == {
         "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0
@@ -81,12 +82,16 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Out
 def test_plan_and_collection_agree(ran: tuple[list[Order], Outcome]) -> None:
     for known in read_summary(store_of(ran))["planned"].values():
         assert known["seconds_collected"] == pytest.approx(known["seconds"], rel=0.1)
-        assert known["bytes_collected"] == pytest.approx(known["bytes"], rel=0.25)
+        # without a video these are events, and the plan reckons with the mean of all conditions;
+        # what frames take is held to a quarter in test_levels
+        assert 0.5 < known["bytes_collected"] / known["bytes"] < 2.0
 
 
 def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outcome]) -> None:
     text = (store_of(ran).folder / "report" / "index.html").read_text()
     assert "Every number and picture here is simulated" in text
+    assert text.count("simulated tracks of the markers (no video was drawn)") >= 3
+    assert "the video" not in text
     assert text.count("<svg") >= 7
     assert text.count(">simulated</text>") == text.count("<figure>")
     for outside in ("http://", "https://", "src="):

@@ -45,9 +45,9 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "greater than or equal to 0",
     ),
     "scale that is not drawn": (
-        _set("frame_camera", "scale_px_per_mm", to=20),
+        _set("frame_camera", "scale_px_per_mm", to=12),
         "frame_camera.scale_px_per_mm",
-        "must be mock.frame_camera.px_per_mm = 12",
+        "must be mock.frame_camera.px_per_mm = 20",
     ),
     "infinite scale": (
         _set("frame_camera", "scale_px_per_mm", to=float("inf")),
@@ -76,7 +76,7 @@ def test_a_region_larger_than_the_sensor_is_refused(tmp_path: Path) -> None:
     path.write_text(MOCK.replace("spool: false", "spool: false, height_px: 400"))
     rig, _ = load_rig_file(path)
     plan = load_plan(ROOT / "protocols" / "pilot.yaml")
-    with pytest.raises(InputError, match=r"frame_camera.height_px = 400: .* needs 432 px"):
+    with pytest.raises(InputError, match=r"frame_camera.height_px = 400: .* needs 720 px"):
         check_plan(rig, plan, str(path))
 
 

@@ -1,7 +1,9 @@
 """Frames are lossless, and the same frames are the same file."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 
@@ -34,6 +36,53 @@ def test_the_same_frames_are_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.mkv", "b.mkv"):
         write(tmp_path / name, 9)
     assert (tmp_path / "a.mkv").read_bytes() == (tmp_path / "b.mkv").read_bytes()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_the_number_of_threads_shows_nowhere_in_the_file(count: int, tmp_path: Path) -> None:
+    images = frames(count, seed=4).images
+    files = []
+    for threads in (1, 2, 3):
+        path = tmp_path / f"{threads}.mkv"
+        writer = VideoWriter(path, *FRAME, 100, threads)
+        for image in images:
+            writer.write(image[None])
+        writer.close()
+        files.append(path.read_bytes())
+    assert files[0] == files[1] == files[2]
+    found = list(read_frames(tmp_path / "3.mkv"))
+    assert np.array_equal(np.stack(found), images)
+
+
+def test_an_encoder_that_fails_says_so_and_blocks_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        """Stands for the codec's frames: the third one cannot be made."""
+
+        made = 0
+
+        @classmethod
+        def from_ndarray(cls, image: np.ndarray, format: str) -> av.VideoFrame:
+            cls.made += 1
+            if cls.made == 3:
+                raise ValueError("out of ink")
+            return av.VideoFrame.from_ndarray(image, format=format)
+
+    monkeypatch.setattr("storage.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken}))
+    writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)
+    # fewer than the queues hold: nothing waits, and closing tells what happened
+    writer.write(frames(20).images[:2])
+    writer.close()
+    writer = VideoWriter(tmp_path / "w.mkv", *FRAME, 100)
+
+    def write_on() -> None:
+        for _ in range(20):
+            writer.write(frames(20).images)
+        writer.close()
+
+    with pytest.raises(RuntimeError, match="out of ink"):
+        write_on()
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:

@@ -41,9 +41,11 @@ def frames(count: int, seed: int = 0) -> FrameChunk:
     )
 
 
-def fill(writer: TrialWriter, count: int = 1000, pieces: int = 3) -> None:
+def fill(
+    writer: TrialWriter, count: int = 1000, pieces: int = 3, *, with_frames: bool = True
+) -> None:
     """Write events, pulses, poses and frames in some pieces."""
-    whole, pictures = events(count), frames(12)
+    whole = events(count)
     edges = np.linspace(0, count, pieces + 1).astype(int)
     for low, high in pairwise(edges):
         rows = slice(low, high)
@@ -53,7 +55,8 @@ def fill(writer: TrialWriter, count: int = 1000, pieces: int = 3) -> None:
     writer.add_arm_pulses(PulseChunk(times))
     writer.add_sync_pulses(PulseChunk(times))
     writer.add_poses(PoseChunk(times, times, np.ones((10, 3)), np.zeros((10, 3))))
-    writer.add_frames(pictures)
+    if with_frames:
+        writer.add_frames(frames(12))
 
 
 def record(trial: str, **changes: Any) -> dict[str, Any]:

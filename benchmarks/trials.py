@@ -1,0 +1,74 @@
+"""Whole trials of the kinematic grid on a simulated rig, from the first motion to the commit.
+
+Simulated, like everything that comes out of it. `python -m benchmarks.trials RIG` takes one trial
+in a process of its own and prints the most memory it held, MB.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import SEED, peak_mb
+from flows.orders import describe_campaign, make_order
+from flows.session import Session
+from protocols import Trial
+from rigs.build import build_rig
+from storage.store import Store
+
+ROOT = Path(__file__).parent.parent
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A session at a simulated rig with its store, ready to take trials."""
+
+    session: Session
+    trials: list[Trial]
+
+    def take(self, count: int | None = None) -> float:
+        """Take the next trials (all by default); returns the seconds of their programs.
+
+        Warming up and touching off are taken too, and do not count on this side.
+        """
+        wanted = self.trials[:count]
+        del self.trials[: len(wanted)]
+        self.session.take(wanted)
+        return sum(self.session.plan.seconds(trial) for trial in wanted)
+
+
+@contextmanager
+def stretch(rig: str, count: int, protocol: str = "kinematic") -> Iterator[Stretch]:
+    """A session that can take `count` random trials of a protocol's grid."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        order = make_order(
+            ROOT / "protocols" / f"{protocol}.yaml", ROOT / "rigs" / f"{rig}.yaml", Path(folder)
+        )
+        store = Store.create(Path(folder))
+        campaign = describe_campaign(store, order)
+        device = build_rig(order.rig)
+        device.connect()
+        every = list(order.plan)
+        chosen = np.random.default_rng(SEED).choice(len(every), count, replace=False)
+        session = Session(order.plan, order.rig, device, campaign)
+        try:
+            yield Stretch(session, [every[index] for index in sorted(chosen)])
+        finally:
+            device.close()
+
+
+def main(rig: str) -> None:
+    """One trial, and what it took."""
+    with stretch(rig, 1) as work:
+        work.take()
+    print(f"{peak_mb():.1f}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

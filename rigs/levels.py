@@ -1,0 +1,167 @@
+"""Which level of physics a plan needs in a simulated rig, and what slip to expect from it.
+
+A scene takes the lowest level whose onsets differ from the next level's by less than two seeds of
+the same scene differ. That is reckoned from onsets in closed form (`rigs.scene.onsets`), in
+milliseconds and without a simulation; `sliplab tradeoff --scene` measures the same by windows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from protocols.plan import Plan
+from protocols.program import Dwell, Move, Program
+from rigs.mock.settings import MockSettings
+from rigs.mock.skins import skin_of
+from rigs.rig_file import RigFile
+from rigs.scene.onsets import Material, slide_onsets
+from rigs.scene.randomness import generator
+
+F64 = npt.NDArray[np.float64]
+
+SEEDS = 12
+HIGHEST = 3
+
+
+@dataclass(frozen=True)
+class Slide:
+    """What decides on the onsets of one slide."""
+
+    depth_mm: float
+    speed_mm_s: float
+    press_mm_s: float
+    settled_s: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A level, and why."""
+
+    level: int
+    reason: str
+
+    @property
+    def name(self) -> str:
+        """As rig files write it."""
+        return f"L{self.level}"
+
+
+def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
+    """The level of physics for a plan on a simulated rig; None on a real one."""
+    if not rig.simulated:
+        return None
+    told = rig.mock.scene.level
+    if told != "auto":
+        return Choice(int(told[1]), "told so by the rig file (mock.scene.level)")
+    slides = slides_of(plan)
+    if not slides:
+        return Choice(
+            HIGHEST,
+            "onsets under a falling plate have no closed form at the higher levels, so nothing "
+            "is left out",
+        )
+    onsets = {level: expected_onsets(rig.mock, slides, level) for level in (1, 2, 3)}
+    seeds = _seeds_differ(rig.mock, slides)
+    level, differences = 1, []
+    for level in (1, 2):
+        difference = np.abs(onsets[level] - onsets[level + 1]).mean(axis=0)
+        differences.append((level, difference))
+        if np.all(difference < seeds):
+            break
+    else:
+        level = HIGHEST
+    last, far = differences[-1]
+    against = "stays within" if level == last else "is beyond"
+    return Choice(
+        level,
+        f"L{last} against L{last + 1} moves the first slip by {far[0] * 1e3:.0f} ms and the "
+        f"centre's by {far[1] * 1e3:.0f} ms on average, which {against} what two seeds differ "
+        f"by, {seeds[0] * 1e3:.0f} and {seeds[1] * 1e3:.0f} ms (simulated)",
+    )
+
+
+def with_level(rig: RigFile, plan: Plan) -> RigFile:
+    """The rig file with its scene's level decided for a plan."""
+    choice = choose_level(rig, plan)
+    return rig if choice is None else at_level(rig, choice.name)
+
+
+def at_level(rig: RigFile, name: str) -> RigFile:
+    """A simulated rig's file with the scene at the level `name`, such as L2."""
+    scene = rig.mock.scene.model_copy(update={"level": name})
+    return rig.model_copy(update={"mock": rig.mock.model_copy(update={"scene": scene})})
+
+
+def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
+    """First slip after the start of the slide and duration of incipient slip, over all slides.
+
+    None for a real rig or a plan without slides. Friction is taken as even, markers' thresholds
+    are left out; closed forms at the highest level.
+    """
+    slides = slides_of(plan)
+    if not rig.simulated or not slides:
+        return None
+    onsets = expected_onsets(rig.mock, slides, HIGHEST)
+    incipient = onsets[:, 1] - onsets[:, 0]
+    return {
+        "simulated": True,
+        "first_slip_s": [float(onsets[:, 0].min()), float(onsets[:, 0].max())],
+        "incipient_s": [float(incipient.min()), float(incipient.max())],
+    }
+
+
+def slides_of(plan: Plan) -> list[Slide]:
+    """The distinct slides of a plan, in the order they first come."""
+    found: dict[Slide, None] = {}
+    for trial in plan:
+        slide = _slide(plan.program(trial))
+        if slide is not None:
+            found.setdefault(slide)
+    return list(found)
+
+
+def _slide(program: Program) -> Slide | None:
+    depth, press, settled = 0.0, 1.0, 0.0
+    for step in program.steps:
+        if isinstance(step, Move) and step.phase == "press":
+            depth, press, settled = step.to.depth_mm, step.speed_mm_s, 0.0
+        elif isinstance(step, Dwell):
+            settled += step.seconds
+        elif isinstance(step, Move) and step.phase == "slide":
+            return Slide(depth, step.speed_mm_s, press, settled)
+    return None
+
+
+def expected_onsets(
+    mock: MockSettings, slides: list[Slide], level: int, grip: F64 | None = None
+) -> F64:
+    """First slip of all and slip of the centre, s after the start of each slide, (k, 2)."""
+    scene = mock.scene
+    skin = skin_of(mock)
+    material = Material(
+        scene.friction.kinetic, scene.friction.static_excess, scene.skin.relaxation_share,
+        scene.skin.relaxation_s,
+    )  # fmt: skip
+    onsets = slide_onsets(
+        skin, material, level,
+        [slide.depth_mm for slide in slides], [slide.speed_mm_s for slide in slides],
+        [slide.press_mm_s for slide in slides], [slide.settled_s for slide in slides], grip,
+    )  # fmt: skip
+    return np.stack([onsets.min(axis=-1), onsets[..., 0]], axis=-1)
+
+
+def _seeds_differ(mock: MockSettings, slides: list[Slide]) -> F64:
+    """Mean difference of both onsets between two seeds: friction at each tip's start varies."""
+    variation, count = mock.scene.friction.path_variation, sum(mock.scene.skin.ring_counts)
+    onsets = []
+    for seed in range(SEEDS):
+        spread = np.clip(generator(seed, "level choice").standard_normal(count), -3.0, 3.0)
+        onsets.append(expected_onsets(mock, slides, HIGHEST, 1.0 + variation * spread))
+    values = np.array(onsets)  # (seeds, slides, 2)
+    differences = np.abs(values[:, None] - values[None]).sum(axis=(0, 1)) / (SEEDS * (SEEDS - 1))
+    result: F64 = differences.mean(axis=0)
+    return result

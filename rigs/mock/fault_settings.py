@@ -1,0 +1,230 @@
+"""What can go wrong on purpose, as a rig file or a test writes it down: `mock: faults: [...]`.
+
+Each kind of fault has a model of its own with the parameters that mean something for it, and no
+others; docs/faults.md is the same list for a reader. Cheap to import, as all settings are.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, model_validator
+
+from protocols.yaml_file import KeyedError, StrictModel, register_tags
+
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Count = Annotated[int, Field(ge=1, le=100_000)]
+Papilla = Annotated[int, Field(ge=0, le=10_000)]
+Device = Literal["arm", "event_camera", "frame_camera", "sync_box"]
+PulseDevice = Literal["arm", "event_camera", "sync_box"]
+
+
+class _Fault(StrictModel):
+    trial: Annotated[int, Field(ge=1)] | None = None
+    """Which trial begun on this rig, counting from 1; left out, every one."""
+
+
+class _TimedFault(_Fault):
+    at_s: Annotated[float, Field(ge=0, le=1e6)] = 0.5
+    """When it happens, after the moment that `since` names."""
+    since: Literal["trial", "recording"] = "recording"
+    """`trial`: the trial's first moment; `recording`: the start of the sync box."""
+
+
+class ArmProtectiveStop(_TimedFault):
+    """The arm stops by itself and moves no more until a person clears it."""
+
+    kind: Literal["arm_protective_stop"]
+    at_mm: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    """A point instead of a time: once the tool has gone this far since `since`, mm of its way."""
+
+    @model_validator(mode="after")
+    def _one_moment(self) -> ArmProtectiveStop:
+        if self.at_mm is not None and "at_s" in self.model_fields_set:
+            raise ValueError("needs a time (at_s) or a point (at_mm), not both")
+        return self
+
+
+class ArmOffPath(_TimedFault):
+    """The tool leaves its path sideways, and its poses say so."""
+
+    kind: Literal["arm_off_path"]
+    mm: Annotated[float, Field(gt=0, le=10)] = 0.5
+    """How far it gets, in the plate's plane."""
+    seconds: Seconds = 1.0
+    """How long the deviation grows, evenly; then it stays to the trial's end."""
+    direction_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """Direction on the plate, from its x towards its y; left out, to the left of the way that the
+    tool goes at that moment (the plate's y when it does not move along the plate)."""
+
+
+class FramesLost(_TimedFault):
+    """Frames that never reach the host; the camera's counter goes on."""
+
+    kind: Literal["frames_lost"]
+    count: Count = 1
+
+
+class FrameLate(_TimedFault):
+    """Frames that reach the host late, in order and rightly stamped; later ones wait for them."""
+
+    kind: Literal["frame_late"]
+    count: Count = 1
+    seconds: Seconds = 0.1
+
+
+class EventGap(_TimedFault):
+    """The event camera loses everything, pulses too, for some time."""
+
+    kind: Literal["event_gap"]
+    seconds: Seconds = 0.1
+
+
+class EventStall(_TimedFault):
+    """The event camera sends nothing for some time and then all that it had."""
+
+    kind: Literal["event_stall"]
+    seconds: Seconds = 0.1
+
+
+class EventBurst(_TimedFault):
+    """Flicker: noise events all over the array."""
+
+    kind: Literal["event_burst"]
+    seconds: Seconds = 0.1
+    million_per_s: Annotated[float, Field(gt=0, le=1000)] = 20.0
+    """Mean rate of the additional events, both polarities together, in 1e6 a second."""
+
+
+class ClockDrift(_TimedFault):
+    """A device's clock runs faster from a moment on."""
+
+    kind: Literal["clock_drift"]
+    device: Device
+    ppm: Annotated[float, Field(ge=-10_000, le=10_000)]
+    """What it gains on what it gained before; negative, it loses."""
+
+
+class ClockJump(_TimedFault):
+    """A device's clock jumps."""
+
+    kind: Literal["clock_jump"]
+    device: Device
+    seconds: Annotated[float, Field(ge=-1e6, le=1e6)]
+    """Forwards, or backwards when negative."""
+
+
+class PulsesLost(_TimedFault):
+    """Sync pulses that a device does not report."""
+
+    kind: Literal["pulses_lost"]
+    count: Count = 1
+    device: PulseDevice = "event_camera"
+
+
+class PulsesDuplicated(_TimedFault):
+    """Sync pulses that a device reports twice."""
+
+    kind: Literal["pulses_duplicated"]
+    count: Count = 1
+    seconds: Seconds = 0.0002
+    """From a pulse to its double: a contact that bounces."""
+    device: PulseDevice = "event_camera"
+
+
+class PulsesLate(_TimedFault):
+    """Sync pulses that a device stamps too late."""
+
+    kind: Literal["pulses_late"]
+    count: Count = 1
+    seconds: Seconds = 0.001
+    device: PulseDevice = "event_camera"
+
+
+class PapillaTorn(_TimedFault):
+    """A papilla tears off: no contact force, and no white spot, from that moment on."""
+
+    kind: Literal["papilla_torn"]
+    papilla: Papilla
+    """Counted from the centre (0) outwards, ring by ring."""
+
+
+class MarkerOccluded(_TimedFault):
+    """Something hides a marker from the outside camera for some time."""
+
+    kind: Literal["marker_occluded"]
+    papilla: Papilla | None = None
+    """Whose white spot, counted as for `papilla_torn`."""
+    plate: bool = False
+    """The plate's ArUco marker instead."""
+    seconds: Seconds = 0.3
+
+    @model_validator(mode="after")
+    def _one_marker(self) -> MarkerOccluded:
+        if self.plate == (self.papilla is not None):
+            raise ValueError("needs either a papilla (its number) or plate: true")
+        return self
+
+
+class PlateStuck(_Fault):
+    """The slider jams: a released plate does not fall."""
+
+    kind: Literal["plate_stuck"]
+
+
+class DiskFull(_TimedFault):
+    """The recording cannot be written any further (ENOSPC), for the rest of the trial."""
+
+    kind: Literal["disk_full"]
+
+
+class DeviceGone(_TimedFault):
+    """A device loses its power or its cable: each call fails."""
+
+    kind: Literal["device_gone"]
+    device: Device
+    seconds: Seconds | None = None
+    """Until it answers again; left out, for good. It comes back switched on, and idle."""
+
+
+AnyFault = (
+    ArmProtectiveStop
+    | ArmOffPath
+    | FramesLost
+    | FrameLate
+    | EventGap
+    | EventStall
+    | EventBurst
+    | ClockDrift
+    | ClockJump
+    | PulsesLost
+    | PulsesDuplicated
+    | PulsesLate
+    | PapillaTorn
+    | MarkerOccluded
+    | PlateStuck
+    | DiskFull
+    | DeviceGone
+)
+Fault = Annotated[AnyFault, Field(discriminator="kind")]
+"""One fault, told apart by its `kind`."""
+KINDS: tuple[str, ...] = tuple(
+    get_args(model.model_fields["kind"].annotation)[0] for model in get_args(AnyFault)
+)
+register_tags(*KINDS)
+
+
+def check_papillae(faults: tuple[AnyFault, ...], count: int) -> None:
+    """Hold the papillae that `faults` name against a skin of `count` papillae.
+
+    Raises:
+        KeyedError: the skin has no such papilla.
+    """
+    for index, fault in enumerate(faults):
+        papilla = getattr(fault, "papilla", None)
+        if papilla is not None and papilla >= count:
+            raise KeyedError(
+                f"mock.faults[{index}].papilla",
+                papilla,
+                f"the skin has {count} papillae, numbered from 0 (the centre) to {count - 1}",
+            )

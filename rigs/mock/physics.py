@@ -1,0 +1,205 @@
+"""The skin on the plate through one trial: springs, plate, and what is kept of them row by row.
+
+Rows stand on a global grid: every `step_ms` while the plate is held, every millisecond while it
+may fall, and nothing is computed beyond the present. Which rows there are depends on what the
+plate was told and when, never on who looked how often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from protocols.program import PlateAction
+from rigs.mock.faults import NEVER
+from rigs.mock.history import History
+from rigs.mock.settings import MockSettings
+from rigs.scene.contact import advance, record
+from rigs.scene.friction import friction_knots
+from rigs.scene.plate import advance_free
+from rigs.scene.skin import Skin
+from rigs.scene.springs import GAP, Springs, Tips, make_springs, new_tips, track_width
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+
+FINE_NS = 1_000_000
+"""Step while the plate may fall; the scheme is of first order there."""
+KEPT_NS = 300_000_000_000
+"""History kept at least, twice as much at most; a trial takes a few tens of seconds."""
+_CHUNK = 4096
+OUT_OF_REACH_MM = 1e6
+"""Indentation at which a torn papilla would touch."""
+
+
+class Physics:
+    """State and history of one trial.
+
+    Attributes:
+        step_ns: the last row is never further behind the present than this.
+        track: `rigs.scene.contact.record`'s rows since the trial began.
+        loads: forces of every row since `keep_loads`, or None.
+    """
+
+    def __init__(
+        self,
+        settings: MockSettings,
+        skin: Skin,
+        seed: int,
+        sensor_at: Callable[[I64], F64],
+        torn: Callable[[], Sequence[tuple[int, int]]] = tuple,
+    ) -> None:
+        """What the skin meets.
+
+        Args:
+            sensor_at: from times to x, y, depth (mm) and slopes of depth, (k, 5) from (k,).
+            torn: papillae that tear off, and the true times, ns, as far as they are known.
+        """
+        self._settings, self._sensor_at, self._torn = settings, sensor_at, torn
+        self._off: set[int] = set()
+        self.step_ns = settings.scene.step_ms * 1_000_000
+        self.springs = springs_of(settings, skin, seed)
+        self.tips: Tips = new_tips(len(skin))
+        self.track = History(track_width(len(skin)))
+        self.loads: History | None = None
+        self.plate_free = False
+        self._plate_ramp: tuple[int, int, float, float] = (0, 0, 0.0, 0.0)
+        self._plate_motion = np.zeros(2)
+        self._release: tuple[int, int, float] = (0, 0, 0.0)
+        self._advance_over(np.array([-self.step_ns, 0], np.int64))
+
+    def advance(self, now_ns: int) -> int:
+        """Compute the rows up to a time; returns the time of the last one, ns."""
+        while True:
+            step = FINE_NS if self.plate_free else self.step_ns
+            first = (self.track.end_ns // step + 1) * step
+            last = now_ns // step * step
+            if last < first:
+                break
+            last = min(last, first + (_CHUNK - 1) * step, self._tear_off(first, step))
+            times = np.arange(first, last + 1, step, dtype=np.int64)
+            self._advance_over(np.concatenate([[self.track.end_ns], times]))
+        if self.track.end_ns - self.track.begin_ns > 2 * KEPT_NS:
+            self.track.forget(self.track.end_ns - KEPT_NS)
+        return self.track.end_ns
+
+    def _tear_off(self, first_ns: int, step_ns: int) -> int:
+        """Tear off what is torn before the row at `first_ns`; the last row before the next is."""
+        last = NEVER
+        for papilla, due_ns in self._torn():
+            if due_ns >= first_ns:
+                last = min(last, due_ns // step_ns * step_ns)
+            elif papilla not in self._off:
+                self._off.add(papilla)
+                table = self.springs.table.copy()
+                table[papilla, GAP] = OUT_OF_REACH_MM
+                self.springs = replace(self.springs, table=table)
+        return last
+
+    def _advance_over(self, t_ns: I64) -> None:
+        count = len(t_ns) - 1
+        sensor = np.ascontiguousarray(self._sensor_at(t_ns[1:]))
+        track = self.track.grow(t_ns[1:])
+        load = np.empty((count, 0)) if self.loads is None else self.loads.grow(t_ns[1:])
+        springs, state = self.springs, self.tips.state
+        if not self.plate_free:
+            height = np.empty(count + 1)
+            height[0] = self._plate_motion[0]
+            height[1:] = self._prescribed(t_ns[1:])
+            advance(
+                springs.table, springs.friction, springs.law, state, t_ns, sensor, height, track,
+                load,
+            )  # fmt: skip
+            self._plate_motion[:] = height[-1], 0.0
+            return
+        plate, mass_kg = self._settings.scene.plate, self._release[2]
+        done = advance_free(
+            springs.table, springs.friction, springs.law, state, t_ns, sensor,
+            self._plate_motion, mass_kg, self._weight(t_ns[1:]), plate.stiction_n,
+            -plate.stroke_mm, track, load,
+        )  # fmt: skip
+        if done < count or self._plate_motion[0] <= -plate.stroke_mm:
+            self._hold_plate(-plate.stroke_mm)
+        if done < count:
+            self.track.shrink(count - done)
+            if self.loads is not None:
+                self.loads.shrink(count - done)
+
+    # -- the plate -------------------------------------------------------------------------
+
+    def act(self, action: PlateAction, seconds: float, now_ns: int, mass_kg: float) -> None:
+        """Raise the plate and hold it, release it over a ramp, or catch it where it is."""
+        self.advance(now_ns)
+        behind = np.arange(self.track.end_ns, now_ns + 1, FINE_NS, dtype=np.int64)
+        if len(behind) > 1:
+            self._advance_over(behind)
+        length = round(seconds * 1e9)
+        height = float(self._plate_motion[0])
+        if action == "release":
+            self.springs = self.springs.damped(self._settings.scene.plate.damping_s)
+            self.plate_free = True
+            self._release = (now_ns, length, mass_kg)
+            return
+        self._hold_plate(height)
+        if action == "raise":
+            self._plate_ramp = (now_ns, length, height, 0.0)
+
+    def _hold_plate(self, height: float) -> None:
+        self.plate_free = False
+        self._plate_ramp = (0, 0, height, height)
+        self._plate_motion[:] = height, 0.0
+        self.springs = self.springs.damped(0.0)
+
+    def _prescribed(self, t_ns: I64) -> F64:
+        start, length, low, high = self._plate_ramp
+        share = np.clip((t_ns - start) / max(length, 1), 0.0, 1.0)
+        result: F64 = low + share * (high - low)
+        return result
+
+    def _weight(self, t_ns: I64) -> F64:
+        start, length, mass_kg = self._release
+        share = np.clip((t_ns - start) / max(length, 1), 0.0, 1.0)
+        result: F64 = share * (mass_kg * self._settings.scene.plate.gravity_m_s2)
+        return result
+
+    # -- what devices look at --------------------------------------------------------------
+
+    def keep_loads(self, now_ns: int) -> History:
+        """Keep the forces of every row from the last one on, until `loads` is let go."""
+        done_ns, n = self.advance(now_ns), len(self.tips.state)
+        self.loads = History(3 * n)
+        row = self.loads.grow(np.array([done_ns], np.int64))[0]
+        record(self.tips.state, 0.0, np.empty(track_width(n)), row)
+        return self.loads
+
+    def tips_at(self, t_ns: I64) -> tuple[F64, F64]:
+        """Places of the tips in the world and heights of the plate, mm: (k, n, 2) and (k,).
+
+        `t_ns` are rising true times not after the last row; between rows the line is straight.
+        """
+        n = len(self.tips.state)
+        here = self.track.at(t_ns)
+        tips = here[:, : 2 * n].reshape(-1, n, 2).copy()
+        height = here[:, 4 * n]
+        tips[:, :, 1] += height[:, None]
+        return tips, height
+
+
+def springs_of(settings: MockSettings, skin: Skin, seed: int) -> Springs:
+    """The springs of one trial, at the scene's level of physics."""
+    scene, friction = settings.scene, settings.scene.friction
+    return make_springs(
+        skin,
+        friction_knots(
+            skin, friction.kinetic, friction.path_variation, friction.correlation_mm, seed
+        ),
+        level=3 if scene.level == "auto" else int(scene.level[1]),
+        static_excess=friction.static_excess,
+        strengthening=friction.strengthening,
+        weak_mm_s=friction.weak_mm_s,
+        relaxation_share=scene.skin.relaxation_share,
+        relaxation_s=scene.skin.relaxation_s,
+    )

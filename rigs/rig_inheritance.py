@@ -1,0 +1,140 @@
+"""Rig files that build on one another: `extends: mock.yaml`, and the file's own keys on top.
+
+A rehearsal differs from the rig it rehearses by a line or two; copies of whole files would drift
+apart. What is kept with the data is the merged content, which stands alone.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from protocols.errors import InputError
+from protocols.yaml_file import parse_yaml, read_text
+
+KEY = "extends"
+_DEEPEST = 8
+
+
+@dataclass(frozen=True)
+class RigSource:
+    """A rig file as read, and everything that it extends."""
+
+    path: Path
+    data: dict[str, Any]
+    """Merged."""
+    text: str
+    """The file's own text if it extends nothing, else the merged content as YAML."""
+    parts: tuple[tuple[Path, dict[str, Any]], ...]
+    """Each file with its own keys, the one that was asked for first."""
+
+    def blame(self, key: str) -> Path:
+        """The file that says what stands at `key`; the first one where none says it."""
+        path = re.findall(r"[^.\[\]]+", key)
+        deepest = max(_depth(data, path) for _, data in self.parts)
+        return next(file for file, data in self.parts if _depth(data, path) == deepest)
+
+
+def shipped_rigs() -> dict[str, Path]:
+    """The rig files that ship with the package, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+
+
+def rig_path(given: Path) -> Path:
+    """The file that a person means: a path, or the name of a shipped rig.
+
+    Raises:
+        InputError: a bare name that is neither.
+    """
+    if len(given.parts) != 1 or given.suffix or given.is_file():
+        return given
+    known = shipped_rigs()
+    name = given.name.replace("-", "_")
+    if name in known:
+        return known[name]
+    if given.exists():
+        return given  # a folder: reading it says so
+    names = ", ".join(known)
+    raise InputError("--rig", "", str(given), f"no such file, nor a rig that ships: {names}")
+
+
+def read_rig(path: Path) -> RigSource:
+    """A rig file with everything that it extends, merged but not checked.
+
+    Mappings are merged key by key, everything else is replaced as a whole.
+
+    Raises:
+        InputError: a file cannot be read, or extends itself, or goes on for more than 8 files.
+    """
+    parts: list[tuple[Path, dict[str, Any]]] = []
+    text, here = read_text(path, "rig file"), path
+    own = text
+    while True:
+        data = parse_yaml(own, here)
+        parent = data.pop(KEY, None)
+        parts.append((here, data))
+        if parent is None:
+            break
+        if not isinstance(parent, str):
+            raise InputError(here, KEY, parent, "must be the path of a rig file")
+        there = here.parent / parent
+        if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:
+            raise InputError(here, KEY, parent, "leads in a circle, or through more than 8 files")
+        try:
+            own = read_text(there, "rig file")
+        except InputError as error:
+            raise InputError(here, KEY, parent, error.expected) from None
+        here = there
+    merged: dict[str, Any] = {}
+    for _, data in reversed(parts):
+        merged = _merge(merged, data)
+    if len(parts) > 1:
+        names = " on ".join(file.name for file, _ in parts)
+        text = f"# Merged: {names}\n" + yaml.dump(merged, Dumper=_Dumper, sort_keys=False)
+    return RigSource(path, merged, text, tuple(parts))
+
+
+def _same(a: Path, b: Path) -> bool:
+    return a.resolve() == b.resolve()
+
+
+def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        known = merged.get(key)
+        both = isinstance(known, dict) and isinstance(value, dict)
+        merged[key] = _merge(known, value) if both else value  # type: ignore[arg-type]
+    return merged
+
+
+def _depth(data: Any, path: list[str]) -> int:
+    """How many leading parts of a key stand in `data`."""
+    for depth, part in enumerate(path):
+        if isinstance(data, dict) and part in data:
+            data = data[part]
+        elif isinstance(data, list) and part.isdigit() and int(part) < len(data):
+            data = data[int(part)]
+        else:
+            return depth
+    return len(path)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Numbers with the digits they were written with."""
+
+
+def _number(dumper: _Dumper, value: Decimal) -> Any:
+    if not value.is_finite():
+        text = ".nan" if value.is_nan() else ".inf" if value > 0 else "-.inf"
+    else:
+        text = format(value, "f")
+        text = text if "." in text else text + ".0"
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Dumper.add_representer(Decimal, _number)

@@ -1,0 +1,93 @@
+"""Friction that varies along the path of each tip: what keeps steady sliding from being silent.
+
+With one constant coefficient a sliding papilla pulls with a constant force and its marker stands
+still in the image, exactly as if it stuck. Real surfaces are not like that. The field is smooth
+(C1 between its knots), so that forces, marker paths and event times stay smooth too, and the
+contact solver's Newton steps have a true slope.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from rigs.scene.randomness import generator
+from rigs.scene.skin import Skin
+
+F64 = npt.NDArray[np.float64]
+
+KNOT_MM = 0.1
+KNOTS = 256
+LEAST_SHARE = 0.2
+"""No knot lies below this share of the mean."""
+
+
+def friction_knots(
+    skin: Skin, kinetic: float, variation: float, correlation_mm: float, seed: int
+) -> F64:
+    """Kinetic coefficient at knots along each tip's path, Gaussian, shape (n, knots).
+
+    Its autocorrelation over a distance d is exp(-(d / correlation_mm)^2), and it repeats after
+    25.6 mm. Without variation there is one knot only.
+
+    Args:
+        kinetic: mean coefficient of a papilla without scatter.
+        variation: standard deviation over mean.
+        seed: the trial's.
+    """
+    mean = (kinetic * skin.friction_factor)[:, None]
+    if variation == 0.0:
+        return np.ascontiguousarray(mean.astype(np.float64))
+    white = generator(seed, "friction").standard_normal((len(skin), KNOTS))
+    reach = min(int(3.0 * correlation_mm / KNOT_MM), KNOTS // 2 - 1)
+    away = np.arange(-reach, reach + 1) * KNOT_MM
+    kernel = np.exp(-2.0 * (away / correlation_mm) ** 2)
+    kernel /= np.sqrt(np.sum(kernel**2))
+    smooth = _smoothed(np.concatenate([white[:, -reach:], white, white[:, :reach]], axis=1), kernel)
+    return np.maximum(mean * (1.0 + variation * smooth), LEAST_SHARE * mean)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smoothed(padded, kernel):  # type: ignore[no-untyped-def]
+    """Rows folded with a kernel, term by term in a fixed order: the same bits everywhere."""
+    rows, length = padded.shape[0], padded.shape[1] - kernel.shape[0] + 1
+    result = np.zeros((rows, length))
+    for i in range(rows):
+        for shift in range(kernel.shape[0]):
+            weight = kernel[shift]
+            for k in range(length):
+                result[i, k] += weight * padded[i, k + shift]
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def friction_field(knots):  # type: ignore[no-untyped-def]
+    """Cubics through periodic knots with central slopes (Catmull-Rom), shape (n, knots, 4).
+
+    Between knot k and the next the coefficient is c0 + s (c1 + s (c2 + s c3)), s from 0 to 1.
+    """
+    rows, count = knots.shape
+    field = np.empty((rows, count, 4))
+    for i in range(rows):
+        for k in range(count):
+            here, after = knots[i, k], knots[i, (k + 1) % count]
+            slope = 0.5 * (after - knots[i, k - 1])
+            slope_after = 0.5 * (knots[i, (k + 2) % count] - here)
+            rise = after - here
+            field[i, k, 0], field[i, k, 1] = here, slope
+            field[i, k, 2] = 3.0 * rise - 2.0 * slope - slope_after
+            field[i, k, 3] = slope + slope_after - 2.0 * rise
+    return field
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def grip_at(field, i, path_mm):  # type: ignore[no-untyped-def]
+    """Coefficient of tip `i` after it slid `path_mm`, and its slope along the path, 1/mm."""
+    along = path_mm * (1.0 / KNOT_MM)
+    knot = int(along)
+    s = along - knot
+    knot &= field.shape[1] - 1  # a power of two
+    c1, c2, c3 = field[i, knot, 1], field[i, knot, 2], field[i, knot, 3]
+    grip = field[i, knot, 0] + s * (c1 + s * (c2 + s * c3))
+    return grip, (c1 + s * (2.0 * c2 + 3.0 * s * c3)) * (1.0 / KNOT_MM)

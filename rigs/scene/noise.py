@@ -1,0 +1,117 @@
+"""Noise of an event camera: leakage, shot noise that bright pixels have less of, and hot pixels.
+
+As in v2e (Hu, Liu and Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPRW 2021):
+leakage makes positive events at a steady rate; shot noise makes events of both polarities, at its
+full rate where it is dark and at a quarter of it in the brightest places, linear in intensity.
+The bright share is thinned out of candidates that belong to whole seconds of the trial, so that
+neither chunks nor what the camera sees change which candidates there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from rigs.scene.edges import LEVEL
+from rigs.scene.randomness import generator
+
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+Candidates = tuple[I64, I64, F64]
+"""Time (ns, rising), place (column << 12 | row) and lot (0 to 1) of possible noise events."""
+
+BIN_NS = 1_000_000_000
+BRIGHT_SHARE = 0.25
+"""Shot noise of the brightest pixels over that of dark ones: v2e's SHOT_NOISE_INTEN_FACTOR."""
+
+
+@dataclass(frozen=True)
+class NoiseRates:
+    """How noisy a camera is; its hot pixels are its own, whatever the trial."""
+
+    width: int
+    height: int
+    noise_hz: float
+    """Mean rate of a dark pixel, leakage and shot noise together."""
+    leak_share: float
+    hot_hz: float
+    hot_places: I64
+    """Column << 12 | row of each hot pixel, (n,)."""
+
+    @property
+    def total_hz(self) -> float:
+        """Rate of candidates in the whole picture."""
+        return self.noise_hz * self.width * self.height + self.hot_hz * len(self.hot_places)
+
+    @property
+    def hot_share(self) -> float:
+        """Share of the candidates that are of hot pixels."""
+        return self.hot_hz * len(self.hot_places) / self.total_hz if self.total_hz > 0 else 0.0
+
+    @property
+    def leak_below(self) -> float:
+        """Lots below this are positive whatever a pixel sees: of hot pixels, or leakage."""
+        return self.hot_share + self.leak_share * (1.0 - self.hot_share)
+
+
+def hot_places(width: int, height: int, count: int, seed: int) -> I64:
+    """Which pixels are hot in the camera of a rig with `seed`: column << 12 | row, (count,)."""
+    pixel = generator(seed, "hot pixels").choice(width * height, count, replace=False)
+    return (pixel % width << 12 | pixel // width).astype(np.int64)
+
+
+def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
+    """All that may become noise in second `index` of the trial with `seed`.
+
+    The sum of independent Poisson processes is one of the summed rate, whose events belong to each
+    with its share; given their number, their times are sorted uniform ones, which the cumulative
+    sums of exponential gaps are (Devroye 1986, V.2.2).
+    """
+    rng = generator(seed, "event noise", index)
+    n = int(rng.poisson(rates.total_hz * (BIN_NS * 1e-9)))
+    until = np.cumsum(rng.standard_exponential(n + 1))
+    t_ns = (until[:-1] * (BIN_NS / until[-1])).astype(np.int64) + index * BIN_NS
+    place = rng.integers(0, rates.width, n) << 12 | rng.integers(0, rates.height, n)
+    lot = rng.random(n)
+    hot = np.flatnonzero(lot < rates.hot_share)
+    if len(hot):
+        place[hot] = rates.hot_places[rng.integers(0, len(rates.hot_places), len(hot))]
+    return t_ns, place, lot
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def noise_events(  # type: ignore[no-untyped-def]
+    t_ns, place, lot, begin, end_ns, base_ns, leak_below, contrast, state, events, n
+):
+    """Turn candidates from `begin` on, and before `end_ns`, into events where their pixel is.
+
+    Args:
+        state: of every pixel, (height, width, 4); its level decides.
+        events: packed as in `sorting`, ns after `base_ns`; written from `n` on.
+
+    Returns:
+        the next candidate, and how many events there are now.
+    """
+    brightest = np.exp(contrast) - 1.0
+    k = begin
+    while k < t_ns.shape[0] and t_ns[k] < end_ns:
+        x, y = place[k] >> 12, place[k] & 4095
+        positive, kept = True, True
+        if lot[k] >= leak_below:
+            # the same lot says which polarity, and whether the pixel is too bright for it
+            turn = 2.0 * (lot[k] - leak_below) / (1.0 - leak_below)
+            positive = turn < 1.0
+            if not positive:
+                turn -= 1.0
+            level = state[y, x, LEVEL]
+            if level != 0.0:
+                bright = min(max((np.exp(level) - 1.0) / brightest, 0.0), 1.0)
+                kept = turn < 1.0 - (1.0 - BRIGHT_SHARE) * bright
+        if kept:
+            events[n] = (t_ns[k] - base_ns) << 25 | place[k] << 1 | np.int64(positive)
+            n += 1
+        k += 1
+    return k, n

@@ -1,0 +1,110 @@
+"""How an event camera hands its events over: the dead time of a pixel, and the scans of the array.
+
+The DVXplorer does not send an event when it happens: it scans its pixels, and "the constant
+settings guarantee constant timing but only up to about 1000" scans a second (iniVation's engineer
+L. Longinotti in the public forum dv-users; the values are `DVXeFPS` of dv-processing). Its stamps
+run on while a scan is read; here every event of a scan has the time at which the scan begins.
+
+A pixel has room for one event: it holds the first until it is read and reports nothing else in
+that scan. What it sees meanwhile is not lost from its reference level, as if it were read at once;
+with a dead time of half a millisecond there is rarely more than one. Inside a scan, events are
+ordered as they are read: by column, then by row. A scan that is not complete when a stream stops
+is never read.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from rigs.scene.sorting import sort_packed
+
+NEVER_NS = -(1 << 62)
+_TIME_BITS = 27
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bits_for(largest):  # type: ignore[no-untyped-def]
+    """How many bits hold the numbers 0 to `largest`."""
+    n = 0
+    while largest >> n > 0:
+        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def read_each(  # type: ignore[no-untyped-def]
+    events, n, other, base_ns, span_ns, refractory_ns, fired, t_ns, xs, ys, ps, kept
+):
+    """Hand over a block's events with their own times.
+
+    Args:
+        events: packed as in `sorting`, their times ns after `base_ns`, at most `span_ns`; spoilt.
+        other: scratch, as long.
+        fired: time (ns) at which each pixel last fired, (height, width), written.
+        t_ns, xs, ys, ps: written from `kept` on.
+
+    Returns:
+        how many they hold now.
+    """
+    sort_packed(events, n, other, 25, 25 + bits_for(span_ns))
+    for k in range(n):
+        event = events[k]
+        t = base_ns + (event >> 25)
+        x, y = (event >> 13) & 4095, (event >> 1) & 4095
+        if t - fired[y, x] < refractory_ns:
+            continue
+        fired[y, x] = t
+        t_ns[kept], xs[kept], ys[kept], ps[kept] = t, x, y, event & 1
+        kept += 1
+    return kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def read_scans(  # type: ignore[no-untyped-def]
+    events, n, other, base_ns, end_ns, period_ns, phase_ns, refractory_ns, fired, t_ns, xs, ys, ps,
+    kept,
+):  # fmt: skip
+    """Hand over the scans that begin up to `end_ns`; see `read_each`.
+
+    Returns:
+        how many events are handed over in all, and how many of later scans are left: these stand
+        at the front of `events`, their times unchanged.
+    """
+    height, width = fired.shape
+    y_bits, x_bits = bits_for(height - 1), bits_for(width - 1)
+    low, mask = _TIME_BITS + 1, (1 << (_TIME_BITS + 1)) - 1
+    first = (base_ns - phase_ns) // period_ns
+    start_ns = phase_ns + first * period_ns
+    lead_ns = base_ns - start_ns + period_ns - 1
+    past = (end_ns - phase_ns) // period_ns - first
+    left, inside = 0, 0
+    for k in range(n):
+        event = events[k]
+        scan = ((event >> 25) + lead_ns) // period_ns
+        if scan > past:
+            events[left] = event
+            left += 1
+            continue
+        where = (scan << x_bits | (event >> 13) & 4095) << y_bits | (event >> 1) & 4095
+        other[inside] = where << low | (event >> 25) << 1 | event & 1
+        inside += 1
+    # what is sorted stands behind what is left over
+    keys = events[left:]
+    for k in range(inside):
+        keys[k] = other[k]
+    sort_packed(keys, inside, other, low, low + y_bits + x_bits + bits_for(past))
+    for k in range(inside):
+        key = keys[k]
+        t = base_ns + ((key & mask) >> 1)
+        where = key >> low
+        y = where & ((1 << y_bits) - 1)
+        x = (where >> y_bits) & ((1 << x_bits) - 1)
+        stamp = start_ns + (where >> (y_bits + x_bits)) * period_ns
+        before = fired[y, x]
+        if t - before < refractory_ns or before > stamp - period_ns:
+            continue
+        fired[y, x] = t
+        t_ns[kept], xs[kept], ys[kept], ps[kept] = stamp, x, y, key & 1
+        kept += 1
+    return kept, left

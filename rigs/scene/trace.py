@@ -1,0 +1,152 @@
+"""Events of all markers along their paths, block by block: what `rigs.scene.events` runs on.
+
+In a block each marker's path is fitted, the pixels that fall due are taken from its agenda, and
+each of them is asked whether its distance from the rim meets a threshold. Noise is added, and the
+block is read out. Blocks lie on a grid of true time and nothing looks past their borders.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from rigs.scene.agenda import MOVED, REACH, REACH_PX, make_list, near_rim, put, take
+from rigs.scene.crossings import events_of_pixels
+from rigs.scene.edges import CUT
+from rigs.scene.marker_path import fit_curve, join_rates, slope_weights, step_rates
+from rigs.scene.noise import noise_events
+from rigs.scene.readout import read_each, read_scans
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def larger(array, capacity):  # type: ignore[no-untyped-def]
+    """`array` with room for `capacity` elements."""
+    grown = np.empty(capacity, array.dtype)
+    grown[: array.shape[0]] = array
+    return grown
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def trace(  # type: ignore[no-untyped-def]
+    path, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns, phase_ns, lowest,
+    threshold, state, fired, way, head, following, place, pending, noise_t, noise_place, noise_lot,
+    leak_below,
+):  # fmt: skip
+    """Signal and noise along `path`, as the camera hands them over.
+
+    Args:
+        path: column, row and radius of each marker at each row, px, (n, 3, m).
+        row_ns: true times of the rows, (m,); one lies on each border of a block in between.
+        chord: straight lines between rows in place of cubics.
+        period_ns, phase_ns: scans of the read-out begin at phase + k period; period 0: no scans.
+        lowest: the lowest threshold of all.
+        threshold, fired: (height, width); state: (height, width, 4), written.
+        way, head, following, place: the agenda, written.
+        pending: packed events of a scan that was not complete, ns after `row_ns[0]` - period.
+        noise_t, noise_place, noise_lot: of `noise.candidates`, in this span of time.
+        leak_below: of `noise.NoiseRates`.
+
+    Returns:
+        time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
+    """
+    total = row_ns.shape[0]
+    rows, weights = np.empty(total), np.empty((2, total))
+    curves = np.empty((3, 4, total))
+    stack, parts = np.empty((64, 3), np.int64), np.empty((128, 2))
+    tree = np.empty((6, 4 * total))
+    height, width = threshold.shape
+    taken = np.empty(place.shape[1], np.int64)
+    pixels, slack = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
+    # of the profile, at the rim: a pixel has no more events than its level goes up and down
+    steepest = 0.26 * contrast / edge
+    capacity = (1 << 14) + pending.shape[0]
+    events, other = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    room = 1 << 14
+    t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
+    xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
+    waiting, kept, noise_at, begin = pending.shape[0], 0, 0, 0
+    events[:waiting] = pending
+    while begin < total - 1:
+        border = (row_ns[begin] // block_ns + 1) * block_ns
+        last = 1
+        while begin + last < total - 1 and row_ns[begin + last] < border:
+            last += 1
+        stop = begin + last
+        base_ns, end_ns = row_ns[begin] - period_ns, row_ns[stop]
+        n = waiting
+        noise_to = noise_at
+        while noise_to < noise_t.shape[0] and noise_t[noise_to] < end_ns:
+            noise_to += 1
+        if n + noise_to - noise_at > capacity:
+            capacity = 2 * (n + noise_to - noise_at)
+            events, other = larger(events, capacity), np.empty(capacity, np.int64)
+        noise_at, n = noise_events(
+            noise_t, noise_place, noise_lot, noise_at, end_ns, base_ns, leak_below, contrast,
+            state, events, n,
+        )  # fmt: skip
+        for k in range(last + 1):
+            rows[k] = row_ns[begin + k] - row_ns[begin]
+        block = rows[: last + 1]
+        slope_weights(block, chord, weights)
+        size = 1
+        while size < last:
+            size *= 2
+        for i in range(path.shape[0]):
+            for c in range(3):
+                fit_curve(block, path[i, c, begin : stop + 1], weights, chord, curves[c])
+            strays, whole = step_rates(block, curves, size, tree)
+            if strays == 0.0:
+                continue
+            column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
+            listed = strays <= REACH_PX
+            if listed and way[i, MOVED] + strays > way[i, REACH]:
+                listed = make_list(
+                    i, column, row, radius, state, edge, way, head, following, place, taken,
+                    pixels, slack,
+                )  # fmt: skip
+            if listed:
+                ahead = way[i, MOVED] + strays
+                count = take(i, way[i, MOVED], ahead, place, head, following, taken, pixels)
+                dx, dy = path[i, 0, stop] - column, path[i, 1, stop] - row
+                way[i, MOVED] += np.sqrt(dx * dx + dy * dy) + abs(path[i, 2, stop] - radius)
+            else:
+                way[i, REACH] = -1.0
+                band = CUT * edge + strays
+                count = near_rim(column, row, radius, band, height, width, pixels)
+                if count > pixels.shape[0]:
+                    pixels, slack = np.empty(2 * count, np.int64), np.empty(2 * count)
+                    near_rim(column, row, radius, band, height, width, pixels)
+            if count == 0:
+                continue
+            most = n + count * (int(steepest * whole / lowest) + 2)
+            if most > capacity:
+                capacity = 2 * most
+                events, other = larger(events, capacity), np.empty(capacity, np.int64)
+            join_rates(size, tree)
+            n = events_of_pixels(
+                pixels, count, block, curves, size, tree, threshold, contrast, edge, period_ns,
+                stack, parts, state, slack, events, n,
+            )  # fmt: skip
+            if listed:
+                put(i, taken, slack, count, way, head, following)
+        if kept + n > room:
+            room = 2 * (kept + n)
+            t_ns, ps = larger(t_ns, room), larger(ps, room)
+            xs, ys = larger(xs, room), larger(ys, room)
+        if period_ns > 0:
+            kept, waiting = read_scans(
+                events, n, other, base_ns, end_ns, period_ns, phase_ns, refractory_ns, fired,
+                t_ns, xs, ys, ps, kept,
+            )  # fmt: skip
+            for k in range(waiting):
+                events[k] -= (end_ns - row_ns[begin]) << 25
+        else:
+            kept = read_each(
+                events, n, other, base_ns, end_ns - base_ns, refractory_ns, fired, t_ns, xs, ys,
+                ps, kept,
+            )  # fmt: skip
+        begin = stop
+    return (
+        t_ns[:kept].copy(), xs[:kept].copy(), ys[:kept].copy(), ps[:kept].copy(),
+        events[:waiting].copy(),
+    )  # fmt: skip

@@ -1,0 +1,142 @@
+"""Slides and falls on a simulated rig, for tests of its devices: driven without the rig's code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from rigs.capabilities import Segment
+from rigs.mock.devices import MockDevices, build_mock
+from rigs.mock.settings import FrameCamera as FrameSettings
+from rigs.mock.settings import MockSettings
+
+SMALL = MockSettings(frame_camera=FrameSettings(width=640, height=640, px_per_mm=4.0))
+CODE = 4321
+
+
+@dataclass
+class Trial:
+    events: dict[str, np.ndarray]
+    frames: dict[str, np.ndarray]
+    poses: dict[str, np.ndarray]
+    event_pulses: np.ndarray
+    arm_pulses: np.ndarray
+    sync_pulses: np.ndarray
+    truth: dict[str, Any]
+    slide_ns: int
+
+
+def joined(chunks: list[Any]) -> dict[str, np.ndarray]:
+    return {
+        field.name: np.concatenate([getattr(chunk, field.name) for chunk in chunks])
+        for field in fields(chunks[0])
+        if getattr(chunks[0], field.name) is not None
+    }
+
+
+def go(
+    devices: MockDevices, x: float, y: float, depth: float, speed: float, step_s: float,
+    each: Callable[[], None],
+) -> None:  # fmt: skip
+    """Move in a straight line to a place on the plate; `each` is called after every step."""
+    devices.arm.start([Segment(devices.world.plane.pose(x, y, depth), speed)])
+    while not devices.arm.progress().done:
+        devices.clock.wait(step_s)
+        each()
+
+
+def slide(
+    devices: MockDevices, seed: int, *, chunk_s: float = 0.5, distance: float = 4.0,
+    speed: float = 2.0, depth: float = 2.6, rest_s: float = 0.4,
+) -> Trial:  # fmt: skip
+    """Press, hold, slide; streams are read every `chunk_s` seconds, whatever the motion does."""
+    clock, arm, world = devices.clock, devices.arm, devices.world
+    arm.connect()
+    go(devices, 0, 0, -2, 50.0, 0.05, lambda: None)
+    devices.begin_trial(seed)
+    go(devices, 0, 0, depth, 4.0, 0.05, lambda: None)
+    clock.wait(0.5)
+    devices.frames.set_region(180, 180)
+    arm.read_poses()
+    devices.frames.start()
+    devices.events.start()
+    devices.sync.start(100.0, CODE)
+    parts: dict[str, list[Any]] = {name: [] for name in ("e", "f", "p", "ep", "ap", "sp")}
+
+    def read() -> None:
+        parts["e"].append(devices.events.read())
+        parts["f"].append(devices.frames.read())
+        parts["p"].append(arm.read_poses())
+        parts["ep"].append(devices.events.read_pulses())
+        parts["ap"].append(arm.read_pulses())
+        parts["sp"].append(devices.sync.read_pulses())
+
+    def run(seconds: float) -> None:
+        left = round(seconds * 1e9)
+        while left > 0:
+            now = min(left, round(chunk_s * 1e9))
+            clock.wait(now / 1e9)
+            left -= now
+            read()
+
+    run(rest_s)
+    start = world.now_ns
+    arm.start([Segment(world.plane.pose(distance, 0, depth), speed)])
+    run(distance / speed + 0.2)
+    devices.events.stop()
+    devices.frames.stop()
+    devices.sync.stop()
+    read()
+    clock.wait(0.05)
+    read()
+    return Trial(
+        joined(parts["e"]), joined(parts["f"]), joined(parts["p"]),
+        joined(parts["ep"])["t_ns"], joined(parts["ap"])["t_ns"], joined(parts["sp"])["t_ns"],
+        devices.truth(start), start,
+    )  # fmt: skip
+
+
+def same(a: Trial, b: Trial) -> None:
+    for stream in ("events", "frames", "poses"):
+        first, second = getattr(a, stream), getattr(b, stream)
+        for name, column in first.items():
+            assert np.array_equal(column, second[name]), f"{stream}.{name}"
+    for stream in ("event_pulses", "arm_pulses", "sync_pulses"):
+        assert np.array_equal(getattr(a, stream), getattr(b, stream)), stream
+    assert a.truth == b.truth
+
+
+def with_faults(*faults: dict[str, Any]) -> MockDevices:
+    """The small rig on which something goes wrong."""
+    data = {**SMALL.model_dump(), "faults": list(faults)}
+    return build_mock(MockSettings.model_validate(data))
+
+
+def gravity(devices: MockDevices, seed: int) -> dict[str, Any]:
+    """Hang 0.205 kg on the skin, retract until it falls; truth and what the camera saw."""
+    clock, arm, world = devices.clock, devices.arm, devices.world
+    arm.connect()
+    go(devices, 0, 0, -5, 50.0, 0.5, lambda: None)
+    devices.begin_trial(seed)
+    devices.operator.ask("changeover", "Mount the plate.", "0.205 kg")
+    devices.plate.act("raise", 0.5)
+    clock.wait(0.5)
+    go(devices, 0, 0, 3.4, 4.0, 0.5, lambda: None)
+    devices.plate.act("release", 1.0)
+    clock.wait(1.5)
+    devices.frames.set_region(180, 180)
+    devices.frames.start()
+    devices.events.start()
+    devices.sync.start(100.0, CODE)
+    clock.wait(0.3)
+    start = world.now_ns
+    go(devices, 0, 0, 2.0, 0.5, 0.1, lambda: None)
+    images = devices.frames.read().images
+    events = devices.events.read()
+    devices.plate.act("catch", 0.0)
+    truth = devices.truth(start)
+    go(devices, 0, 0, -5, 10.0, 0.5, lambda: None)
+    return {**truth, "images": images, "events": events}

@@ -1,0 +1,65 @@
+"""The simulated arm and the person beside it: segments as they end, refusals, a changed mass."""
+
+import pytest
+
+from rigs.capabilities import ArmFault, ArmState, RigError, Segment
+from rigs.mock.devices import build_mock
+from tests.rigs.mock.driving import SMALL
+
+
+def test_the_arm_reports_its_segments_as_they_end() -> None:
+    devices = build_mock(SMALL)
+    with pytest.raises(ArmFault, match="disconnected"):
+        devices.arm.start([])
+    devices.arm.connect()
+    pose = devices.world.plane.pose
+    devices.arm.start([Segment(pose(0, 0, -50), 10.0), Segment(pose(5, 0, -50), 5.0)])
+    assert devices.arm.state() is ArmState.MOVING
+    with pytest.raises(RigError, match="moving"):
+        devices.arm.start([])
+    devices.clock.wait(1.5)
+    progress = devices.arm.progress()
+    assert len(progress.finished) == 1
+    assert not progress.done
+    start, end = progress.finished[0]
+    assert end - start == pytest.approx(1e9, rel=1e-4)
+    devices.clock.wait(0.5)
+    progress = devices.arm.progress()
+    assert progress.done
+    assert progress.finished[1][0] == progress.finished[0][1]
+    assert devices.arm.now_ns() == progress.finished[1][1]
+    assert devices.arm.pose().xyz_mm == pytest.approx(pose(5, 0, -50).xyz_mm)
+    devices.arm.start([Segment(pose(0, 0, -50), 5.0)])
+    devices.clock.wait(0.5)
+    devices.arm.stop()
+    devices.arm.stop()
+    assert devices.arm.state() is ArmState.READY
+    assert devices.arm.pose().xyz_mm == pytest.approx(pose(2.5, 0, -50).xyz_mm)
+    assert devices.arm.progress().finished == ()
+
+
+def test_a_tool_that_looks_away_is_refused_near_the_plate() -> None:
+    devices = build_mock(SMALL)
+    devices.arm.connect()
+    place = devices.world.plane.pose(0, 0, 0)
+    with pytest.raises(ArmFault, match="turned"):
+        devices.arm.start([Segment(type(place)(place.xyz_mm, (0.0, 0.0, 0.0)), 5.0)])
+
+
+def test_a_trial_does_not_begin_in_motion() -> None:
+    devices = build_mock(SMALL)
+    devices.arm.connect()
+    devices.arm.start([Segment(devices.world.plane.pose(0, 0, -50), 1.0)])
+    with pytest.raises(RigError, match="moving"):
+        devices.begin_trial(1)
+
+
+def test_the_operator_mounts_a_mass_and_clears_a_stop() -> None:
+    devices = build_mock(SMALL)
+    assert devices.operator.ask("changeover", "Mount the plate.", "0.245 kg")
+    assert devices.plate.mass_kg() == 0.245
+    assert devices.operator.ask("clean", "Clean the skin.", "")
+    assert devices.plate.mass_kg() == 0.245
+    with pytest.raises(RigError, match="expected such as"):
+        devices.operator.ask("changeover", "Mount the plate.", "heavy")
+    assert [asked.task for asked in devices.operator.asked] == ["changeover", "clean", "changeover"]
