@@ -13,6 +13,7 @@ _HUBER = 1.345
 # sqrt of the 95 % quantile of chi-squared with 2 degrees: both ends of a fitted line at once
 _BAND_95 = 2.4477
 _STRETCHES = 8
+_RUNS = (8, 16)
 _ENDS = (4, 8, 16, 32)
 
 
@@ -72,8 +73,9 @@ def line_uncertainty(x: Floats, line: Line) -> float:
     """Half the width of the line's 95 % band (Working, Hotelling 1929) at the train's far end.
 
     Where the mean residual of an eighth of the train is more than chance, the clocks did not run
-    straight, and the band is wider by that much. At the ends shorter stretches count, and twice: of
-    a clock that drifts away, the mean shows half.
+    straight, and the band is wider by that much; so where that of a few pulses is far more than
+    chance, next to a jump. At the ends it counts twice: of a clock that drifts away, the mean shows
+    half.
     """
     order = np.argsort(x[line.inside], kind="stable")
     inner = x[line.inside][order]
@@ -88,6 +90,10 @@ def line_uncertainty(x: Floats, line: Line) -> float:
     local = float(np.sqrt((np.diff(residuals) ** 2).mean() / 2))
     stretches = np.array_split(residuals, _STRETCHES)
     bend = max(abs(float(part.mean())) - 3 * local / part.size**0.5 for part in stretches)
+    for count in _RUNS:
+        sums = np.cumsum(np.concatenate([[0.0], residuals]))
+        means = np.abs(sums[count:] - sums[:-count]) / count
+        bend = max(bend, float(means.max(initial=0.0)) - 5 * local / count**0.5)
     for count in _ENDS:
         for end in (residuals[:count], residuals[-count:]):
             bend = max(bend, 2 * (abs(float(end.mean())) - 3 * local / end.size**0.5))

@@ -57,6 +57,9 @@ class SceneError:
     """Median difference of the times of matched events."""
     event_p95_us: float | None
     """Their 95th percentile."""
+    early_p95_us: float | None
+    """The same of what the reference saw before its gross onset: a marker that hardly moves
+    crosses a threshold at any time, and steadily sliding ones hardly move."""
     unmatched: float | None
     """Share of the events of both runs that have no partner in the other."""
     flipped: float | None
@@ -145,20 +148,23 @@ def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
     )  # fmt: skip
     total = int(b.sum(dtype=np.int64))
     # counts are unsigned: the larger less the smaller one
-    return float((np.maximum(a, b) - np.minimum(a, b)).sum(dtype=np.int64)) / total if total else None
+    return (
+        float((np.maximum(a, b) - np.minimum(a, b)).sum(dtype=np.int64)) / total if total else None
+    )
 
 
 def compare(reference: Seen, other: Seen, windows: Windows) -> SceneError:
     """How far `other` is from `reference`: two runs of one program."""
-    median = p95 = unmatched = None
+    median = p95 = early = unmatched = None
     if reference.events is not None and other.events is not None:
         pairs = match_events(reference.events, other.events)
         unmatched = pairs.unmatched
         if len(pairs.first):
-            apart = np.abs(
-                reference.events.t_us[pairs.first] - other.events.t_us[pairs.second]
-            ).astype(np.float64)
+            t_us = reference.events.t_us[pairs.first]
+            apart = np.abs(t_us - other.events.t_us[pairs.second]).astype(np.float64)
             median, p95 = (float(value) for value in np.percentile(apart, (50, 95)))
+            before = apart[t_us * 1000 < _gross_ns(reference)]
+            early = float(np.percentile(before, 95)) if len(before) else None
     if reference.markers is None or other.markers is None:
         onsets = reference.slips, other.slips
     else:
@@ -168,10 +174,16 @@ def compare(reference: Seen, other: Seen, windows: Windows) -> SceneError:
         centre_slip_ms=_apart_ms(reference.slips[1], other.slips[1]),
         event_median_us=median,
         event_p95_us=p95,
+        early_p95_us=early,
         unmatched=unmatched,
         flipped=flipped_share(reference.begin_us, reference.end_us, windows, *onsets),
         tensor_l1=tensor_l1(reference, other, windows),
     )
+
+
+def _gross_ns(seen: Seen) -> int:
+    onset = seen.slips[1] if seen.markers is None else seen.markers[1]
+    return seen.end_us * 1000 if onset is None else onset
 
 
 def _apart_ms(a: int | None, b: int | None) -> float | None:

@@ -111,9 +111,7 @@ def pooled(trials: Sequence[SceneWindows]) -> dict[str, Any]:
         "simulated": True,
         "hold_share": hold,
         "ceiling": None if hold is None else 1.0 - hold / 3.0,
-        "silent_share": {
-            name: share(silent[k], samples[k]) for k, name in enumerate(CLASSES)
-        },
+        "silent_share": {name: share(silent[k], samples[k]) for k, name in enumerate(CLASSES)},
         "events_per_s": dict(zip(PHASES, rates, strict=True)),
         "samples": dict(zip(CLASSES, samples, strict=True)),
     }

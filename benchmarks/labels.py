@@ -26,8 +26,8 @@ from storage.video import VideoWriter, read_frames
 
 _CV2: Any = cv2  # its stubs lack the blob detector
 RATE_HZ = 100
-SIDE_PX = 504
-"""The kinematic grid's 42 mm."""
+SIDE_PX = 832
+"""The kinematic grid's 41.6 mm."""
 LEVEL = 69
 """A quarter of the way from the frames' ground to their tips."""
 

@@ -44,7 +44,7 @@ def measure(length_mm: float = LENGTH_MM, frames: int = 200, runs: int = RUNS) -
             for first in range(0, len(loads) - 1, 96)
         )
 
-    view = PlateView(FrameOptics(tip_radius_mm=1.0), 512, 512)
+    view = PlateView(FrameOptics(px_per_mm=12.0), 512, 512)
     places = np.linspace(-3.0, 3.0, frames)[:, None, None] * np.array([1.0, 0.2])
     tips = devices.world.skin.layout_mm[None] + places
     images = np.empty((10, 512, 512), np.uint8)

@@ -284,6 +284,35 @@ def verify(store: StoreArgument, as_json: JsonOption = False) -> None:
         raise typer.Exit(console.FAILED)
 
 
+@app.command()
+def tradeoff(
+    scene: Annotated[
+        Path, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
+    ],
+    rig: RigOption = Path("mock"),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for page and numbers; made if missing.")
+    ] = Path("sliplab-tradeoff"),
+    trials: Annotated[int, typer.Option("--trials", min=1, help="Trials to simulate.")] = 4,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Also what each guessed number changes.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure what simulating a protocol's scene costs, and how far off cheaper ways are."""
+    from flows import tradeoff as steps
+    from flows.tradeoff_page import choice_pairs, short_table
+
+    result = steps.tradeoff(scene, rig, out, trials, sensitivity)
+    if as_json:
+        console.print_json(result)
+        return
+    title = f"Cost and error of the scene of {result['protocol']} (simulated)"
+    console.print_table(title, *short_table(result))
+    console.print_pairs("The level that the protocol needs", choice_pairs(result))
+    console.results.print(f"Page (simulated): {(out / steps.PAGE).resolve()}", soft_wrap=True)
+
+
 def _prepare(folder: Path) -> None:
     """Make the store and point Prefect at it; everything that imports Prefect comes after."""
     from flows.orchestration import prepare

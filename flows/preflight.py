@@ -35,6 +35,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         Check("protocol and limits", True, f"{len(order.plan)} trials within all limits"),
         Check("campaign", True, f"{len(pending)} of {len(order.plan)} still to take"),
     ]
+    found.append(Check("outside camera", True, _outside_camera(order)))
     found += [Check("hint", True, text) for text in order.plan.warnings()]
     try:
         free = check_disk([order])
@@ -44,6 +45,17 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         found.append(Check("space", False, error.expected))
     found += _check_devices(order)
     return found
+
+
+def _outside_camera(order: Order) -> str:
+    """What the labels will be read from."""
+    size = order.rig.frame_px(order.plan)
+    if size is None:
+        return "not recorded: these trials cannot be labelled"
+    simulated = "simulated " if order.rig.simulated else ""
+    if order.rig.frame_source == "tracks":
+        return f"{simulated}tracks of the markers, no video"
+    return f"{simulated}video, {size[0]} x {size[1]} px"
 
 
 def _check_devices(order: Order) -> list[Check]:

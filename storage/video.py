@@ -109,7 +109,7 @@ class VideoWriter:
                 continue  # drain, so that the writer is never blocked by a dead encoder
             index, image = item
             try:
-                frame = av.VideoFrame.from_ndarray(image, format="gray")
+                frame = av.VideoFrame.from_numpy_buffer(image, format="gray")  # no copy
                 frame.pts, frame.time_base = index, self._time_base
                 packets = encoder.encode(frame)
                 with self._turn:

@@ -60,7 +60,7 @@ from rigs.scene.springs import (
 _ROUNDING = 1.0 + 1e-13
 _LEAST_STIFFNESS = 0.05
 _ITERATIONS = 60
-_CLOSE = 1e-8
+_CLOSE = 1e-7
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -146,6 +146,13 @@ def _turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _unit(x, y):  # type: ignore[no-untyped-def]
+    """The direction of a vector; x for none."""
+    size = np.sqrt(x * x + y * y)
+    return (x / size, y / size) if size > 0.0 else (1.0, 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):  # type: ignore[no-untyped-def]
     """Where tip `i` is after its base moved linearly to a place and depth within `h` seconds.
 
@@ -216,7 +223,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
     # left by a bend decides on the coefficient of friction, and so on F
     rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
-    towards_x, towards_y = unit_x, unit_y
+    towards_x, towards_y = _unit(before * unit_x + rest_x, before * unit_y + rest_y)
     low, high = 0.0, bent
     bent = min(state[i, BENT], bent)
     slip, limit, stretch = 0.0, 0.0, 0.0
@@ -228,6 +235,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
         slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
         slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
+        straight = (slip_x * towards_x + slip_y * towards_y) / slip if slip > 0.0 else 1.0
         grip, grip_slope = grip_at(field, i, state[i, PATH] + slip)
         if law.strengthening != 0.0 and slid_s > 0.0:
             speed = (1.0 + ahead) * slip / slid_s - ahead * state[i, SPEED]
@@ -236,10 +244,8 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
                 rate = law.strengthening / (law.weak_mm_s + speed) * (1.0 + ahead) / slid_s
                 grip_slope = grip_slope * faster + grip * rate
                 grip *= faster
-        limit, limit_slope = (
-            grip * normal,
-            grip * normal_slope - normal * grip_slope * stretch_slope,
-        )
+        limit = grip * normal
+        limit_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
         pull, pull_slope = limit, limit_slope
         if soft != 0.0:
             pull_x, pull_y = limit * unit_x + rest_x, limit * unit_y + rest_y
@@ -258,7 +264,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         if abs(change) <= _CLOSE * bent:
             # the next change would be of the order of its square: rounding
             stretch += stretch_slope * change
-            slip = max(slip - stretch_slope * change, 0.0)
+            slip = max(slip - stretch_slope * straight * change, 0.0)
             limit += limit_slope * change
             normal += normal_slope * change
             break

@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.agenda import slack_of
 from rigs.scene.edges import CUT, LAST, LEVEL, OFF, ON, rim_of
 
 _DONE_PX = 1e-10
@@ -49,83 +48,6 @@ def distance_at(x, y, t, k, rows, curve):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _root(x, y, target, low, high, guess, falling, rows, curve):  # type: ignore[no-untyped-def]
-    """Time in [low, high] at which the monotone distance meets `target`: bracketed Newton."""
-    t = min(max(guess, low), high)
-    length = rows[rows.shape[0] - 1]
-    close = _NEWTON * length
-    k = step_at(t, rows, int(t / length * (rows.shape[0] - 1)))
-    for _ in range(100):
-        value, rate = distance_at(x, y, t, k, rows, curve)
-        miss = value - target
-        if (miss > 0.0) == falling:
-            low = t
-        else:
-            high = t
-        before, t = t, t - miss / rate
-        # also where the rate is 0 and t is no number
-        if not low <= t <= high:
-            t = 0.5 * (low + high)
-            if high - low < 1e-9 * length:
-                break
-        elif abs(t - before) < close:
-            break
-        k = step_at(t, rows, k)
-    return t
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def monotone_events(  # type: ignore[no-untyped-def]
-    x, y, a, b, ga, gb, rate_a, rate_b, rows, curve, state, step, contrast, edge, origin, code,
-    out, n,
-):  # fmt: skip
-    """Events of a pixel between the times a and b, on which its distance goes from ga to gb.
-
-    The first guess of each time is the cubic through both ends in which time is a function of
-    distance; on a smooth path a single Newton step then does.
-
-    Args:
-        rate_a, rate_b: rates of the distance at both ends, px/ns; 0 where they are not known.
-        state: of this pixel, written.
-        step: its threshold.
-        code: what stands below the time (ns after `origin`) in a packed event; see `sorting`.
-
-    Returns:
-        how many events `out` holds now.
-    """
-    falling = gb < ga
-    rise = gb - ga
-    scale_a = rise / rate_a if rate_a * rise > 0.0 else b - a
-    scale_b = rise / rate_b if rate_b * rise > 0.0 else b - a
-    low = a
-    # a pixel that is out of this disc's reach may be another one's
-    allowed = falling or ga < CUT * edge
-    target = state[y, x, ON] if falling else state[y, x, OFF]
-    while allowed and (target >= gb if falling else target <= gb):
-        at = low
-        if (target < ga) if falling else (target > ga):
-            s = (target - ga) / rise
-            u = 1.0 - s
-            guess = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
-            at = _root(x, y, target, low, b, guess, falling, rows, curve)
-        if falling:
-            state[y, x, LEVEL] += step
-            state[y, x, OFF], state[y, x, LAST] = state[y, x, LAST], target
-            next_target = rim_of(state[y, x, LEVEL] + step, contrast, edge)
-            state[y, x, ON] = next_target
-        else:
-            state[y, x, LEVEL] -= step
-            state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
-            next_target = rim_of(state[y, x, LEVEL] - step, contrast, edge)
-            state[y, x, OFF] = next_target
-        target = next_target
-        out[n] = (np.int64(at + origin) << 25) | code | np.int64(falling)
-        n += 1
-        low = at
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def turning(turn_px, away):  # type: ignore[no-untyped-def]
     """How far a unit vector may turn whose end, `away` px off, moves by `turn_px`.
 
@@ -152,73 +74,6 @@ def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, rows, curve, size, tree, threshold, contrast, edge, origin, stack, parts, state,
-    slack, out, n,
-):  # fmt: skip
-    """Events of pixels over a whole block, however their distances go; see the module's text.
-
-    Args:
-        pixels: column << 12 | row, the first `count` of them.
-        rows: times of the block's rows, ns after its begin, (m,).
-        curve: column, row and radius between them, (3, 4, m); see `marker_path.fit_curve`.
-        size, tree: bounds of the rates; see `marker_path.join_rates`.
-        threshold, state: of all pixels, (height, width) and (height, width, 4); written.
-        origin: ns to add to every time.
-        stack, parts: scratch, (64, 3) of integers and (128, 2).
-        slack: px that the marker may move before each pixel can fire again; written.
-        out: packed events, written from `n` on.
-
-    Returns:
-        how many events `out` holds now.
-    """
-    last = rows.shape[0] - 1
-    reach = CUT * edge
-    for index in range(count):
-        x, y = pixels[index] >> 12, pixels[index] & 4095
-        code = np.int64(x) << 13 | np.int64(y) << 1
-        step = threshold[y, x]
-        ga = _at_row(x, y, 0, curve)
-        stack[0, 0], stack[0, 1], stack[0, 2] = 1, 0, size
-        depth = 1
-        while depth > 0:
-            depth -= 1
-            node, begin, end = stack[depth, 0], stack[depth, 1], min(stack[depth, 2], last)
-            length = rows[end] - rows[begin]
-            # the end of a piece is the beginning of the next one, to the bit
-            dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
-            away = np.sqrt(dx * dx + dy * dy)
-            gb = away - curve[2, 0, end]
-            inverse = 1.0 / away if away > 0.0 else 0.0
-            slowest, fastest = _node_rates(node, dx * inverse, dy * inverse, away, length, tree)
-            on, off = state[y, x, ON], state[y, x, OFF]
-            if slowest >= 0.0 or fastest <= 0.0:
-                if on >= gb or (off <= gb and ga < reach):
-                    rate_a = distance_at(x, y, rows[begin], begin, rows, curve)[1]
-                    rate_b = distance_at(x, y, rows[end], end - 1, rows, curve)[1]
-                    n = monotone_events(
-                        x, y, rows[begin], rows[end], ga, gb, rate_a, rate_b, rows, curve, state,
-                        step, contrast, edge, origin, code, out, n,
-                    )  # fmt: skip
-            elif may_reach(ga, gb, slowest, fastest, length, on, off, reach):
-                if end - begin > 1:
-                    half = begin + (stack[depth, 2] - begin) // 2
-                    if half < end:
-                        stack[depth, 0], stack[depth, 1] = 2 * node + 1, half
-                        depth += 1
-                    stack[depth, 0], stack[depth, 1], stack[depth, 2] = 2 * node, begin, half
-                    depth += 1
-                    continue
-                n = _events_in_step(
-                    x, y, begin, ga, gb, rows, curve, state, step, contrast, edge, origin, code,
-                    parts, out, n,
-                )  # fmt: skip
-            ga = gb
-        slack[index] = slack_of(ga, state[y, x, ON], state[y, x, OFF], reach)
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _at_row(x, y, k, curve):  # type: ignore[no-untyped-def]
     """Distance of a pixel from the rim at row k, px."""
     dx, dy = x - curve[0, 0, k], y - curve[1, 0, k]
@@ -226,8 +81,10 @@ def _at_row(x, y, k, curve):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _node_rates(node, ux, uy, away, length, tree):  # type: ignore[no-untyped-def]
-    """Bounds of the distance's rate over the steps of a node; (ux, uy): direction at its end."""
+def _node_rates(node, dx, dy, away, length, tree):  # type: ignore[no-untyped-def]
+    """Bounds of the distance's rate over the steps of a node; (dx, dy): to the pixel at its end."""
+    inverse = 1.0 / away if away > 0.0 else 0.0
+    ux, uy = dx * inverse, dy * inverse
     low_x, high_x, low_y, high_y = tree[0, node], tree[3, node], tree[1, node], tree[4, node]
     half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
     middle_x, middle_y = low_x + half_x, low_y + half_y
@@ -240,40 +97,7 @@ def _node_rates(node, ux, uy, away, length, tree):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _events_in_step(  # type: ignore[no-untyped-def]
-    x, y, k, first, final, rows, curve, state, step, contrast, edge, origin, code, parts, out, n
-):
-    """Events of a pixel in step k, on which its distance goes from `first` to `final`, by halves."""
-    h = rows[k + 1] - rows[k]
-    ga = first
-    parts[0, 0], parts[0, 1] = 0.0, 1.0
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        sa, sb = parts[depth, 0], parts[depth, 1]
-        a, b, length = rows[k] + sa * h, rows[k] + sb * h, (sb - sa) * h
-        gb = distance_at(x, y, b, k, rows, curve)[0]
-        if sb == 1.0:
-            b, gb = rows[k + 1], final
-        slowest, fastest = _rates(x, y, sa, sb, length, k, h, curve)
-        whole = (fastest - slowest) * length < _DONE_PX or depth > 120
-        if whole or slowest >= 0.0 or fastest <= 0.0:
-            n = monotone_events(
-                x, y, a, b, ga, gb, 0.0, 0.0, rows, curve, state, step, contrast, edge, origin,
-                code, out, n,
-            )  # fmt: skip
-        elif may_reach(ga, gb, slowest, fastest, length, state[y, x, ON], state[y, x, OFF], CUT * edge):
-            half = 0.5 * (sa + sb)
-            parts[depth, 0], parts[depth, 1] = half, sb
-            parts[depth + 1, 0], parts[depth + 1, 1] = sa, half
-            depth += 2
-            continue
-        ga = gb
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _rates(x, y, sa, sb, length, k, h, curve):  # type: ignore[no-untyped-def]
+def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
     """Bounds of the distance's rate on the part sa to sb of step k.
 
     The control points of the part of a quadratic Bezier curve are its blossom at (sa, sa),
@@ -293,5 +117,136 @@ def _rates(x, y, sa, sb, length, k, h, curve):  # type: ignore[no-untyped-def]
         rate = -(ux * vx + uy * vy) - growth
         low, high = min(low, rate), max(high, rate)
         speed = max(speed, np.sqrt(vx * vx + vy * vy))
-    turn = turning(speed * length, away) * speed
+    turn = turning(speed * (sb - sa) * h, away) * speed
     return low - turn, high + turn
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def events_of_pixels(  # type: ignore[no-untyped-def]
+    pixels, count, rows, curve, size, tree, threshold, contrast, edge, origin, stack, state, gaps,
+    out, n,
+):  # fmt: skip
+    """Events of pixels over a whole block, however their distances go; see the module's text.
+
+    One long function, because handing arrays on costs numba more than a root does.
+
+    Args:
+        pixels: column << 12 | row, the first `count` of them.
+        rows: times of the block's rows, ns after its begin, (m,).
+        curve: column, row and radius between them, (3, 4, m); see `marker_path.fit_curve`.
+        size, tree: bounds of the rates; see `marker_path.join_rates`.
+        threshold, state: of all pixels, (height, width) and (height, width, 4); written.
+        origin: ns to add to every time.
+        stack: scratch, (160, 3).
+        gaps: distance of each pixel from the rim at the end, px; written.
+        out: packed events as in `sorting`, written from `n` on.
+
+    Returns:
+        how many events `out` holds now.
+    """
+    last = rows.shape[0] - 1
+    reach, length = CUT * edge, rows[last]
+    for index in range(count):
+        x, y = pixels[index] >> 12, pixels[index] & 4095
+        code = np.int64(x) << 13 | np.int64(y) << 1
+        ga = _at_row(x, y, 0, curve)
+        # pieces yet to be done, the next one on top: a node of the tree with its steps, or with a
+        # negative number a step with the part of it from sa to sb
+        stack[0, 0], stack[0, 1], stack[0, 2] = 1.0, 0.0, size
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            node = int(stack[depth, 0])
+            sa, sb = stack[depth, 1], stack[depth, 2]
+            # the end of a piece is the beginning of the next one, to the bit
+            if node > 0:
+                k, end = int(sa), min(int(sb), last)
+                a, b = rows[k], rows[end]
+                dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
+                away = np.sqrt(dx * dx + dy * dy)
+                gb = away - curve[2, 0, end]
+                slowest, fastest = _node_rates(node, dx, dy, away, b - a, tree)
+            else:
+                k = -node
+                end, h = k + 1, rows[k + 1] - rows[k]
+                a, b = rows[k] + sa * h, rows[k] + sb * h
+                if sb == 1.0:
+                    b, gb = rows[k + 1], _at_row(x, y, k + 1, curve)
+                else:
+                    gb = distance_at(x, y, b, k, rows, curve)[0]
+                slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
+            on, off = state[y, x, ON], state[y, x, OFF]
+            if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
+                if may_reach(ga, gb, slowest, fastest, b - a, on, off, reach) and depth < 156:
+                    if node > 0 and end - k > 1:
+                        half = k + (int(sb) - k) // 2
+                        if half < end:
+                            stack[depth, 0], stack[depth, 1] = 2 * node + 1, half
+                            depth += 1
+                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = 2 * node, k, half
+                        depth += 1
+                    else:
+                        low, high = (0.0, 1.0) if node > 0 else (sa, sb)
+                        half_s = 0.5 * (low + high)
+                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, half_s, high
+                        stack[depth + 1, 0], stack[depth + 1, 1] = -k, low
+                        stack[depth + 1, 2] = half_s
+                        depth += 2
+                    continue
+                ga = gb
+                continue
+            falling = gb < ga
+            target = on if falling else off
+            # a pixel that is out of this disc's reach may be another one's
+            if (target < gb) if falling else (target > gb or ga >= reach):
+                ga = gb
+                continue
+            rise, step = gb - ga, threshold[y, x]
+            rate_a = distance_at(x, y, a, k, rows, curve)[1]
+            rate_b = distance_at(x, y, b, end - 1, rows, curve)[1]
+            # on a monotone piece time is a function of distance; a cubic through both ends is the
+            # first guess, after which a smooth path needs one step of Newton's method
+            scale_a = rise / rate_a if rate_a * rise > 0.0 else b - a
+            scale_b = rise / rate_b if rate_b * rise > 0.0 else b - a
+            level, begun = state[y, x, LEVEL], a
+            while (target >= gb) if falling else (target <= gb):
+                t = begun
+                if (target < ga) if falling else (target > ga):
+                    s = (target - ga) / rise
+                    u = 1.0 - s
+                    t = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
+                    low, high = begun, b
+                    t = min(max(t, low), high)
+                    for _ in range(100):
+                        k = step_at(t, rows, k)
+                        value, rate = distance_at(x, y, t, k, rows, curve)
+                        miss = value - target
+                        if (miss > 0.0) == falling:
+                            low = t
+                        else:
+                            high = t
+                        before, t = t, t - miss / rate
+                        # also where the rate is 0 and t is no number
+                        if not low <= t <= high:
+                            t = 0.5 * (low + high)
+                            if high - low < 1e-9 * length:
+                                break
+                        elif abs(t - before) < _NEWTON * length:
+                            break
+                if falling:
+                    level += step
+                    state[y, x, OFF], state[y, x, LAST] = state[y, x, LAST], target
+                    target = rim_of(level + step, contrast, edge)
+                    state[y, x, ON] = target
+                else:
+                    level -= step
+                    state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
+                    target = rim_of(level - step, contrast, edge)
+                    state[y, x, OFF] = target
+                out[n] = (np.int64(t + origin) << 25) | code | np.int64(falling)
+                n += 1
+                begun = t
+            state[y, x, LEVEL] = level
+            ga = gb
+        gaps[index] = ga
+    return n

@@ -16,13 +16,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.agenda import BUCKETS, MOVED, REACH, REACH_PX
 from rigs.scene.edges import CUT, dark_pixels, see_discs
 from rigs.scene.marker_path import markers_in_image
 from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
 from rigs.scene.randomness import generator
 from rigs.scene.readout import NEVER_NS
 from rigs.scene.trace import trace
+from rigs.scene.watch import REACH_PX
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -84,7 +84,7 @@ class MarkerSensor:
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
         self._state = self._dark.copy()
         self._fired_ns = np.empty(shape, np.int64)
-        self._agenda = _empty_agenda(len(self._layout_mm), 0)
+        self._lists = _empty_lists(len(self._layout_mm), 0)
         self._pending = np.empty(0, np.int64)
         self._phase_ns = 0
         self._trial = 0
@@ -124,12 +124,12 @@ class MarkerSensor:
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
             self._phase_ns = int(generator(seed, "read-out").integers(optics.period_ns))
-        # room for rims half as wide again; where that is not enough, trace does without the agenda
+        # room for rims half as wide again; where that is not enough, trace does without lists
         band = CUT * optics.edge_px + REACH_PX + 1.0
-        slots = int(4.0 * np.pi * band * (1.5 * float(discs[:, 2].max()) + band))
-        if self._agenda[-1].shape[1] < slots:
-            self._agenda = _empty_agenda(len(discs), slots)
-        self._agenda[0][:, MOVED], self._agenda[0][:, REACH] = 0.0, -1.0
+        slots = int(4.0 * np.pi * band * (1.5 * float(discs[:, 2].max()) + band)) // 8 * 8
+        if self._lists[-1].shape[1] < slots:
+            self._lists = _empty_lists(len(discs), slots)
+        self._lists[0][:] = 0.0
 
     def sense(self, loads: F64, t_ns: I64) -> Events:
         """Events between the first and the last row of `loads`, in order of time.
@@ -148,7 +148,7 @@ class MarkerSensor:
         *events, self._pending = trace(
             self.path(loads), t_ns, optics.block_ns, optics.path == "chord", optics.contrast,
             optics.edge_px, round(optics.refractory_us * 1e3), optics.period_ns, self._phase_ns,
-            self._lowest, self.threshold, self._state, self._fired_ns, *self._agenda,
+            self._lowest, self.threshold, self._state, self._fired_ns, *self._lists,
             self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])), self._noise.leak_below,
         )  # fmt: skip
         when, x, y, p = events
@@ -171,9 +171,9 @@ class MarkerSensor:
         return t_ns, place, lot
 
 
-def _empty_agenda(markers: int, slots: int) -> tuple[npt.NDArray[np.generic], ...]:
-    """See `rigs.scene.agenda`: way, head, following, place."""
+def _empty_lists(markers: int, slots: int) -> tuple[npt.NDArray[np.generic], ...]:
+    """See `rigs.scene.watch`: origin, aim, place."""
     return (
-        np.full((markers, 2), -1.0), np.full((markers, BUCKETS), -1, np.int32),
-        np.empty((markers, slots), np.int32), np.empty((markers, slots), np.int32),
+        np.zeros((markers, 5)), np.empty((markers, 5, slots), np.float32),
+        np.empty((markers, slots), np.int32),
     )  # fmt: skip

@@ -102,7 +102,7 @@ def fit_curve(t, place, weights, chord, curve):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_rates(t, curves, size, tree):  # type: ignore[no-untyped-def]
-    """Bounds of the rates in each step, and how far the marker strays in the block from its start.
+    """Bounds of the rates in each step, and the length of the marker's way in the block.
 
     A step's rates stay between the control points of the derivative as a Bezier curve.
 
@@ -113,36 +113,27 @@ def step_rates(t, curves, size, tree):  # type: ignore[no-untyped-def]
             from `size` on are written, px/ns. See `join_rates`.
 
     Returns:
-        how far at most the centre is from its start, plus the radius, at any time, and the length
-        of their ways together, at most, px.
+        the lengths of the ways of column, row and radius, at most and together, px.
     """
     last = t.shape[0] - 1
-    far, whole = np.zeros(3), 0.0
+    whole = 0.0
     for c in range(3):
-        low, high, curve = tree[c], tree[3 + c], curves[c]
         for k in range(last):
-            first = curve[1, k]
-            middle = first + curve[2, k]
-            end = middle + curve[2, k] + 3.0 * curve[3, k]
-            low[size + k] = min(first, min(middle, end))
-            high[size + k] = max(first, max(middle, end))
-        low[size + last :] = np.inf
-        high[size + last :] = -np.inf
-        most = 0.0
-        for k in range(last):
-            fastest = max(high[size + k], -low[size + k])
-            most = max(most, abs(curve[0, k] - curve[0, 0]) + fastest * (t[k + 1] - t[k]))
-        far[c] = most
-        for k in range(last):
-            whole += max(high[size + k], -low[size + k]) * (t[k + 1] - t[k])
-    return np.sqrt(far[0] * far[0] + far[1] * far[1]) + far[2], whole
+            first = curves[c, 1, k]
+            middle = first + curves[c, 2, k]
+            end = middle + curves[c, 2, k] + 3.0 * curves[c, 3, k]
+            low, high = min(first, min(middle, end)), max(first, max(middle, end))
+            tree[c, size + k], tree[3 + c, size + k] = low, high
+            whole += max(high, -low) * (t[k + 1] - t[k])
+        for k in range(last, size):
+            tree[c, size + k], tree[3 + c, size + k] = np.inf, -np.inf
+    return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def join_rates(size, tree):  # type: ignore[no-untyped-def]
     """Fill a tree from its leaves: node j holds for all steps below it; 2 j and 2 j + 1 are below."""
     for c in range(3):
-        low, high = tree[c], tree[3 + c]
         for j in range(size - 1, 0, -1):
-            low[j] = min(low[2 * j], low[2 * j + 1])
-            high[j] = max(high[2 * j], high[2 * j + 1])
+            tree[c, j] = min(tree[c, 2 * j], tree[c, 2 * j + 1])
+            tree[3 + c, j] = max(tree[3 + c, 2 * j], tree[3 + c, 2 * j + 1])

@@ -1,6 +1,6 @@
 """Events of all markers along their paths, block by block: what `rigs.scene.events` runs on.
 
-In a block each marker's path is fitted, the pixels that fall due are taken from its agenda, and
+In a block each marker's path is fitted, the pixels that may fire are picked from its list, and
 each of them is asked whether its distance from the rim meets a threshold. Noise is added, and the
 block is read out. Blocks lie on a grid of true time and nothing looks past their borders.
 """
@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.agenda import MOVED, REACH, REACH_PX, make_list, near_rim, put, take
 from rigs.scene.crossings import events_of_pixels
 from rigs.scene.edges import CUT
 from rigs.scene.marker_path import fit_curve, join_rates, slope_weights, step_rates
 from rigs.scene.noise import noise_events
 from rigs.scene.readout import read_each, read_scans
+from rigs.scene.watch import REACH_PX, excursion, make_list, may_fire, near_rim, reaches, renew
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -29,7 +29,7 @@ def larger(array, capacity):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
     path, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns, phase_ns, lowest,
-    threshold, state, fired, way, head, following, place, pending, noise_t, noise_place, noise_lot,
+    threshold, state, fired, origin, aim, place, pending, noise_t, noise_place, noise_lot,
     leak_below,
 ):  # fmt: skip
     """Signal and noise along `path`, as the camera hands them over.
@@ -41,7 +41,7 @@ def trace(  # type: ignore[no-untyped-def]
         period_ns, phase_ns: scans of the read-out begin at phase + k period; period 0: no scans.
         lowest: the lowest threshold of all.
         threshold, fired: (height, width); state: (height, width, 4), written.
-        way, head, following, place: the agenda, written.
+        origin, aim, place: the lists of `watch`, written.
         pending: packed events of a scan that was not complete, ns after `row_ns[0]` - period.
         noise_t, noise_place, noise_lot: of `noise.candidates`, in this span of time.
         leak_below: of `noise.NoiseRates`.
@@ -52,11 +52,11 @@ def trace(  # type: ignore[no-untyped-def]
     total = row_ns.shape[0]
     rows, weights = np.empty(total), np.empty((2, total))
     curves = np.empty((3, 4, total))
-    stack, parts = np.empty((64, 3), np.int64), np.empty((128, 2))
+    stack = np.empty((160, 3))
     tree = np.empty((6, 4 * total))
     height, width = threshold.shape
-    taken = np.empty(place.shape[1], np.int64)
-    pixels, slack = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
+    slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
+    pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
     # of the profile, at the rim: a pixel has no more events than its level goes up and down
     steepest = 0.26 * contrast / edge
     capacity = (1 << 14) + pending.shape[0]
@@ -94,41 +94,44 @@ def trace(  # type: ignore[no-untyped-def]
         for i in range(path.shape[0]):
             for c in range(3):
                 fit_curve(block, path[i, c, begin : stop + 1], weights, chord, curves[c])
-            strays, whole = step_rates(block, curves, size, tree)
+            strays, stray = excursion(block, curves)
             if strays == 0.0:
                 continue
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
-            listed = strays <= REACH_PX
-            if listed and way[i, MOVED] + strays > way[i, REACH]:
+            listed = reaches(i, column, row, radius, strays, origin)
+            if not listed and strays <= REACH_PX:
                 listed = make_list(
-                    i, column, row, radius, state, edge, way, head, following, place, taken,
-                    pixels, slack,
-                )  # fmt: skip
+                    i, column, row, radius, state, edge, pixels, origin, aim, place
+                )
+            end_x, end_y, end_r = path[i, 0, stop], path[i, 1, stop], path[i, 2, stop]
             if listed:
-                ahead = way[i, MOVED] + strays
-                count = take(i, way[i, MOVED], ahead, place, head, following, taken, pixels)
-                dx, dy = path[i, 0, stop] - column, path[i, 1, stop] - row
-                way[i, MOVED] += np.sqrt(dx * dx + dy * dy) + abs(path[i, 2, stop] - radius)
+                count = may_fire(
+                    i, column, row, radius, end_x - column, end_y - row, end_r - radius, stray,
+                    origin, aim, place, hit, slots, pixels,
+                )  # fmt: skip
             else:
-                way[i, REACH] = -1.0
+                origin[i, 3] = 0.0
                 band = CUT * edge + strays
                 count = near_rim(column, row, radius, band, height, width, pixels)
                 if count > pixels.shape[0]:
-                    pixels, slack = np.empty(2 * count, np.int64), np.empty(2 * count)
+                    pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
                     near_rim(column, row, radius, band, height, width, pixels)
             if count == 0:
                 continue
+            whole = step_rates(block, curves, size, tree)
+            join_rates(size, tree)
             most = n + count * (int(steepest * whole / lowest) + 2)
             if most > capacity:
                 capacity = 2 * most
                 events, other = larger(events, capacity), np.empty(capacity, np.int64)
-            join_rates(size, tree)
             n = events_of_pixels(
                 pixels, count, block, curves, size, tree, threshold, contrast, edge, period_ns,
-                stack, parts, state, slack, events, n,
+                stack, state, gaps, events, n,
             )  # fmt: skip
             if listed:
-                put(i, taken, slack, count, way, head, following)
+                renew(
+                    i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim
+                )
         if kept + n > room:
             room = 2 * (kept + n)
             t_ns, ps = larger(t_ns, room), larger(ps, room)

@@ -105,6 +105,8 @@ def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:
     found = json.loads(done.stdout)
     assert found["passed"]
     assert {"arm", "clocks", "space"} <= {item["name"] for item in found["checks"]}
+    (camera,) = (item for item in found["checks"] if item["name"] == "outside camera")
+    assert camera["finding"] == "simulated video, 720 x 720 px"
 
 
 def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:

@@ -35,7 +35,7 @@ def gravity() -> dict[str, Any]:
     """One retraction."""
     data = tiny_gravity()
     data["collection"]["factors"]["mass"]["values"] = [0.245]
-    data["collection"]["motion"][5] = {"phase": "hold", "settle": "0.5 s", "duration": "0.6 s"}
+    data["collection"]["motion"][5] = {"phase": "hold", "settle": "1 s", "duration": "0.6 s"}
     return data
 
 
@@ -86,7 +86,8 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         assert found.displacement_px.shape == (len(found.frame_ns), 19)
         assert found.plate_lost == 0
         # the first frame over the threshold: up to a frame late, early by noise only
-        assert all(-3.0 < error < FRAME_MS + 5.0 for error in errors_ms(found, recording))
+        errors = errors_ms(found, recording)
+        assert all(-3.0 < error < FRAME_MS + 5.0 for error in errors), errors
         expected.append(frame_bytes * len(found.frame_ns))
         recordings.append(recording)
         labels.append(found)

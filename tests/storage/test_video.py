@@ -63,11 +63,11 @@ def test_an_encoder_that_fails_says_so_and_blocks_nobody(
         made = 0
 
         @classmethod
-        def from_ndarray(cls, image: np.ndarray, format: str) -> av.VideoFrame:
+        def from_numpy_buffer(cls, image: np.ndarray, format: str) -> av.VideoFrame:
             cls.made += 1
             if cls.made == 3:
                 raise ValueError("out of ink")
-            return av.VideoFrame.from_ndarray(image, format=format)
+            return av.VideoFrame.from_numpy_buffer(image, format=format)
 
     monkeypatch.setattr("storage.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken}))
     writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)

@@ -1,0 +1,209 @@
+"""Which pixels have to be looked at in a block: a list of each marker's pixels, and a cheap test.
+
+When a list is made, every pixel near the rim keeps the direction u to it, its distance rho and how
+far its next thresholds are. Once the marker has moved by D and grown by G, the pixel's distance
+from the rim has fallen by q = u.D - (u x D)^2 / (2 rho) + G, to third order in D / rho. So a block
+is one pass of a few single precision operations a pixel, without branches, over all that may fire,
+and what cannot fire costs nothing more. A marker that has moved by `REACH_PX` gets a new list.
+
+Lists of n markers with room for s pixels: `aim` (n, 5, s), float32: both components of u,
+1 / (2 rho), and what q must rise to and fall to (negated) for a positive and a negative event;
+`place` (n, s), int32: column << 12 | row; `origin` (n, 5): column, row and radius when the list was
+made, how many pixels there are (0: no list), and the least rho.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from rigs.scene.edges import CUT, OFF, ON
+
+REACH_PX = 1.5
+"""How far a marker may move, and grow, before its list is made again."""
+UX, UY, BEND, RISE, FALL = 0, 1, 2, 3, 4
+_COUNT, _NEAREST = 3, 4
+_NEVER_PX = 1e6
+_SPARE_PX = np.float32(2e-6)  # rounding of single precision cannot hide a pixel
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[no-untyped-def]
+    """Pixels within `band` px of a disc's rim, into `pixels`; how many there are.
+
+    Where there are more than `pixels` has room for, the rest is counted and not kept.
+    """
+    n, room = 0, pixels.shape[0]
+    outer, inner = radius + band, max(radius - band, 0.0)
+    for y in range(max(int(np.ceil(row - outer)), 0), min(int(np.floor(row + outer)) + 1, height)):
+        across = (y - row) * (y - row)
+        wide = np.sqrt(max(outer * outer - across, 0.0))
+        hole = np.sqrt(max(inner * inner - across, 0.0))
+        left = max(int(np.ceil(column - wide)), 0)
+        right = min(int(np.floor(column + wide)), width - 1)
+        hole_left, hole_right = int(np.floor(column - hole)), int(np.ceil(column + hole))
+        if hole_right - hole_left < 2:
+            hole_left, hole_right = right + 1, right + 1
+        for x in range(left, min(hole_left, right) + 1):
+            if n < room:
+                pixels[n] = x << 12 | y
+            n += 1
+        for x in range(max(hole_right, left), right + 1):
+            if n < room:
+                pixels[n] = x << 12 | y
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def excursion(t, curves):  # type: ignore[no-untyped-def]
+    """How far a marker strays in a block, px: (from its start, from the chord to its end).
+
+    The control points of its cubics hold the path, and distances from a point or from a segment
+    are convex, so the farthest control point bounds them. Growth counts like a move.
+    """
+    last = t.shape[0] - 1
+    x, y, r = curves[0, 0, 0], curves[1, 0, 0], curves[2, 0, 0]
+    dx, dy, dr = curves[0, 0, last] - x, curves[1, 0, last] - y, curves[2, 0, last] - r
+    square = dx * dx + dy * dy + dr * dr
+    scale = 1.0 / square if square > 0.0 else 0.0
+    far, far_r = dx * dx + dy * dy, abs(dr)
+    off, off_r = 0.0, 0.0
+    for k in range(last):
+        h = t[k + 1] - t[k]
+        for j in range(3):
+            # the control points of step k: its first one, and the two between its ends
+            a, b = h * (0.0, 1.0 / 3.0, 2.0 / 3.0)[j], h * (0.0, 0.0, 1.0 / 3.0)[j]
+            px = curves[0, 0, k] + a * curves[0, 1, k] + b * curves[0, 2, k] - x
+            py = curves[1, 0, k] + a * curves[1, 1, k] + b * curves[1, 2, k] - y
+            pr = curves[2, 0, k] + a * curves[2, 1, k] + b * curves[2, 2, k] - r
+            far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
+            s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
+            ex, ey = px - s * dx, py - s * dy
+            off, off_r = max(off, ex * ex + ey * ey), max(off_r, abs(pr - s * dr))
+    return np.sqrt(far) + far_r, np.sqrt(off) + off_r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
+    """How far a pixel's distance from the rim must fall for a positive, and rise for a negative event.
+
+    Outside the edge (`reach`) the pixel may be another marker's: then only the way to it counts.
+    """
+    if gap >= reach:
+        return gap - reach, _NEVER_PX
+    return gap - on, off - gap
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place):  # type: ignore[no-untyped-def]
+    """Make marker i's list anew, where it is now; False where it cannot have one.
+
+    There is none where the list has too few slots, or the disc is so small that the rim's
+    curvature matters.
+
+    Args:
+        state: of every pixel, (height, width, 4).
+        pixels: scratch, at least as many as slots.
+    """
+    reach = CUT * edge
+    band = reach + REACH_PX
+    n = near_rim(column, row, radius, band, state.shape[0], state.shape[1], pixels)
+    fits = n <= place.shape[1] and radius > band + 2.0 * REACH_PX
+    if fits:
+        near, n = n, 0
+        for k in range(near):
+            x, y = pixels[k] >> 12, pixels[k] & 4095
+            dx, dy = x - column, y - row
+            away = np.sqrt(dx * dx + dy * dy)
+            gap = away - radius
+            rise, fall = thresholds(gap, state[y, x, ON], state[y, x, OFF], reach)
+            if min(rise, fall) <= 1.05 * REACH_PX:
+                inverse = 1.0 / away
+                place[i, n] = pixels[k]
+                aim[i, UX, n], aim[i, UY, n] = dx * inverse, dy * inverse
+                aim[i, BEND, n] = 0.5 * inverse
+                aim[i, RISE, n], aim[i, FALL, n] = rise, fall
+                n += 1
+    origin[i, 0], origin[i, 1], origin[i, 2] = column, row, radius
+    origin[i, _COUNT] = n if fits else 0.0
+    origin[i, _NEAREST] = radius - band
+    return fits
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-def]
+    """Whether marker i's list still holds if it strays so far from (column, row, radius), px."""
+    dx, dy = column - origin[i, 0], row - origin[i, 1]
+    moved = np.sqrt(dx * dx + dy * dy) + abs(radius - origin[i, 2])
+    return origin[i, _COUNT] > 0.0 and moved + strays <= REACH_PX
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def may_fire(  # type: ignore[no-untyped-def]
+    i, column, row, radius, dx, dy, dr, stray, origin, aim, place, hit, slots, pixels
+):
+    """Pixels that marker i may let fire on its way from (column, row, radius) by (dx, dy, dr).
+
+    Args:
+        stray: how far the way is from its chord at most, px.
+        hit: scratch, bytes, a multiple of eight of them, at least as many as slots.
+        slots, pixels: slots and places of these pixels, written.
+
+    Returns:
+        how many there are.
+    """
+    from_x, from_y = column - origin[i, 0], row - origin[i, 1]
+    to_x, to_y = from_x + dx, from_y + dy
+    moved = np.sqrt(max(from_x * from_x + from_y * from_y, to_x * to_x + to_y * to_y)) + stray
+    nearest = origin[i, _NEAREST]
+    left = nearest - moved
+    # what the second order leaves out: a b^2 / (2 rho (rho - a)) and b^4 / (8 (rho - a)^3) with
+    # a^2 + b^2 = D^2; twice, for a pixel's thresholds may have been renewed on the way
+    rest = 0.385 * moved**3 / (2.0 * nearest * left) + moved**4 / (8.0 * left**3)
+    # along the chord the bending term is a parabola; this is how far it and a line are apart
+    bow = 0.25 * (dx * dx + dy * dy) / nearest
+    margin = np.float32(stray * (1.0 + moved / left) + 2.0 * rest + bow) + _SPARE_PX
+    x, y, grown = np.float32(to_x), np.float32(to_y), np.float32(radius + dr - origin[i, 2])
+    way_x, way_y, growth = np.float32(dx), np.float32(dy), np.float32(dr)
+    count = int(origin[i, _COUNT])
+    ux, uy, bend, rise, fall = aim[i, UX], aim[i, UY], aim[i, BEND], aim[i, RISE], aim[i, FALL]
+    for k in range(count):
+        across = ux[k] * y - uy[k] * x
+        turn = ux[k] * way_y - uy[k] * way_x
+        end = ux[k] * x + uy[k] * y - across * across * bend[k] + grown
+        start = end - (ux[k] * way_x + uy[k] * way_y + growth)
+        start += (across + across - turn) * turn * bend[k]
+        hit[k] = (
+            (end + margin >= rise[k]) | (start + margin >= rise[k])
+            | (margin - end >= fall[k]) | (margin - start >= fall[k])
+        )  # fmt: skip
+    n = 0
+    groups = hit.view(np.uint64)
+    for group in range((count + 7) // 8):
+        if groups[group] != 0:
+            for k in range(8 * group, min(8 * group + 8, count)):
+                if hit[k]:
+                    slots[n], pixels[n] = k, place[i, k]
+                    n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def renew(i, column, row, radius, slots, pixels, gaps, count, state, edge, origin, aim):  # type: ignore[no-untyped-def]
+    """Give slots new thresholds after their pixels were looked at.
+
+    Args:
+        column, row, radius: where marker i is now.
+        gaps: how far each pixel is from the rim now, px.
+    """
+    reach = CUT * edge
+    x, y = np.float32(column - origin[i, 0]), np.float32(row - origin[i, 1])
+    dr = np.float32(radius - origin[i, 2])
+    for index in range(count):
+        k, gap = slots[index], gaps[index]
+        across = aim[i, UX, k] * y - aim[i, UY, k] * x
+        q = aim[i, UX, k] * x + aim[i, UY, k] * y - across * across * aim[i, BEND, k] + dr
+        px, py = pixels[index] >> 12, pixels[index] & 4095
+        rise, fall = thresholds(gap, state[py, px, ON], state[py, px, OFF], reach)
+        aim[i, RISE, k], aim[i, FALL, k] = rise + q, fall - q
