@@ -22,6 +22,8 @@ Array = npt.NDArray[Any]
 
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
+SMALL_HELD = 1 << 14
+"""Rows of small columns that are held back; each write costs more than what is in it."""
 FORMAT = 1
 
 # column -> (dtype, trailing shape, unit)
@@ -58,6 +60,8 @@ class StreamFile:
         self._file.attrs["format"] = FORMAT
         self._offset: int | None = None
         self._last_us: int | None = None
+        self._marks: list[Array] = []
+        self._next_ms = 0
         self._pending: dict[str, list[Array]] = {name: [] for name in COLUMNS}
         self._held = dict.fromkeys(COLUMNS, 0)
         self.counts = dict.fromkeys(COLUMNS, 0)
@@ -78,11 +82,12 @@ class StreamFile:
 
     def _append(self, name: str, values: Array) -> None:
         """Gather whole chunks before writing: a partial chunk would be compressed twice."""
-        rows = EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
+        small = not name.startswith("events/")
+        rows = SMALL_CHUNK if small else EVENT_CHUNK
         self._pending[name].append(np.asarray(values))
         self._held[name] += len(values)
         self.counts[name] += len(values)
-        if self._held[name] >= rows:
+        if self._held[name] >= (SMALL_HELD if small else rows):
             joined = np.concatenate(self._pending[name])
             whole = len(joined) // rows * rows
             self._write(name, joined[:whole])
@@ -109,10 +114,18 @@ class StreamFile:
         if self._offset is None:
             self._offset = first
         self._last_us = last
+        times = chunk.t_us - self._offset
+        self._mark(times, int(times[-1]) // 1000 + 1)
         self._append("events/x", chunk.x)
         self._append("events/y", chunk.y)
         self._append("events/p", chunk.p)
-        self._append("events/t", chunk.t_us - self._offset)
+        self._append("events/t", times)
+
+    def _mark(self, times: I64, end_ms: int) -> None:
+        """Note the first event at or after each millisecond before `end_ms`."""
+        marks = np.arange(self._next_ms, end_ms, dtype=np.int64) * 1000
+        self._marks.append(self.counts["events/t"] + np.searchsorted(times, marks, side="left"))
+        self._next_ms = max(end_ms, self._next_ms)
 
     def add_pulses(self, group: str, chunk: PulseChunk) -> None:
         """Append pulses to ``event_pulses``, ``arm_pulses`` or ``sync_pulses``."""
@@ -160,11 +173,9 @@ class StreamFile:
             if self._held[name]:
                 self._write(name, np.concatenate(parts))
             self._held[name] = 0
-        events = self._file["events"]
-        times = events["t"][:]
-        last_ms = int(times[-1]) // 1000 if len(times) else -1
-        marks = np.arange(last_ms + 2, dtype=np.int64) * 1000
-        index = np.searchsorted(times, marks, side="left").astype(np.int64)
+        # one more mark, so that the last millisecond has an end
+        self._marks.append(np.full(1, self.counts["events/t"], np.int64))
+        index = np.concatenate(self._marks).astype(np.int64)
         self._file.create_dataset(
             "ms_to_idx", data=index, chunks=True, **hdf5plugin.Bitshuffle(cname="zstd", clevel=3)
         )

@@ -158,6 +158,8 @@ def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
 
 def undisturbed(clock: ClockMap) -> ClockMap:
     """What the device's cycles run by: `clock` without its faults."""
+    if type(clock) is ClockMap:
+        return clock
     return ClockMap(clock.device_anchor_ns, clock.reference_anchor_ns, clock.drift_ppb)
 
 

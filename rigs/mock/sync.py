@@ -104,11 +104,17 @@ class MockSyncBox:
             return 0
         box = undisturbed(self.clock).to_reference(true_ns)
         guess = max(int(box * self.rate_hz / 1e9) - 1, 0)
-        while guess and int(self.true_ns(np.array([guess - 1], np.int64))[0]) >= true_ns:
+        while guess and self._true_of(guess - 1) >= true_ns:
             guess -= 1
-        while int(self.true_ns(np.array([guess], np.int64))[0]) < true_ns:
+        while self._true_of(guess) < true_ns:
             guess += 1
         return guess
+
+    def _true_of(self, tick: int) -> int:
+        """`true_ns` of one tick, without arrays: it is asked often."""
+        if isinstance(self.clock, FaultyClock):
+            return int(self.true_ns(np.array([tick], np.int64))[0])
+        return self.clock.to_device(round(tick * (1e9 / self.rate_hz)))
 
     def box_ns(self, ticks: I64) -> I64:
         """Ticks on the box's clock, ns."""

@@ -16,7 +16,7 @@ from numba import njit
 from rigs.scene.edges import CUT, LAST, LEVEL, OFF, ON, rim_of
 
 _DONE_PX = 1e-10
-_NEWTON = 1e-5  # of the piece: after a step as small as that the next error is below 1e-9
+_NEWTON = 1e-4  # of the block: after a step as small as that the next error is below 1e-7
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -32,10 +32,15 @@ def step_at(t, rows, guess):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_at(x, y, t, k, rows, curve):  # type: ignore[no-untyped-def]
-    """Distance of a pixel from the rim at time `t` in step `k`, px, and its rate, px/ns."""
+def distance_at(x, y, t, k, rows, inverse, curve):  # type: ignore[no-untyped-def]
+    """Distance of a pixel from the rim at time `t` in step `k`, px, and its rate, px/ns.
+
+    Returns:
+        the distance, and the rate as a product of two: the rate times the distance from the
+        centre, and that distance (of which the caller may spare the division).
+    """
     tau = t - rows[k]
-    s = tau / (rows[k + 1] - rows[k])
+    s = tau * inverse[k]
     dx = x - (curve[0, 0, k] + tau * (curve[0, 1, k] + s * (curve[0, 2, k] + s * curve[0, 3, k])))
     dy = y - (curve[1, 0, k] + tau * (curve[1, 1, k] + s * (curve[1, 2, k] + s * curve[1, 3, k])))
     r = curve[2, 0, k] + tau * (curve[2, 1, k] + s * (curve[2, 2, k] + s * curve[2, 3, k]))
@@ -43,17 +48,15 @@ def distance_at(x, y, t, k, rows, curve):  # type: ignore[no-untyped-def]
     vy = curve[1, 1, k] + s * (2.0 * curve[1, 2, k] + 3.0 * s * curve[1, 3, k])
     growth = curve[2, 1, k] + s * (2.0 * curve[2, 2, k] + 3.0 * s * curve[2, 3, k])
     away = np.sqrt(dx * dx + dy * dy)
-    closing = (dx * vx + dy * vy) / away if away > 0.0 else np.sqrt(vx * vx + vy * vy)
-    return away - r, -closing - growth
+    return away - r, -(dx * vx + dy * vy) - growth * away, away
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def turning(turn_px, away):  # type: ignore[no-untyped-def]
-    """How far a unit vector may turn whose end, `away` px off, moves by `turn_px`.
+def turning(share):  # type: ignore[no-untyped-def]
+    """How far a unit vector may turn whose end moves by a `share` of its distance.
 
     |u - u'| <= 2 |e - e'| / (|e| + |e'|) (Dunkl and Williams 1964), and never above 2.
     """
-    share = turn_px / away if away > 0.0 else 1.0
     return 1.34 * share if share <= 0.5 else 2.0
 
 
@@ -85,15 +88,13 @@ def _node_rates(node, dx, dy, away, length, tree):  # type: ignore[no-untyped-de
     """Bounds of the distance's rate over the steps of a node; (dx, dy): to the pixel at its end."""
     inverse = 1.0 / away if away > 0.0 else 0.0
     ux, uy = dx * inverse, dy * inverse
-    low_x, high_x, low_y, high_y = tree[0, node], tree[3, node], tree[1, node], tree[4, node]
-    half_x, half_y = 0.5 * (high_x - low_x), 0.5 * (high_y - low_y)
-    middle_x, middle_y = low_x + half_x, low_y + half_y
-    middle = -(ux * middle_x + uy * middle_y)
-    half = abs(ux) * half_x + abs(uy) * half_y
-    fast_x, fast_y = abs(middle_x) + half_x, abs(middle_y) + half_y
-    speed = np.sqrt(fast_x * fast_x + fast_y * fast_y)
-    half += turning(speed * length, away) * speed
-    return middle - half - tree[5, node], middle + half - tree[2, node]
+    low_x, high_x = ux * tree[0, node], ux * tree[3, node]
+    low_y, high_y = uy * tree[1, node], uy * tree[4, node]
+    least = min(low_x, high_x) + min(low_y, high_y)
+    most = max(low_x, high_x) + max(low_y, high_y)
+    speed = tree[6, node]
+    turn = (turning(speed * length * inverse) if away > 0.0 else 2.0) * speed
+    return -most - tree[5, node] - turn, -least - tree[2, node] + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -117,24 +118,26 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
         rate = -(ux * vx + uy * vy) - growth
         low, high = min(low, rate), max(high, rate)
         speed = max(speed, np.sqrt(vx * vx + vy * vy))
-    turn = turning(speed * (sb - sa) * h, away) * speed
+    turn = (turning(speed * (sb - sa) * h * inverse) if away > 0.0 else 2.0) * speed
     return low - turn, high + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, rows, curve, size, tree, threshold, contrast, edge, origin, stack, state, gaps,
-    out, n,
+    pixels, count, rows, inverse, curve, first, blocks, stray, tree, threshold, contrast, edge,
+    origin, stack, state, gaps, out, n,
 ):  # fmt: skip
-    """Events of pixels over a whole block, however their distances go; see the module's text.
+    """Events of pixels over some blocks, however their distances go; see the module's text.
 
-    One long function, because handing arrays on costs numba more than a root does.
+    What is done in a block follows from its own rows alone, to the bit. One long function, because
+    handing arrays on costs numba more than a root does.
 
     Args:
         pixels: column << 12 | row, the first `count` of them.
-        rows: times of the block's rows, ns after its begin, (m,).
-        curve: column, row and radius between them, (3, 4, m); see `marker_path.fit_curve`.
-        size, tree: bounds of the rates; see `marker_path.join_rates`.
+        rows, inverse, curve: see `marker_path.fit_block`.
+        first: first row of each block, and the last row of all, (blocks + 1,).
+        stray: how far the marker is from the chord of each block at most, px.
+        tree: of `marker_path.bound_rates`; that of block b begins at 4 first[b].
         threshold, state: of all pixels, (height, width) and (height, width, 4); written.
         origin: ns to add to every time.
         stack: scratch, (160, 3).
@@ -144,41 +147,60 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
     Returns:
         how many events `out` holds now.
     """
-    last = rows.shape[0] - 1
-    reach, length = CUT * edge, rows[last]
+    reach = CUT * edge
+    for index in range(count):
+        # all that is not in the cache is asked for at once, and not one pixel after the other
+        x, y = pixels[index] >> 12, pixels[index] & 4095
+        gaps[index] = state[y, x, LEVEL] + threshold[y, x]
     for index in range(count):
         x, y = pixels[index] >> 12, pixels[index] & 4095
         code = np.int64(x) << 13 | np.int64(y) << 1
-        ga = _at_row(x, y, 0, curve)
-        # pieces yet to be done, the next one on top: a node of the tree with its steps, or with a
-        # negative number a step with the part of it from sa to sb
-        stack[0, 0], stack[0, 1], stack[0, 2] = 1.0, 0.0, size
-        depth = 1
-        while depth > 0:
-            depth -= 1
-            node = int(stack[depth, 0])
-            sa, sb = stack[depth, 1], stack[depth, 2]
-            # the end of a piece is the beginning of the next one, to the bit
-            if node > 0:
-                k, end = int(sa), min(int(sb), last)
-                a, b = rows[k], rows[end]
-                dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
-                away = np.sqrt(dx * dx + dy * dy)
-                gb = away - curve[2, 0, end]
-                slowest, fastest = _node_rates(node, dx, dy, away, b - a, tree)
-            else:
-                k = -node
-                end, h = k + 1, rows[k + 1] - rows[k]
-                a, b = rows[k] + sa * h, rows[k] + sb * h
-                if sb == 1.0:
-                    b, gb = rows[k + 1], _at_row(x, y, k + 1, curve)
+        ga = _at_row(x, y, first[0], curve)
+        for block in range(blocks):
+            begin, last = first[block], first[block + 1]
+            gb = _at_row(x, y, last, curve)
+            if (
+                min(ga, gb) - stray[block] > state[y, x, ON]
+                and max(ga, gb) + stray[block] < state[y, x, OFF]
+            ):
+                ga = gb
+                continue
+            final, length, base = gb, rows[last] - rows[begin], 4 * begin
+            size = 1
+            while size < last - begin:
+                size *= 2
+            # pieces yet to be done, the next one on top: a node of the tree with its steps, or,
+            # with a number not above 0, a step with the part of it from sa to sb
+            stack[0, 0], stack[0, 1], stack[0, 2] = 1.0, begin, begin + size
+            depth = 1
+            while depth > 0:
+                depth -= 1
+                node = int(stack[depth, 0])
+                sa, sb = stack[depth, 1], stack[depth, 2]
+                # the end of a piece is the beginning of the next one, to the bit
+                if node > 0:
+                    k, end = int(sa), min(int(sb), last)
+                    a, b = rows[k], rows[end]
+                    dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
+                    away = np.sqrt(dx * dx + dy * dy)
+                    gb = away - curve[2, 0, end]
+                    slowest, fastest = _node_rates(base + node, dx, dy, away, b - a, tree)
                 else:
-                    gb = distance_at(x, y, b, k, rows, curve)[0]
-                slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
-            on, off = state[y, x, ON], state[y, x, OFF]
-            if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
-                if may_reach(ga, gb, slowest, fastest, b - a, on, off, reach) and depth < 156:
-                    if node > 0 and end - k > 1:
+                    k = -node
+                    end, h = k + 1, rows[k + 1] - rows[k]
+                    a, b = rows[k] + sa * h, rows[k] + sb * h
+                    if sb == 1.0:
+                        b, gb = rows[k + 1], _at_row(x, y, k + 1, curve)
+                    else:
+                        gb = distance_at(x, y, b, k, rows, inverse, curve)[0]
+                    slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
+                on, off = state[y, x, ON], state[y, x, OFF]
+                if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
+                    if depth > 156 or not may_reach(
+                        ga, gb, slowest, fastest, b - a, on, off, reach
+                    ):
+                        ga = gb
+                    elif node > 0 and end - k > 1:
                         half = k + (int(sb) - k) // 2
                         if half < end:
                             stack[depth, 0], stack[depth, 1] = 2 * node + 1, half
@@ -187,66 +209,67 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                         depth += 1
                     else:
                         low, high = (0.0, 1.0) if node > 0 else (sa, sb)
-                        half_s = 0.5 * (low + high)
-                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, half_s, high
-                        stack[depth + 1, 0], stack[depth + 1, 1] = -k, low
-                        stack[depth + 1, 2] = half_s
-                        depth += 2
+                        middle = 0.5 * (low + high)
+                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, middle, high
+                        depth += 1
+                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, low, middle
+                        depth += 1
                     continue
-                ga = gb
-                continue
-            falling = gb < ga
-            target = on if falling else off
-            # a pixel that is out of this disc's reach may be another one's
-            if (target < gb) if falling else (target > gb or ga >= reach):
-                ga = gb
-                continue
-            rise, step = gb - ga, threshold[y, x]
-            rate_a = distance_at(x, y, a, k, rows, curve)[1]
-            rate_b = distance_at(x, y, b, end - 1, rows, curve)[1]
-            # on a monotone piece time is a function of distance; a cubic through both ends is the
-            # first guess, after which a smooth path needs one step of Newton's method
-            scale_a = rise / rate_a if rate_a * rise > 0.0 else b - a
-            scale_b = rise / rate_b if rate_b * rise > 0.0 else b - a
-            level, begun = state[y, x, LEVEL], a
-            while (target >= gb) if falling else (target <= gb):
-                t = begun
-                if (target < ga) if falling else (target > ga):
-                    s = (target - ga) / rise
-                    u = 1.0 - s
-                    t = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
-                    low, high = begun, b
-                    t = min(max(t, low), high)
-                    for _ in range(100):
-                        k = step_at(t, rows, k)
-                        value, rate = distance_at(x, y, t, k, rows, curve)
-                        miss = value - target
-                        if (miss > 0.0) == falling:
-                            low = t
-                        else:
-                            high = t
-                        before, t = t, t - miss / rate
-                        # also where the rate is 0 and t is no number
-                        if not low <= t <= high:
-                            t = 0.5 * (low + high)
-                            if high - low < 1e-9 * length:
+                falling = gb < ga
+                target = on if falling else off
+                # a pixel that is out of this disc's reach may be another one's
+                if (target < gb) if falling else (target > gb or ga >= reach):
+                    ga = gb
+                    continue
+                rise, step, level = gb - ga, threshold[y, x], state[y, x, LEVEL]
+                # on a monotone piece time is a function of distance; a cubic through both ends is
+                # the first guess, after which a smooth path needs one step of Newton's method
+                _, slope_a, away_a = distance_at(x, y, a, k, rows, inverse, curve)
+                _, slope_b, away_b = distance_at(x, y, b, end - 1, rows, inverse, curve)
+                scale_a = rise * away_a / slope_a if slope_a * rise > 0.0 else b - a
+                scale_b = rise * away_b / slope_b if slope_b * rise > 0.0 else b - a
+                begun = a
+                while (target >= gb) if falling else (target <= gb):
+                    t = begun
+                    if (target < ga) if falling else (target > ga):
+                        s = (target - ga) / rise
+                        u = 1.0 - s
+                        t = a + s * (
+                            s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b)
+                        )
+                        low, high = begun, b
+                        t = min(max(t, low), high)
+                        for _ in range(100):
+                            k = step_at(t, rows, k)
+                            value, slope, away = distance_at(x, y, t, k, rows, inverse, curve)
+                            miss = value - target
+                            if (miss > 0.0) == falling:
+                                low = t
+                            else:
+                                high = t
+                            before, t = t, t - miss * away / slope
+                            # also where the slope is 0 and t is no number
+                            if not low <= t <= high:
+                                t = 0.5 * (low + high)
+                                if high - low < 1e-9 * length:
+                                    break
+                            elif abs(t - before) < _NEWTON * length:
                                 break
-                        elif abs(t - before) < _NEWTON * length:
-                            break
-                if falling:
-                    level += step
-                    state[y, x, OFF], state[y, x, LAST] = state[y, x, LAST], target
-                    target = rim_of(level + step, contrast, edge)
-                    state[y, x, ON] = target
-                else:
-                    level -= step
-                    state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
-                    target = rim_of(level - step, contrast, edge)
-                    state[y, x, OFF] = target
-                out[n] = (np.int64(t + origin) << 25) | code | np.int64(falling)
-                n += 1
-                begun = t
-            state[y, x, LEVEL] = level
-            ga = gb
+                    if falling:
+                        level += step
+                        state[y, x, OFF], state[y, x, LAST] = state[y, x, LAST], target
+                        target = rim_of(level + step, contrast, edge)
+                        state[y, x, ON] = target
+                    else:
+                        level -= step
+                        state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
+                        target = rim_of(level - step, contrast, edge)
+                        state[y, x, OFF] = target
+                    out[n] = (np.int64(t + origin) << 25) | code | np.int64(falling)
+                    n += 1
+                    begun = t
+                state[y, x, LEVEL] = level
+                ga = gb
+            ga = final
         gaps[index] = ga
     return n

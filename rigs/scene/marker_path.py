@@ -42,98 +42,115 @@ def markers_in_image(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slope_weights(t, chord, weights):  # type: ignore[no-untyped-def]
-    """What the differences before and after row k count for the slope there: `weights` (2, m).
+def fit_block(t, path, i, row, first, last, chord, curve, inverse):  # type: ignore[no-untyped-def]
+    """Marker i as cubics between the rows of one block, which looks at no other rows.
 
-    Three-point parabolic differences on uneven steps h0, h1: (h1 d0 + h0 d1) / (h0 + h1). At both
-    ends row 0 of `weights` belongs to the next difference inwards and row 1 to the one after it:
-    the same parabola, seen from its end. Two rows are joined by a straight line.
+    The slope at a row is the parabola's through it and its neighbours, (h1 d0 + h0 d1) / (h0 + h1)
+    for steps h0, h1 and differences d0, d1; at both ends it is the slope of the parabola through
+    the three outermost rows; two rows are joined by a straight line.
+
+    Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
+    is curve[0] + tau (curve[1] + s (curve[2] + s curve[3])), px.
 
     Args:
-        t: times of the block's rows, (m,), strictly rising.
-        chord: join rows by straight lines: the weights are not used then.
+        t: times of rows, ns, (r,).
+        path: column, row and radius of each marker, (n, 3, m).
+        row: row of `path` that belongs to t[first].
+        first, last: the block's first and last row in `t`.
+        chord: join rows by straight lines.
+        curve: (3, 4, r), written for steps `first` to `last` - 1; the places also at `last`.
+        inverse: 1 over the length of each step, (r,), written.
     """
-    last = t.shape[0] - 1
-    if chord or last < 2:
-        weights[0, : last + 1] = 1.0
-        weights[1, : last + 1] = 0.0
-        return
-    for k in range(1, last):
-        whole = t[k + 1] - t[k - 1]
-        weights[0, k] = (t[k + 1] - t[k]) / whole
-        weights[1, k] = (t[k] - t[k - 1]) / whole
-    weights[1, 0] = -(t[1] - t[0]) / (t[2] - t[0])
-    weights[1, last] = -(t[last] - t[last - 1]) / (t[last] - t[last - 2])
-    weights[0, 0], weights[0, last] = 1.0 - weights[1, 0], 1.0 - weights[1, last]
+    for k in range(first, last):
+        inverse[k] = 1.0 / (t[k + 1] - t[k])
+    straight = chord or last - first < 2
+    for c in range(3):
+        for k in range(first, last + 1):
+            curve[c, 0, k] = path[i, c, row + k - first]
+        for k in range(first, last):
+            curve[c, 1, k] = (curve[c, 0, k + 1] - curve[c, 0, k]) * inverse[k]
+            curve[c, 2, k] = curve[c, 3, k] = 0.0
+        if not straight:
+            here, after = curve[c, 1, first], curve[c, 1, first + 1]
+            share = (t[first + 1] - t[first]) / (t[first + 2] - t[first])
+            slope, before = here + share * (here - after), here
+            for k in range(first, last):
+                here = curve[c, 1, k]
+                if k + 1 < last:
+                    after = curve[c, 1, k + 1]
+                    share = (t[k + 1] - t[k]) / (t[k + 2] - t[k])
+                    end = here + share * (after - here)
+                else:
+                    share = (t[last] - t[k]) / (t[last] - t[k - 1])
+                    end = here + share * (here - before)
+                curve[c, 1, k] = slope
+                curve[c, 2, k] = 3.0 * here - 2.0 * slope - end
+                curve[c, 3, k] = slope + end - 2.0 * here
+                slope, before = end, here
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_curve(t, place, weights, chord, curve):  # type: ignore[no-untyped-def]
-    """One coordinate as cubics between the rows: `curve` (4, m), written; its end is curve[0, m - 1].
+def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-untyped-def]
+    """Bounds of a block's rates as a tree, and how far the marker goes in it.
 
-    Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), it is
-    curve[0] + tau (curve[1] + s (curve[2] + s curve[3])).
-
-    Args:
-        place: the coordinate at the rows, (m,).
-        weights: of `slope_weights`.
-    """
-    last = t.shape[0] - 1
-    rate, slope = curve[2], curve[1]
-    for k in range(last):
-        curve[0, k] = place[k]
-        rate[k] = (place[k + 1] - place[k]) / (t[k + 1] - t[k])
-    curve[0, last] = place[last]
-    if chord or last < 2:
-        slope[:last] = rate[:last]
-        curve[2:, :last] = 0.0
-        return
-    slope[0] = weights[0, 0] * rate[0] + weights[1, 0] * rate[1]
-    end = weights[0, last] * rate[last - 1] + weights[1, last] * rate[last - 2]
-    for k in range(1, last):
-        slope[k] = weights[0, k] * rate[k - 1] + weights[1, k] * rate[k]
-    # in place: the rate of a step is needed until its own two coefficients are known
-    for k in range(last):
-        after = slope[k + 1] if k + 1 < last else end
-        chord_rate = rate[k]
-        curve[2, k] = 3.0 * chord_rate - 2.0 * slope[k] - after
-        curve[3, k] = slope[k] + after - 2.0 * chord_rate
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def step_rates(t, curves, size, tree):  # type: ignore[no-untyped-def]
-    """Bounds of the rates in each step, and the length of the marker's way in the block.
-
-    A step's rates stay between the control points of the derivative as a Bezier curve.
+    A step's rates stay between the control points of the derivative as a Bezier curve. Node 1
+    holds for the whole block; below node j are 2 j and 2 j + 1; leaves begin at `size`.
 
     Args:
-        curves: column, row and radius, (3, 4, m).
-        size: leaves of `tree`, a power of two, not less than the steps.
-        tree: (6, 2 size): lowest rates of column, row and radius and the highest ones; the leaves
-            from `size` on are written, px/ns. See `join_rates`.
+        first, last: the block's first and last row in `t`.
+        size: leaves, a power of two, not less than the steps.
+        base: where the tree's node 0 is.
+        tree: (7, nodes): lowest rates of column, row and radius, the highest ones, px/ns, and the
+            fastest speed of the centre; written.
 
     Returns:
         the lengths of the ways of column, row and radius, at most and together, px.
     """
-    last = t.shape[0] - 1
     whole = 0.0
+    leaves = base + size - first
     for c in range(3):
-        for k in range(last):
-            first = curves[c, 1, k]
-            middle = first + curves[c, 2, k]
-            end = middle + curves[c, 2, k] + 3.0 * curves[c, 3, k]
-            low, high = min(first, min(middle, end)), max(first, max(middle, end))
-            tree[c, size + k], tree[3 + c, size + k] = low, high
+        for k in range(first, last):
+            begin = curve[c, 1, k]
+            middle = begin + curve[c, 2, k]
+            end = middle + curve[c, 2, k] + 3.0 * curve[c, 3, k]
+            low, high = min(begin, min(middle, end)), max(begin, max(middle, end))
+            tree[c, leaves + k], tree[3 + c, leaves + k] = low, high
             whole += max(high, -low) * (t[k + 1] - t[k])
-        for k in range(last, size):
-            tree[c, size + k], tree[3 + c, size + k] = np.inf, -np.inf
+        for k in range(last, first + size):
+            tree[c, leaves + k], tree[3 + c, leaves + k] = np.inf, -np.inf
+        for j in range(size - 1, 0, -1):
+            a, b = base + 2 * j, base + 2 * j + 1
+            tree[c, base + j] = min(tree[c, a], tree[c, b])
+            tree[3 + c, base + j] = max(tree[3 + c, a], tree[3 + c, b])
+    for j in range(base + 1, base + 2 * size):
+        x, y = max(tree[3, j], -tree[0, j]), max(tree[4, j], -tree[1, j])
+        tree[6, j] = np.sqrt(x * x + y * y)
     return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def join_rates(size, tree):  # type: ignore[no-untyped-def]
-    """Fill a tree from its leaves: node j holds for all steps below it; 2 j and 2 j + 1 are below."""
-    for c in range(3):
-        for j in range(size - 1, 0, -1):
-            tree[c, j] = min(tree[c, 2 * j], tree[c, 2 * j + 1])
-            tree[3 + c, j] = max(tree[3 + c, 2 * j], tree[3 + c, 2 * j + 1])
+def excursion(t, curve, first, last):  # type: ignore[no-untyped-def]
+    """How far a marker strays between two rows, px: (from its start, from the chord to its end).
+
+    The control points of its cubics hold the path, and distances from a point or from a segment
+    are convex, so the farthest control point bounds them. Growth counts like a move.
+    """
+    x, y, r = curve[0, 0, first], curve[1, 0, first], curve[2, 0, first]
+    dx, dy, dr = curve[0, 0, last] - x, curve[1, 0, last] - y, curve[2, 0, last] - r
+    square = dx * dx + dy * dy + dr * dr
+    scale = 1.0 / square if square > 0.0 else 0.0
+    far, far_r = dx * dx + dy * dy, abs(dr)
+    off, off_r = 0.0, 0.0
+    for k in range(first, last):
+        third = (t[k + 1] - t[k]) / 3.0
+        for j in range(3):
+            # the control points of step k: its first one, and the two between its ends
+            a, b = third * j, third * (j == 2)
+            px = curve[0, 0, k] + a * curve[0, 1, k] + b * curve[0, 2, k] - x
+            py = curve[1, 0, k] + a * curve[1, 1, k] + b * curve[1, 2, k] - y
+            pr = curve[2, 0, k] + a * curve[2, 1, k] + b * curve[2, 2, k] - r
+            far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
+            s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
+            ex, ey = px - s * dx, py - s * dy
+            off, off_r = max(off, ex * ex + ey * ey), max(off_r, abs(pr - s * dr))
+    return np.sqrt(far) + far_r, np.sqrt(off) + off_r

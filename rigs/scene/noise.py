@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.edges import LEVEL
+from rigs.scene.edges import CUT, level_at
 from rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
@@ -83,22 +83,37 @@ def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def brightness(x, y, discs, contrast, edge):  # type: ignore[no-untyped-def]
+    """Intensity of a pixel between that of the ground (0) and that of a disc (1).
+
+    Args:
+        discs: column, row and radius of each disc, px, (n, 3).
+    """
+    reach = CUT * edge
+    for i in range(discs.shape[0]):
+        dx, dy, most = x - discs[i, 0], y - discs[i, 1], discs[i, 2] + reach
+        square = dx * dx + dy * dy
+        if square < most * most:
+            level = level_at(np.sqrt(square) - discs[i, 2], contrast, edge)
+            return (np.exp(level) - 1.0) / (np.exp(contrast) - 1.0)
+    return 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def noise_events(  # type: ignore[no-untyped-def]
-    t_ns, place, lot, begin, end_ns, base_ns, leak_below, contrast, state, events, n
+    t_ns, place, lot, begin, end_ns, base_ns, leak_below, contrast, edge, discs, events, n
 ):
     """Turn candidates from `begin` on, and before `end_ns`, into events where their pixel is.
 
     Args:
-        state: of every pixel, (height, width, 4); its level decides.
+        discs: column, row and radius of each disc at this time, px, (n, 3).
         events: packed as in `sorting`, ns after `base_ns`; written from `n` on.
 
     Returns:
         the next candidate, and how many events there are now.
     """
-    brightest = np.exp(contrast) - 1.0
     k = begin
     while k < t_ns.shape[0] and t_ns[k] < end_ns:
-        x, y = place[k] >> 12, place[k] & 4095
         positive, kept = True, True
         if lot[k] >= leak_below:
             # the same lot says which polarity, and whether the pixel is too bright for it
@@ -106,9 +121,8 @@ def noise_events(  # type: ignore[no-untyped-def]
             positive = turn < 1.0
             if not positive:
                 turn -= 1.0
-            level = state[y, x, LEVEL]
-            if level != 0.0:
-                bright = min(max((np.exp(level) - 1.0) / brightest, 0.0), 1.0)
+            if turn >= BRIGHT_SHARE:
+                bright = brightness(place[k] >> 12, place[k] & 4095, discs, contrast, edge)
                 kept = turn < 1.0 - (1.0 - BRIGHT_SHARE) * bright
         if kept:
             events[n] = (t_ns[k] - base_ns) << 25 | place[k] << 1 | np.int64(positive)

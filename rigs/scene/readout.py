@@ -33,6 +33,16 @@ def bits_for(largest):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _row_of(where, y_bits):  # type: ignore[no-untyped-def]
+    return where & ((1 << y_bits) - 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _column_of(where, y_bits, x_bits):  # type: ignore[no-untyped-def]
+    return (where >> y_bits) & ((1 << x_bits) - 1)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def read_each(  # type: ignore[no-untyped-def]
     events, n, other, base_ns, span_ns, refractory_ns, fired, t_ns, xs, ys, ps, kept
 ):
@@ -95,11 +105,13 @@ def read_scans(  # type: ignore[no-untyped-def]
         keys[k] = other[k]
     sort_packed(keys, inside, other, low, low + y_bits + x_bits + bits_for(past))
     for k in range(inside):
+        # all that is not in the cache is asked for at once, and not one pixel after the other
+        other[k] = fired[_row_of(keys[k] >> low, y_bits), _column_of(keys[k] >> low, y_bits, x_bits)]
+    for k in range(inside):
         key = keys[k]
         t = base_ns + ((key & mask) >> 1)
         where = key >> low
-        y = where & ((1 << y_bits) - 1)
-        x = (where >> y_bits) & ((1 << x_bits) - 1)
+        x, y = _column_of(where, y_bits, x_bits), _row_of(where, y_bits)
         stamp = start_ns + (where >> (y_bits + x_bits)) * period_ns
         before = fired[y, x]
         if t - before < refractory_ns or before > stamp - period_ns:

@@ -12,10 +12,13 @@ from numba import njit
 
 from rigs.scene.crossings import events_of_pixels
 from rigs.scene.edges import CUT
-from rigs.scene.marker_path import fit_curve, join_rates, slope_weights, step_rates
+from rigs.scene.marker_path import bound_rates, excursion, fit_block
 from rigs.scene.noise import noise_events
 from rigs.scene.readout import read_each, read_scans
-from rigs.scene.watch import REACH_PX, excursion, make_list, may_fire, near_rim, reaches, renew
+from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
+
+SPAN_NS = 96_000_000
+"""As long a time is looked at in one go; a packed event has room for 134 ms."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -24,6 +27,28 @@ def larger(array, capacity):  # type: ignore[no-untyped-def]
     grown = np.empty(capacity, array.dtype)
     grown[: array.shape[0]] = array
     return grown
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
+    """Blocks of a grid of `block_ns` from row `begin` on, as many as are looked at together.
+
+    Args:
+        first: first row of each block, counted from `begin`, then the last row of all; written.
+
+    Returns:
+        how many blocks there are, at least one; together not above `SPAN_NS` if more than one.
+    """
+    last, k, blocks = row_ns.shape[0] - 1, begin, 0
+    first[0] = 0
+    while k < last and (blocks == 0 or (blocks + 1) * block_ns <= SPAN_NS):
+        border = (row_ns[k] // block_ns + 1) * block_ns
+        k += 1
+        while k < last and row_ns[k] < border:
+            k += 1
+        blocks += 1
+        first[blocks] = k - begin
+    return blocks
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -49,52 +74,41 @@ def trace(  # type: ignore[no-untyped-def]
     Returns:
         time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
     """
-    total = row_ns.shape[0]
-    rows, weights = np.empty(total), np.empty((2, total))
-    curves = np.empty((3, 4, total))
-    stack = np.empty((160, 3))
-    tree = np.empty((6, 4 * total))
-    height, width = threshold.shape
+    total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
+    rows, inverse, curve = np.empty(total), np.empty(total), np.empty((3, 4, total))
+    tree, stack = np.empty((7, 4 * total)), np.empty((160, 3))
+    first, stray = np.empty(total, np.int64), np.empty(total)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
     # of the profile, at the rim: a pixel has no more events than its level goes up and down
     steepest = 0.26 * contrast / edge
-    capacity = (1 << 14) + pending.shape[0]
+    capacity = (1 << 13) + pending.shape[0] + noise_t.shape[0]
     events, other = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    room = 1 << 14
+    room = 1 << 13
     t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
     xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
     waiting, kept, noise_at, begin = pending.shape[0], 0, 0, 0
     events[:waiting] = pending
     while begin < total - 1:
-        border = (row_ns[begin] // block_ns + 1) * block_ns
-        last = 1
-        while begin + last < total - 1 and row_ns[begin + last] < border:
-            last += 1
+        blocks = find_blocks(row_ns, begin, block_ns, first)
+        last = first[blocks]
         stop = begin + last
         base_ns, end_ns = row_ns[begin] - period_ns, row_ns[stop]
-        n = waiting
-        noise_to = noise_at
-        while noise_to < noise_t.shape[0] and noise_t[noise_to] < end_ns:
-            noise_to += 1
-        if n + noise_to - noise_at > capacity:
-            capacity = 2 * (n + noise_to - noise_at)
-            events, other = larger(events, capacity), np.empty(capacity, np.int64)
-        noise_at, n = noise_events(
-            noise_t, noise_place, noise_lot, noise_at, end_ns, base_ns, leak_below, contrast,
-            state, events, n,
-        )  # fmt: skip
         for k in range(last + 1):
             rows[k] = row_ns[begin + k] - row_ns[begin]
-        block = rows[: last + 1]
-        slope_weights(block, chord, weights)
-        size = 1
-        while size < last:
-            size *= 2
+        n = waiting
+        for block in range(blocks):
+            noise_at, n = noise_events(
+                noise_t, noise_place, noise_lot, noise_at, row_ns[begin + first[block + 1]],
+                base_ns, leak_below, contrast, edge, path[:, :, begin + first[block]], events, n,
+            )  # fmt: skip
         for i in range(path.shape[0]):
-            for c in range(3):
-                fit_curve(block, path[i, c, begin : stop + 1], weights, chord, curves[c])
-            strays, stray = excursion(block, curves)
+            for block in range(blocks):
+                fit_block(
+                    rows, path, i, begin + first[block], first[block], first[block + 1], chord,
+                    curve, inverse,
+                )  # fmt: skip
+            strays, off_chord = excursion(rows, curve, 0, last)
             if strays == 0.0:
                 continue
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
@@ -106,8 +120,8 @@ def trace(  # type: ignore[no-untyped-def]
             end_x, end_y, end_r = path[i, 0, stop], path[i, 1, stop], path[i, 2, stop]
             if listed:
                 count = may_fire(
-                    i, column, row, radius, end_x - column, end_y - row, end_r - radius, stray,
-                    origin, aim, place, hit, slots, pixels,
+                    i, column, row, radius, end_x - column, end_y - row, end_r - radius,
+                    off_chord, origin, aim, place, hit, slots, pixels,
                 )  # fmt: skip
             else:
                 origin[i, 3] = 0.0
@@ -118,15 +132,26 @@ def trace(  # type: ignore[no-untyped-def]
                     near_rim(column, row, radius, band, height, width, pixels)
             if count == 0:
                 continue
-            whole = step_rates(block, curves, size, tree)
-            join_rates(size, tree)
+            whole = 0.0
+            for block in range(blocks):
+                a, b = first[block], first[block + 1]
+                size = 1
+                while size < b - a:
+                    size *= 2
+                whole += bound_rates(rows, curve, a, b, size, 4 * a, tree)
+                dx, dy = curve[0, 0, b] - curve[0, 0, a], curve[1, 0, b] - curve[1, 0, a]
+                square = dx * dx + dy * dy
+                nearest = radius - CUT * edge - 2.0 * strays
+                # a distance from a point that moves straight sags below a line by that much
+                sag = 0.125 * square / nearest if nearest > 0.0 else np.inf
+                stray[block] = excursion(rows, curve, a, b)[1] + sag
             most = n + count * (int(steepest * whole / lowest) + 2)
             if most > capacity:
                 capacity = 2 * most
                 events, other = larger(events, capacity), np.empty(capacity, np.int64)
             n = events_of_pixels(
-                pixels, count, block, curves, size, tree, threshold, contrast, edge, period_ns,
-                stack, state, gaps, events, n,
+                pixels, count, rows, inverse, curve, first, blocks, stray, tree, threshold,
+                contrast, edge, period_ns, stack, state, gaps, events, n,
             )  # fmt: skip
             if listed:
                 renew(

@@ -56,37 +56,8 @@ def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def excursion(t, curves):  # type: ignore[no-untyped-def]
-    """How far a marker strays in a block, px: (from its start, from the chord to its end).
-
-    The control points of its cubics hold the path, and distances from a point or from a segment
-    are convex, so the farthest control point bounds them. Growth counts like a move.
-    """
-    last = t.shape[0] - 1
-    x, y, r = curves[0, 0, 0], curves[1, 0, 0], curves[2, 0, 0]
-    dx, dy, dr = curves[0, 0, last] - x, curves[1, 0, last] - y, curves[2, 0, last] - r
-    square = dx * dx + dy * dy + dr * dr
-    scale = 1.0 / square if square > 0.0 else 0.0
-    far, far_r = dx * dx + dy * dy, abs(dr)
-    off, off_r = 0.0, 0.0
-    for k in range(last):
-        h = t[k + 1] - t[k]
-        for j in range(3):
-            # the control points of step k: its first one, and the two between its ends
-            a, b = h * (0.0, 1.0 / 3.0, 2.0 / 3.0)[j], h * (0.0, 0.0, 1.0 / 3.0)[j]
-            px = curves[0, 0, k] + a * curves[0, 1, k] + b * curves[0, 2, k] - x
-            py = curves[1, 0, k] + a * curves[1, 1, k] + b * curves[1, 2, k] - y
-            pr = curves[2, 0, k] + a * curves[2, 1, k] + b * curves[2, 2, k] - r
-            far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
-            s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
-            ex, ey = px - s * dx, py - s * dy
-            off, off_r = max(off, ex * ex + ey * ey), max(off_r, abs(pr - s * dr))
-    return np.sqrt(far) + far_r, np.sqrt(off) + off_r
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
-    """How far a pixel's distance from the rim must fall for a positive, and rise for a negative event.
+    """How far a pixel's distance must fall for a positive, and rise for a negative event, px.
 
     Outside the edge (`reach`) the pixel may be another marker's: then only the way to it counts.
     """
