@@ -1,91 +1,208 @@
-"""What simulating costs: contact, events and pictures, on one core.
+"""What simulating costs, and how exact it is: whole trials, contact, events and pictures.
 
-`ns_per_event` has noise, sorting and the pixels' reset in it, for a slide at 1 mm/s, whose markers
-hardly move; `ns_per_event_busy` is the same where every marker moves at about 200 px/s.
+`tracks_x_realtime` (one core) and `video_x_realtime` (two cores) take whole trials of the kinematic
+grid from the first motion to the commit, quality gates included; a trial's time is that of its
+motion program. `contact_864_s` is the contact of all 864 trials at the default level of physics.
+`ns_per_event` has noise, sorting and read-out in it, for a slide at 1 mm/s, whose markers hardly
+move; `ns_per_event_busy` is the same where every marker moves at about 200 px/s.
+`x_frame_emulator` compares a fast slide without noise with `benchmarks.emulator`, ours, drawing
+included on both sides. `event_time_p95_us` holds signal events, before the read-out, against the
+same trial with contact steps 16 times as fine; `readout_p95_us` is what the read-out's grid adds.
+`peak_mb` is the most memory that a process held that took one trial with its video.
 """
 
 from __future__ import annotations
 
+import itertools
+import subprocess
+import sys
+
 import numpy as np
 
-from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, peak_mb, rate, spread
-from benchmarks.slides import LENGTH_MM, hold_and_slide, press, seconds
-from rigs.mock.devices import build_mock
+from benchmarks.emulator import emulate
+from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
+from benchmarks.slides import CHUNK_S, LENGTH_MM, loads_of_slide
+from benchmarks.trials import stretch
+from rigs.mock.physics import springs_of
 from rigs.mock.settings import MockSettings
-from rigs.scene.events import EventOptics, MarkerSensor
-from rigs.scene.frames import FrameOptics, PlateView
-from storage.streams import F64
+from rigs.mock.skins import skin_of
+from rigs.scene.events import EventOptics, Events, MarkerSensor
+from rigs.scene.slides import run_slide
+from storage.streams import F64, I64
+
+TRIALS = 30
+"""Random trials of the grid; the same for every run."""
+FAST_MM_S = 1.6
+FINER = 16
 
 
-def measure(length_mm: float = LENGTH_MM, frames: int = 200, runs: int = RUNS) -> Figures:
-    """One slide with and without events, its events alone, and frames of 512 x 512 pixels."""
-    settings = MockSettings(seed=SEED)
-    devices = build_mock(settings)
-    loads = _loads(length_mm)
-    optics = EventOptics(**settings.event_camera.model_dump())
-    sensor = MarkerSensor(optics, devices.world.skin.layout_mm, SEED)
-    step_ns = devices.world.step_ns
-    busy = loads[:2000].copy()
-    busy[:, ::3] = 0.1 * np.sin(2 * np.pi * 5.0 * 1e-9 * step_ns * np.arange(len(busy)))[:, None]
-
-    def tracks() -> None:
-        press(devices, length_mm)
-        hold_and_slide(devices, length_mm)
-
-    def contact() -> None:
-        press(devices, length_mm)
-        hold_and_slide(devices, length_mm, events=False)
-
-    def sense(loads: F64) -> int:
-        sensor.reset(loads[0], SEED)
-        # in chunks of about a tenth of a second, as a rig reads
-        return sum(
-            len(sensor.sense(loads[first : first + 97], first, step_ns)[0])
-            for first in range(0, len(loads) - 1, 96)
-        )
-
-    view = PlateView(FrameOptics(px_per_mm=12.0), 512, 512)
-    places = np.linspace(-3.0, 3.0, frames)[:, None, None] * np.array([1.0, 0.2])
-    tips = devices.world.skin.layout_mm[None] + places
-    images = np.empty((10, 512, 512), np.uint8)
-
-    def draw() -> None:
-        for first in range(0, frames, len(images)):
-            part = tips[first : first + len(images)]
-            number = np.arange(first, first + len(part), dtype=np.int64)
-            view.draw(images[: len(part)], part, None, number, SEED)
-
-    with one_core():
-        taken = alternate(
-            runs, tracks=tracks, contact=contact, sense=lambda: sense(loads),
-            busy=lambda: sense(busy), draw=draw,
-        )  # fmt: skip
-    count, many = sense(loads), sense(busy)
-    # both begin with the press, so its time counts on both sides
-    simulated = seconds(length_mm) + _before_s(length_mm)
+def measure(
+    runs: int = RUNS, trials: int = TRIALS, length_mm: float = LENGTH_MM, grid: int = 864
+) -> Figures:
+    """All figures; fewer `runs`, `trials` (0: none) and slides of the `grid` for a quick look."""
+    whole = (
+        {
+            **_whole(runs, trials),
+            "peak_mb": _peak_mb("mock"),
+            "peak_tracks_mb": _peak_mb("rehearsal"),
+        }
+        if trials
+        else {}
+    )
     return {
-        **rate("tracks_x_realtime", simulated, taken["tracks"]),
-        **rate("contact_x_realtime", simulated, taken["contact"]),
-        **spread("ns_per_event", [value * 1e9 / count for value in taken["sense"]]),
-        **spread("ns_per_event_busy", [value * 1e9 / many for value in taken["busy"]]),
-        "events_per_slide": float(count),
-        **spread("frame_ms_512", [value * 1e3 / frames for value in taken["draw"]]),
-        "peak_mb": peak_mb(),
+        **whole,
+        **_contact(runs, grid),
+        **_events(runs, length_mm),
+        **_precision(length_mm),
     }
 
 
-def _before_s(length_mm: float) -> float:
-    """Simulated time of a trial before its recording."""
-    devices = build_mock(MockSettings(seed=SEED))
-    press(devices, length_mm)
-    press(devices, length_mm)  # as in every run but the first: from where the last one ended
-    return devices.world.now_ns * 1e-9
+def _whole(runs: int, trials: int) -> Figures:
+    count = max(trials // runs, 1)
+    seconds: dict[str, list[float]] = {"tracks": [], "video": []}
+    # shares of the sample in turn, so that every trial is taken once and rounds can be compared
+    with (
+        stretch("rehearsal", count * (runs + 1)) as tracks,
+        stretch("mock", runs + 1) as video,
+    ):
+        amounts: dict[str, list[float]] = {"tracks": [], "video": []}
+
+        def one() -> None:
+            with one_core():
+                amounts["tracks"].append(tracks.take(count))
+
+        def two() -> None:
+            amounts["video"].append(video.take(1))
+
+        taken = alternate(runs, tracks=one, video=two)
+        for name, values in amounts.items():
+            seconds[name] = [a / b for a, b in zip(values[1:], taken[name], strict=True)]
+    return {
+        **spread("tracks_x_realtime", seconds["tracks"]),
+        **spread("video_x_realtime", seconds["video"]),
+    }
 
 
-def _loads(length_mm: float) -> F64:
-    """Forces on every tip at every step of one slide."""
-    devices = build_mock(MockSettings(seed=SEED))
-    press(devices, length_mm)
-    kept = devices.world.keep_loads()
-    hold_and_slide(devices, length_mm, events=False)
-    return kept.rows(kept.base, kept.end).copy()
+def _contact(runs: int, grid: int) -> Figures:
+    settings = MockSettings(seed=SEED)
+    skin = skin_of(settings)
+    conditions = list(
+        itertools.product(
+            (2.4, 2.6, 2.8, 3.0, 3.2, 3.4), (0.6, 0.8, 1.0, 1.2, 1.4, 1.6), range(0, 360, 45), "123"
+        )
+    )[:grid]
+
+    def contact() -> None:
+        for seed, (depth, speed, direction, _) in enumerate(conditions):
+            run_slide(springs_of(settings, skin, seed), depth, speed, direction)
+
+    with one_core():
+        taken = alternate(runs, contact=contact)
+    return spread(f"contact_{grid}_s", taken["contact"])
+
+
+def _events(runs: int, length_mm: float) -> Figures:
+    settings = MockSettings(seed=SEED)
+    layout = skin_of(settings).layout_mm
+    sensor = MarkerSensor(EventOptics(**settings.event_camera.model_dump()), layout, SEED)
+    slow = loads_of_slide(settings, length_mm)
+    t_ns = np.arange(2001, dtype=np.int64) * 1_000_000
+    shake = 0.1 * np.sin(2 * np.pi * 5.0 * 1e-9 * t_ns)
+    moved = np.repeat(slow[1][:1], 2001, axis=0)
+    moved[:, ::3] += shake[:, None]
+    busy = (t_ns, moved)
+    quiet = EventOptics(
+        **{**settings.event_camera.model_dump(), "noise_hz": 0.0, "hot_pixels": 0, "readout_hz": 0}
+    )
+    silent = MarkerSensor(quiet, layout, SEED)
+    fast = loads_of_slide(settings, length_mm, FAST_MM_S)
+    # frames are drawn from the same path, at every millisecond
+    every = np.arange(fast[0][0], fast[0][-1] + 1, 1_000_000, dtype=np.int64)
+    dense = np.stack([np.interp(every, fast[0], column) for column in fast[1].T], axis=1)
+    frames = np.ascontiguousarray(np.transpose(silent.path(dense), (2, 0, 1)))
+    counts: dict[str, int] = {}
+
+    def sense(name: str, device: MarkerSensor, rows: tuple[I64, F64]) -> None:
+        counts[name] = sum(len(part[0]) for part in _sensed(device, rows))
+
+    def frame_based() -> None:
+        counts["frames"] = len(emulate(frames, quiet, silent.threshold)[0])
+
+    with one_core():
+        taken = alternate(
+            runs,
+            slow=lambda: sense("slow", sensor, slow),
+            busy=lambda: sense("busy", sensor, busy),
+        )  # fmt: skip
+        rivals = alternate(
+            min(runs, 3), ours=lambda: sense("fast", silent, fast), frames=frame_based
+        )
+    return {
+        **spread("ns_per_event", [value * 1e9 / counts["slow"] for value in taken["slow"]]),
+        **spread("ns_per_event_busy", [value * 1e9 / counts["busy"] for value in taken["busy"]]),
+        "events_per_slide": float(counts["slow"]),
+        **ratio("x_frame_emulator", rivals["frames"], rivals["ours"]),
+        **rate("emulator_x_realtime", len(frames) * 1e-3, rivals["frames"]),
+        "emulator_events_share": counts["frames"] / counts["fast"],
+    }
+
+
+def _sensed(device: MarkerSensor, rows: tuple[I64, F64]) -> list[Events]:
+    """A slide's events in chunks of about a tenth of a second, as a rig reads."""
+    t_ns, loads = rows
+    device.reset(loads[0], SEED)
+    block = round(CHUNK_S * 1e9) // device.optics.block_ns * device.optics.block_ns
+    borders = np.arange(t_ns[0] // block + 1, t_ns[-1] // block + 1) * block
+    cuts = [0, *np.searchsorted(t_ns, borders).tolist(), len(t_ns) - 1]
+    return [
+        device.sense(loads[a : b + 1], t_ns[a : b + 1])
+        for a, b in itertools.pairwise(sorted(set(cuts)))
+    ]
+
+
+def _precision(length_mm: float) -> Figures:
+    """Event times against contact steps 16 times as fine, and what the read-out adds."""
+    settings = MockSettings(seed=SEED)
+    layout = skin_of(settings).layout_mm
+    optics = {**settings.event_camera.model_dump(), "noise_hz": 0.0, "hot_pixels": 0}
+    exact = MarkerSensor(EventOptics(**{**optics, "readout_hz": 0}), layout, SEED)
+    usual, scanned = (
+        loads_of_slide(settings, length_mm),
+        MarkerSensor(EventOptics(**optics), layout, SEED),
+    )
+    fine = loads_of_slide(settings, length_mm, finer=FINER)
+    a = _by_pixel(_sensed(exact, usual))
+    b = _by_pixel(_sensed(exact, fine))
+    c = _by_pixel(_sensed(scanned, usual))
+    error, shared = _apart_us(a, b)
+    late, _ = _apart_us(a, c)
+    return {
+        "event_time_p50_us": float(np.percentile(error, 50)),
+        "event_time_p95_us": float(np.percentile(error, 95)),
+        "events_matched_share": shared,
+        "readout_p95_us": float(np.percentile(late, 95)),
+    }
+
+
+def _by_pixel(parts: list[Events]) -> tuple[I64, I64]:
+    """A key of pixel, polarity and ordinal there for each event, and its time, ns."""
+    t_ns, x, y, p = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    pixel = (y.astype(np.int64) << 13) | (x.astype(np.int64) << 1) | p
+    order = np.lexsort((t_ns, pixel))
+    pixel, t_ns = pixel[order], t_ns[order]
+    first = np.searchsorted(pixel, pixel, side="left")
+    return (pixel << 20) | (np.arange(len(pixel)) - first), t_ns
+
+
+def _apart_us(a: tuple[I64, I64], b: tuple[I64, I64]) -> tuple[F64, float]:
+    _, here, there = np.intersect1d(a[0], b[0], return_indices=True)
+    apart: F64 = np.abs(a[1][here] - b[1][there]) * 1e-3
+    return apart, len(here) / max(len(a[0]), len(b[0]))
+
+
+def _peak_mb(rig: str) -> float:
+    found = subprocess.run(
+        [sys.executable, "-m", "benchmarks.trials", rig],
+        capture_output=True, text=True, check=True, timeout=300,
+    )  # fmt: skip
+    return float(found.stdout.split()[-1])

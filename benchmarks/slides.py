@@ -13,44 +13,57 @@ from benchmarks.measure import SEED
 from rigs.capabilities import Segment
 from rigs.mock.devices import MockDevices, build_mock
 from rigs.mock.settings import MockSettings
-from storage.streams import EventChunk
+from storage.streams import F64, I64, EventChunk
 
 DEPTH_MM, SPEED_MM_S, LENGTH_MM = 2.8, 1.0, 15.0
 HOLD_S, CHUNK_S = 2.0, 0.1
 
 
-def press(devices: MockDevices, length_mm: float) -> None:
-    """Begin a trial: press at one end of the slide and let the skin settle."""
+def press(devices: MockDevices, length_mm: float, finer: int = 1) -> None:
+    """Begin a trial: press at one end of the slide and let the skin settle.
+
+    `finer`: divides the step of the contact.
+    """
     devices.arm.connect()
     devices.begin_trial(SEED)
+    devices.world.physics.step_ns //= finer
     _go(devices, -length_mm / 2, -5.0, 20.0)
     _go(devices, -length_mm / 2, DEPTH_MM, 2.0)
     devices.clock.wait(1.0)
     devices.world.advance()
 
 
-def hold_and_slide(devices: MockDevices, length_mm: float, events: bool = True) -> EventChunk:
-    """What is recorded of a trial: two seconds of hold, and the slide at 1 mm/s."""
+def loads_of_slide(
+    settings: MockSettings, length_mm: float, speed_mm_s: float = SPEED_MM_S, finer: int = 1
+) -> tuple[I64, F64]:
+    """Times (ns) and forces on every tip at every row of a hold and slide, (m,) and (m, 3 n)."""
+    devices = build_mock(settings)
+    press(devices, length_mm, finer)
+    kept = devices.world.keep_loads()
+    hold_and_slide(devices, length_mm, events=False, speed_mm_s=speed_mm_s)
+    t_ns, loads = kept.between(kept.begin_ns, kept.end_ns)
+    return t_ns.copy(), loads.copy()
+
+
+def hold_and_slide(
+    devices: MockDevices, length_mm: float, events: bool = True, speed_mm_s: float = SPEED_MM_S
+) -> EventChunk:
+    """What is recorded of a trial: two seconds of hold, and the slide."""
     parts: list[EventChunk] = []
     if events:
         devices.events.start()
     devices.sync.start(100.0, 4321)
-    left = round((HOLD_S + length_mm / SPEED_MM_S) / CHUNK_S)
+    left = round((HOLD_S + length_mm / speed_mm_s) / CHUNK_S)
     for chunk in range(left):
         if chunk == round(HOLD_S / CHUNK_S):
             target = devices.world.plane.pose(length_mm / 2, 0.0, DEPTH_MM)
-            devices.arm.start([Segment(target, SPEED_MM_S)])
+            devices.arm.start([Segment(target, speed_mm_s)])
         devices.clock.wait(CHUNK_S)
         parts.append(devices.events.read() if events else _nothing(devices))
     devices.events.stop()
     parts.append(devices.events.read())
     devices.sync.stop()
     return _joined(parts)
-
-
-def seconds(length_mm: float) -> float:
-    """How long `hold_and_slide` lasts in simulated time."""
-    return HOLD_S + length_mm / SPEED_MM_S
 
 
 @cache

@@ -35,6 +35,7 @@ from rigs.scene.springs import (
     BRANCH_X,
     BRANCH_Y,
     COMPLIANCE,
+    EARLIER,
     FORCE_X,
     FORCE_Y,
     FREE,
@@ -166,19 +167,24 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     along, bending = table[i, ALONG], table[i, BENDING]
     shortening, compliance = table[i, SHORTER], table[i, COMPLIANCE]
     maxwell = law.maxwell
+    was = state[i, INDENTATION]
     pressed = (
         along * deep + state[i, NORMAL_BRANCH] * decay
-        + maxwell * along * gain * (deep - state[i, INDENTATION])
+        + maxwell * along * gain * (deep - (was if was > 0.0 else 0.0))
     )  # fmt: skip
     if deep <= 0.0 or pressed <= 0.0:
         # clear of the plate, or the skin comes back more slowly than the sensor
         return FREE, base_x, base_y, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
-    mode = state[i, MODE]
+    mode, place_x, place_y = state[i, MODE], state[i, PLACE_X], state[i, PLACE_Y]
+    old_x, old_y = state[i, BASE_X] - place_x, state[i, BASE_Y] - place_y
+    touched = 0.0
     if mode == FREE:
-        # touching: the tip stands under its base
-        return STUCK, base_x, base_y, 0.0, 0.0, pressed, 0.0, 0.0, -1.0
-    old_x, old_y = state[i, BASE_X] - state[i, PLACE_X], state[i, BASE_Y] - state[i, PLACE_Y]
-    new_x, new_y = base_x - state[i, PLACE_X], base_y - state[i, PLACE_Y]
+        # the tip stands under its base when it touches, on the way there in this step
+        touched = was / (was - deep) if was < 0.0 else 1.0
+        place_x = state[i, BASE_X] + touched * (base_x - state[i, BASE_X]) if was < 0.0 else base_x
+        place_y = state[i, BASE_Y] + touched * (base_y - state[i, BASE_Y]) if was < 0.0 else base_y
+        old_x, old_y = 0.0, 0.0
+    new_x, new_y = base_x - place_x, base_y - place_y
     branch_x, branch_y = state[i, BRANCH_X] * decay, state[i, BRANCH_Y] * decay
     soft = table[i, ACROSS] * (maxwell * gain + law.damping_s / h)
     stretch = np.sqrt(new_x * new_x + new_y * new_y)
@@ -197,23 +203,14 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     limit = grip * normal * (1.0 if keeps_on else static)
     size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
     if size <= limit * _ROUNDING:
-        return (
-            STUCK,
-            state[i, PLACE_X],
-            state[i, PLACE_Y],
-            trial_x,
-            trial_y,
-            normal,
-            bent,
-            0.0,
-            -1.0,
-        )
+        return STUCK, place_x, place_y, trial_x, trial_y, normal, bent, 0.0, -1.0
     share, left = -1.0, 1.0
     if not keeps_on:
         share = _leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
         left = 1.0 - share
         from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
         before += share * (grip * normal - before)
+        share = touched + (1.0 - touched) * share
     if law.exact_turns:
         unit_x, unit_y = _turned(
             from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
@@ -227,9 +224,15 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     low, high = 0.0, bent
     bent = min(state[i, BENT], bent)
     slip, limit, stretch = 0.0, 0.0, 0.0
-    # speed at the end of the step, from the means of this one and the last: second order
-    slid_s = left * h
-    ahead = slid_s / (slid_s + state[i, SLID_S]) if keeps_on and state[i, SLID_S] > 0.0 else 0.0
+    # speed at the end of the step: a line, or a parabola, through the mean speeds of the last steps
+    slid_s = left * (1.0 - touched) * h
+    weight, rest = 1.0, 0.0
+    if keeps_on and state[i, SLID_S] > 0.0:
+        ahead = slid_s / (slid_s + state[i, SLID_S])
+        weight, rest = 1.0 + ahead, -ahead * state[i, SPEED]
+        if state[i, SLID_S] == slid_s and state[i, EARLIER] >= 0.0:
+            weight = 11.0 / 6.0
+            rest = state[i, EARLIER] / 3.0 - 7.0 / 6.0 * state[i, SPEED]
     for _ in range(_ITERATIONS):
         spring, normal, slope, normal_slope = _column(bent, bending, shortening, pressed, along)
         stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
@@ -238,10 +241,10 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         straight = (slip_x * towards_x + slip_y * towards_y) / slip if slip > 0.0 else 1.0
         grip, grip_slope = grip_at(field, i, state[i, PATH] + slip)
         if law.strengthening != 0.0 and slid_s > 0.0:
-            speed = (1.0 + ahead) * slip / slid_s - ahead * state[i, SPEED]
+            speed = weight * slip / slid_s + rest
             if speed > 0.0:
                 faster = 1.0 + law.strengthening * np.log1p(speed / law.weak_mm_s)
-                rate = law.strengthening / (law.weak_mm_s + speed) * (1.0 + ahead) / slid_s
+                rate = law.strengthening / (law.weak_mm_s + speed) * weight / slid_s
                 grip_slope = grip_slope * faster + grip * rate
                 grip *= faster
         limit = grip * normal
@@ -291,13 +294,13 @@ def move_tips(table, field, law, state, sensor, plate_y, start_s, h, decay, gain
             table, field, law, state, i, base_x, base_y, deep, h, decay, gain
         )
         if mode == FREE:
-            deep = max(deep, 0.0)
             state[i, BRANCH_X] = state[i, BRANCH_Y] = 0.0
-            state[i, NORMAL_BRANCH] = -table[i, ALONG] * deep
+            state[i, NORMAL_BRANCH] = -table[i, ALONG] * max(deep, 0.0)
         else:
             soft = law.maxwell * gain
-            state[i, NORMAL_BRANCH] = state[i, NORMAL_BRANCH] * decay + (
-                soft * table[i, ALONG] * (deep - state[i, INDENTATION])
+            was = state[i, INDENTATION] if state[i, INDENTATION] > 0.0 else 0.0
+            state[i, NORMAL_BRANCH] = state[i, NORMAL_BRANCH] * decay + soft * table[i, ALONG] * (
+                deep - was
             )
             if state[i, MODE] == FREE:
                 state[i, BASE_X] = state[i, PLACE_X] = x
@@ -313,13 +316,14 @@ def move_tips(table, field, law, state, sensor, plate_y, start_s, h, decay, gain
         state[i, PLACE_X], state[i, PLACE_Y] = x, y
         state[i, FORCE_X], state[i, FORCE_Y] = force_x, force_y
         state[i, NORMAL], state[i, BENT] = normal, bent
-        state[i, SPEED] = state[i, SLID_S] = 0.0
         if share >= 0.0:
             state[i, SLIPPED] = start_s + share * h
-        if slip > 0.0:
-            state[i, PATH] += slip
-            state[i, SLID_S] = h * (1.0 - max(share, 0.0))
-            state[i, SPEED] = slip / state[i, SLID_S] if state[i, SLID_S] > 0.0 else 0.0
+        slid_s = h * (1.0 - max(share, 0.0)) if slip > 0.0 else 0.0
+        earlier = state[i, SPEED] if slid_s > 0.0 and state[i, SLID_S] == slid_s else -1.0
+        state[i, EARLIER] = earlier
+        state[i, SLID_S] = slid_s
+        state[i, SPEED] = slip / slid_s if slid_s > 0.0 else 0.0
+        state[i, PATH] += slip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -20,26 +20,26 @@ _NEWTON = 1e-4  # of the block: after a step as small as that the next error is 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_at(t, rows, guess):  # type: ignore[no-untyped-def]
-    """The step of the path that holds the time `t`, looked for from `guess` on."""
+def step_at(t, zero, rows, guess):  # type: ignore[no-untyped-def]
+    """The step of the path that holds the time `t` after `zero`, looked for from `guess` on."""
     last = rows.shape[0] - 2
     k = min(max(guess, 0), last)
-    while k < last and t > rows[k + 1]:
+    while k < last and t > rows[k + 1] - zero:
         k += 1
-    while k > 0 and t < rows[k]:
+    while k > 0 and t < rows[k] - zero:
         k -= 1
     return k
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_at(x, y, t, k, rows, inverse, curve):  # type: ignore[no-untyped-def]
-    """Distance of a pixel from the rim at time `t` in step `k`, px, and its rate, px/ns.
+def distance_at(x, y, t, k, zero, rows, inverse, curve):  # type: ignore[no-untyped-def]
+    """Distance of a pixel from the rim at a time `t` after `zero`, in step k, px, and its rate.
 
     Returns:
         the distance, and the rate as a product of two: the rate times the distance from the
         centre, and that distance (of which the caller may spare the division).
     """
-    tau = t - rows[k]
+    tau = t - (rows[k] - zero)
     s = tau * inverse[k]
     dx = x - (curve[0, 0, k] + tau * (curve[0, 1, k] + s * (curve[0, 2, k] + s * curve[0, 3, k])))
     dy = y - (curve[1, 0, k] + tau * (curve[1, 1, k] + s * (curve[1, 2, k] + s * curve[1, 3, k])))
@@ -165,7 +165,9 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
             ):
                 ga = gb
                 continue
-            final, length, base = gb, rows[last] - rows[begin], 4 * begin
+            # times count from the block's begin, wherever it lies in `rows`
+            final, zero, base = gb, rows[begin], 4 * begin
+            length, start = rows[last] - zero, np.int64(zero + origin)
             size = 1
             while size < last - begin:
                 size *= 2
@@ -180,7 +182,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 # the end of a piece is the beginning of the next one, to the bit
                 if node > 0:
                     k, end = int(sa), min(int(sb), last)
-                    a, b = rows[k], rows[end]
+                    a, b = rows[k] - zero, rows[end] - zero
                     dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
                     away = np.sqrt(dx * dx + dy * dy)
                     gb = away - curve[2, 0, end]
@@ -188,11 +190,11 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 else:
                     k = -node
                     end, h = k + 1, rows[k + 1] - rows[k]
-                    a, b = rows[k] + sa * h, rows[k] + sb * h
+                    a, b = rows[k] - zero + sa * h, rows[k] - zero + sb * h
                     if sb == 1.0:
-                        b, gb = rows[k + 1], _at_row(x, y, k + 1, curve)
+                        b, gb = rows[k + 1] - zero, _at_row(x, y, k + 1, curve)
                     else:
-                        gb = distance_at(x, y, b, k, rows, inverse, curve)[0]
+                        gb = distance_at(x, y, b, k, zero, rows, inverse, curve)[0]
                     slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
                 on, off = state[y, x, ON], state[y, x, OFF]
                 if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
@@ -224,8 +226,8 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 rise, step, level = gb - ga, threshold[y, x], state[y, x, LEVEL]
                 # on a monotone piece time is a function of distance; a cubic through both ends is
                 # the first guess, after which a smooth path needs one step of Newton's method
-                _, slope_a, away_a = distance_at(x, y, a, k, rows, inverse, curve)
-                _, slope_b, away_b = distance_at(x, y, b, end - 1, rows, inverse, curve)
+                _, slope_a, away_a = distance_at(x, y, a, k, zero, rows, inverse, curve)
+                _, slope_b, away_b = distance_at(x, y, b, end - 1, zero, rows, inverse, curve)
                 scale_a = rise * away_a / slope_a if slope_a * rise > 0.0 else b - a
                 scale_b = rise * away_b / slope_b if slope_b * rise > 0.0 else b - a
                 begun = a
@@ -240,8 +242,8 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                         low, high = begun, b
                         t = min(max(t, low), high)
                         for _ in range(100):
-                            k = step_at(t, rows, k)
-                            value, slope, away = distance_at(x, y, t, k, rows, inverse, curve)
+                            k = step_at(t, zero, rows, k)
+                            value, slope, away = distance_at(x, y, t, k, zero, rows, inverse, curve)
                             miss = value - target
                             if (miss > 0.0) == falling:
                                 low = t
@@ -265,7 +267,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                         state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
                         target = rim_of(level - step, contrast, edge)
                         state[y, x, OFF] = target
-                    out[n] = (np.int64(t + origin) << 25) | code | np.int64(falling)
+                    out[n] = ((start + np.int64(t)) << 25) | code | np.int64(falling)
                     n += 1
                     begun = t
                 state[y, x, LEVEL] = level

@@ -61,18 +61,20 @@ def dark_pixels(threshold, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def see_discs(discs, contrast, edge, threshold, state):  # type: ignore[no-untyped-def]
+def see_discs(discs, contrast, edge, threshold, state, seen):  # type: ignore[no-untyped-def]
     """Let the pixels of `state` that see one of `discs` take its image as their reference.
 
     Args:
         discs: column, row and radius, px, (n, 3).
         threshold: of every pixel, (height, width).
         state: of every pixel, written where a disc reaches.
+        seen: rectangles in which discs have been, see `darken`; widened.
     """
     height, width = threshold.shape
     for i in range(discs.shape[0]):
         column, row, radius = discs[i, 0], discs[i, 1], discs[i, 2]
         reach = radius + CUT * edge
+        widen(i, column, row, reach + 1.0, seen)
         for y in range(max(int(row - reach), 0), min(int(row + reach) + 2, height)):
             for x in range(max(int(column - reach), 0), min(int(column + reach) + 2, width)):
                 dx, dy = x - column, y - row
@@ -84,3 +86,30 @@ def see_discs(discs, contrast, edge, threshold, state):  # type: ignore[no-untyp
                     state[y, x, LAST] = rim_of(here, contrast, edge)
                     state[y, x, ON] = rim_of(here + step, contrast, edge)
                     state[y, x, OFF] = rim_of(here - step, contrast, edge)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def darken(seen, dark, state):  # type: ignore[no-untyped-def]
+    """Let pixels forget what they saw.
+
+    Args:
+        seen: rectangles in which discs have been: left, right, top, bottom, px, (n, 4); emptied.
+        dark: state of pixels that see no disc, (height, width, 4).
+        state: of every pixel, written inside the rectangles.
+    """
+    height, width = state.shape[0], state.shape[1]
+    for i in range(seen.shape[0]):
+        if seen[i, 0] <= seen[i, 1]:
+            left, right = max(int(seen[i, 0]), 0), min(int(seen[i, 1]) + 2, width)
+            for y in range(max(int(seen[i, 2]), 0), min(int(seen[i, 3]) + 2, height)):
+                for x in range(left, right):
+                    for c in range(4):
+                        state[y, x, c] = dark[y, x, c]
+        seen[i, 0], seen[i, 1], seen[i, 2], seen[i, 3] = np.inf, -np.inf, np.inf, -np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def widen(i, column, row, reach, seen):  # type: ignore[no-untyped-def]
+    """Let rectangle i of `seen` hold all within `reach` px of a place."""
+    seen[i, 0], seen[i, 1] = min(seen[i, 0], column - reach), max(seen[i, 1], column + reach)
+    seen[i, 2], seen[i, 3] = min(seen[i, 2], row - reach), max(seen[i, 3], row + reach)

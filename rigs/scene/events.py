@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.edges import CUT, dark_pixels, see_discs
+from rigs.scene.edges import CUT, dark_pixels, darken, see_discs
 from rigs.scene.marker_path import markers_in_image
 from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
 from rigs.scene.randomness import generator
@@ -83,6 +83,7 @@ class MarkerSensor:
         )  # fmt: skip
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
         self._state = self._dark.copy()
+        self._seen: F64 = np.tile([np.inf, -np.inf, np.inf, -np.inf], (len(self._layout_mm), 1))
         self._fired_ns = np.empty(shape, np.int64)
         self._lists = _empty_lists(len(self._layout_mm), 0)
         self._pending = np.empty(0, np.int64)
@@ -118,8 +119,10 @@ class MarkerSensor:
         optics = self.optics
         self._trial, self._bin = seed, None
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
-        self._state[:] = self._dark
-        see_discs(discs, optics.contrast, optics.edge_px, self.threshold, self._state)
+        darken(self._seen, self._dark, self._state)
+        see_discs(
+            discs, optics.contrast, optics.edge_px, self.threshold, self._state, self._seen
+        )  # fmt: skip
         self._fired_ns[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
@@ -148,7 +151,7 @@ class MarkerSensor:
         *events, self._pending = trace(
             self.path(loads), t_ns, optics.block_ns, optics.path == "chord", optics.contrast,
             optics.edge_px, round(optics.refractory_us * 1e3), optics.period_ns, self._phase_ns,
-            self._lowest, self.threshold, self._state, self._fired_ns, *self._lists,
+            self._lowest, self.threshold, self._state, self._fired_ns, self._seen, *self._lists,
             self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])), self._noise.leak_below,
         )  # fmt: skip
         when, x, y, p = events

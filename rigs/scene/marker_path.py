@@ -1,9 +1,9 @@
 """Where the markers are between the rows that the contact model gives: cubic curves in time.
 
 The time of an event is as exact as the path. At 3 px/s a microsecond is 3e-6 px, which straight
-lines between rows miss by far; a cubic through the rows with slopes from three of them is of third
-order at the ends of a block and better inside. A block never looks past its own rows, so that
-cutting a stream at the borders of blocks changes nothing.
+lines between rows miss by far; cubic Hermite curves with slopes from four rows are of fourth order.
+A block never looks past its own rows, so that cutting a stream at the borders of blocks changes
+nothing.
 """
 
 from __future__ import annotations
@@ -42,51 +42,77 @@ def markers_in_image(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_block(t, path, i, row, first, last, chord, curve, inverse):  # type: ignore[no-untyped-def]
-    """Marker i as cubics between the rows of one block, which looks at no other rows.
+def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-untyped-def]
+    """What rows count for the slope at each row of a block, which looks at no other rows.
 
-    The slope at a row is the parabola's through it and its neighbours, (h1 d0 + h0 d1) / (h0 + h1)
-    for steps h0, h1 and differences d0, d1; at both ends it is the slope of the parabola through
-    the three outermost rows; two rows are joined by a straight line.
+    The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
+    block a one-sided one; through all of them where a block has fewer.
+
+    Args:
+        t: times of rows, ns, (r,).
+        first, last: the block's first and last row in `t`.
+        shift: those of row k stand in column k + shift, as a border's row has one of each block.
+        inverse: 1 over the length of each step, (r,), written.
+        weights: (4, columns), 1/ns, of the rows from `nearest_row` on; written.
+    """
+    points = min(last - first + 1, 4)
+    for k in range(first, last):
+        inverse[k] = 1.0 / (t[k + 1] - t[k])
+    for k in range(first, last + 1):
+        low = nearest_row(k, first, last)
+        own = 0.0
+        for j in range(points):
+            weights[j, k + shift] = 0.0
+            if low + j != k:
+                weight = 1.0 / (t[low + j] - t[k])
+                for m in range(points):
+                    if m != j and low + m != k:
+                        weight *= (t[k] - t[low + m]) / (t[low + j] - t[low + m])
+                weights[j, k + shift] = weight
+                own -= weight
+        weights[k - low, k + shift] = own
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def nearest_row(k, first, last):  # type: ignore[no-untyped-def]
+    """The first of the rows through which the slope at row k is taken."""
+    return max(min(k - 1, last - 3), first)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):  # type: ignore[no-untyped-def]
+    """Marker i as cubics between the rows of one block.
 
     Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
     is curve[0] + tau (curve[1] + s (curve[2] + s curve[3])), px.
 
     Args:
-        t: times of rows, ns, (r,).
         path: column, row and radius of each marker, (n, 3, m).
-        row: row of `path` that belongs to t[first].
-        first, last: the block's first and last row in `t`.
+        row: row of `path` that is the block's first.
+        first, last: the block's first and last row.
         chord: join rows by straight lines.
+        shift, inverse, weights: of `slope_weights`.
         curve: (3, 4, r), written for steps `first` to `last` - 1; the places also at `last`.
-        inverse: 1 over the length of each step, (r,), written.
     """
-    for k in range(first, last):
-        inverse[k] = 1.0 / (t[k + 1] - t[k])
-    straight = chord or last - first < 2
+    points = min(last - first + 1, 4)
     for c in range(3):
         for k in range(first, last + 1):
             curve[c, 0, k] = path[i, c, row + k - first]
+        for k in range(first, last + 1):
+            slope = 0.0
+            low = nearest_row(k, first, last)
+            for j in range(points):
+                # differences: of what stands still, the slope is 0 to the bit
+                slope += weights[j, k + shift] * (curve[c, 0, low + j] - curve[c, 0, k])
+            curve[c, 1, k] = slope
         for k in range(first, last):
-            curve[c, 1, k] = (curve[c, 0, k + 1] - curve[c, 0, k]) * inverse[k]
-            curve[c, 2, k] = curve[c, 3, k] = 0.0
-        if not straight:
-            here, after = curve[c, 1, first], curve[c, 1, first + 1]
-            share = (t[first + 1] - t[first]) / (t[first + 2] - t[first])
-            slope, before = here + share * (here - after), here
-            for k in range(first, last):
-                here = curve[c, 1, k]
-                if k + 1 < last:
-                    after = curve[c, 1, k + 1]
-                    share = (t[k + 1] - t[k]) / (t[k + 2] - t[k])
-                    end = here + share * (after - here)
-                else:
-                    share = (t[last] - t[k]) / (t[last] - t[k - 1])
-                    end = here + share * (here - before)
-                curve[c, 1, k] = slope
-                curve[c, 2, k] = 3.0 * here - 2.0 * slope - end
-                curve[c, 3, k] = slope + end - 2.0 * here
-                slope, before = end, here
+            rate = (curve[c, 0, k + 1] - curve[c, 0, k]) * inverse[k]
+            if chord:
+                curve[c, 1, k], curve[c, 2, k], curve[c, 3, k] = rate, 0.0, 0.0
+            else:
+                slope, after = curve[c, 1, k], curve[c, 1, k + 1]
+                curve[c, 2, k] = 3.0 * rate - 2.0 * slope - after
+                curve[c, 3, k] = slope + after - 2.0 * rate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -14,7 +14,6 @@ is never read.
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit
 
 from rigs.scene.sorting import sort_packed
@@ -106,7 +105,9 @@ def read_scans(  # type: ignore[no-untyped-def]
     sort_packed(keys, inside, other, low, low + y_bits + x_bits + bits_for(past))
     for k in range(inside):
         # all that is not in the cache is asked for at once, and not one pixel after the other
-        other[k] = fired[_row_of(keys[k] >> low, y_bits), _column_of(keys[k] >> low, y_bits, x_bits)]
+        other[k] = fired[
+            _row_of(keys[k] >> low, y_bits), _column_of(keys[k] >> low, y_bits, x_bits)
+        ]
     for k in range(inside):
         key = keys[k]
         t = base_ns + ((key & mask) >> 1)

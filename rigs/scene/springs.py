@@ -30,8 +30,8 @@ LEVELS = (1, 2, 3)
 LAYOUT_X, LAYOUT_Y, GAP, ALONG, BENDING, COMPLIANCE, ACROSS, SHORTER = range(8)
 (
     PLACE_X, PLACE_Y, BASE_X, BASE_Y, BRANCH_X, BRANCH_Y, FORCE_X, FORCE_Y,
-    NORMAL, NORMAL_BRANCH, INDENTATION, BENT, PATH, SLIPPED, MODE, SPEED, SLID_S,
-) = range(17)  # fmt: skip
+    NORMAL, NORMAL_BRANCH, INDENTATION, BENT, PATH, SLIPPED, MODE, SPEED, SLID_S, EARLIER,
+) = range(18)  # fmt: skip
 
 
 class Law(NamedTuple):
@@ -94,8 +94,9 @@ class Tips:
     """The state of n tips; the kernels write it in place, the properties are views."""
 
     state: F64
-    """A row each, columns as named in this module, (n, 17); the last two are the mean speed of
-    sliding in the last step (mm/s) and how long the tip slid in it (s)."""
+    """A row each, columns as named in this module, (n, 18); the last three are the mean speed
+    of sliding in the last step (mm/s), how long the tip slid in it (s), and the mean speed in the
+    step before if that was as long (else negative)."""
 
     @property
     def place(self) -> F64:
@@ -144,8 +145,9 @@ class Tips:
 
 def new_tips(n: int) -> Tips:
     """`n` tips clear of the plate."""
-    state = np.zeros((n, 17))
+    state = np.zeros((n, 18))
     state[:, SLIPPED] = np.nan
+    state[:, INDENTATION] = np.nan  # where it came from is not known
     return Tips(state)
 
 

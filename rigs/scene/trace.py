@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 
 from rigs.scene.crossings import events_of_pixels
-from rigs.scene.edges import CUT
-from rigs.scene.marker_path import bound_rates, excursion, fit_block
+from rigs.scene.edges import CUT, widen
+from rigs.scene.marker_path import bound_rates, excursion, fit_block, slope_weights
 from rigs.scene.noise import noise_events
 from rigs.scene.readout import read_each, read_scans
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
@@ -54,7 +54,7 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
     path, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns, phase_ns, lowest,
-    threshold, state, fired, origin, aim, place, pending, noise_t, noise_place, noise_lot,
+    threshold, state, fired, seen, origin, aim, place, pending, noise_t, noise_place, noise_lot,
     leak_below,
 ):  # fmt: skip
     """Signal and noise along `path`, as the camera hands them over.
@@ -66,6 +66,7 @@ def trace(  # type: ignore[no-untyped-def]
         period_ns, phase_ns: scans of the read-out begin at phase + k period; period 0: no scans.
         lowest: the lowest threshold of all.
         threshold, fired: (height, width); state: (height, width, 4), written.
+        seen: rectangles in which markers have been, see `edges.darken`; widened.
         origin, aim, place: the lists of `watch`, written.
         pending: packed events of a scan that was not complete, ns after `row_ns[0]` - period.
         noise_t, noise_place, noise_lot: of `noise.candidates`, in this span of time.
@@ -76,7 +77,7 @@ def trace(  # type: ignore[no-untyped-def]
     """
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
     rows, inverse, curve = np.empty(total), np.empty(total), np.empty((3, 4, total))
-    tree, stack = np.empty((7, 4 * total)), np.empty((160, 3))
+    weights, tree, stack = np.empty((4, 2 * total)), np.empty((7, 4 * total)), np.empty((160, 3))
     first, stray = np.empty(total, np.int64), np.empty(total)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
@@ -102,21 +103,19 @@ def trace(  # type: ignore[no-untyped-def]
                 noise_t, noise_place, noise_lot, noise_at, row_ns[begin + first[block + 1]],
                 base_ns, leak_below, contrast, edge, path[:, :, begin + first[block]], events, n,
             )  # fmt: skip
+        for block in range(blocks):
+            slope_weights(rows, first[block], first[block + 1], block, inverse, weights)
         for i in range(path.shape[0]):
             for block in range(blocks):
-                fit_block(
-                    rows, path, i, begin + first[block], first[block], first[block + 1], chord,
-                    curve, inverse,
-                )  # fmt: skip
+                a, b = first[block], first[block + 1]
+                fit_block(path, i, begin + a, a, b, block, chord, inverse, weights, curve)
             strays, off_chord = excursion(rows, curve, 0, last)
             if strays == 0.0:
                 continue
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
             listed = reaches(i, column, row, radius, strays, origin)
             if not listed and strays <= REACH_PX:
-                listed = make_list(
-                    i, column, row, radius, state, edge, pixels, origin, aim, place
-                )
+                listed = make_list(i, column, row, radius, state, edge, pixels, origin, aim, place)
             end_x, end_y, end_r = path[i, 0, stop], path[i, 1, stop], path[i, 2, stop]
             if listed:
                 count = may_fire(
@@ -132,6 +131,7 @@ def trace(  # type: ignore[no-untyped-def]
                     near_rim(column, row, radius, band, height, width, pixels)
             if count == 0:
                 continue
+            widen(i, column, row, radius + CUT * edge + strays, seen)
             whole = 0.0
             for block in range(blocks):
                 a, b = first[block], first[block + 1]
@@ -154,9 +154,7 @@ def trace(  # type: ignore[no-untyped-def]
                 contrast, edge, period_ns, stack, state, gaps, events, n,
             )  # fmt: skip
             if listed:
-                renew(
-                    i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim
-                )
+                renew(i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim)
         if kept + n > room:
             room = 2 * (kept + n)
             t_ns, ps = larger(t_ns, room), larger(ps, room)

@@ -11,10 +11,11 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks import measure
+from benchmarks.trials import stretch
 
 TINY: dict[str, dict[str, Any]] = {
     "storage": {"events": 30_000, "frames": 3, "size": 96, "runs": 1},
-    "scene": {"length_mm": 1.0, "frames": 5, "runs": 1},
+    "scene": {"length_mm": 1.0, "runs": 1, "trials": 0, "grid": 8},
     "clocks": {"trains": 3, "seconds": 10.0},
     "labels": {"frames": 5, "runs": 1},
 }
@@ -25,7 +26,8 @@ PROMISED = {
         "pickle_window_30ms_ms", "pickle_bytes_per_event",
     },
     "scene": {
-        "tracks_x_realtime", "ns_per_event", "frame_ms_512", "contact_x_realtime", "peak_mb",
+        "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_frame_emulator",
+        "event_time_p95_us", "readout_p95_us",
     },
     "clocks": {
         "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
@@ -99,3 +101,12 @@ def test_an_unknown_name_is_refused(
         command.main()
     assert refused.value.code == 2
     assert "storage" in capsys.readouterr().err
+
+
+def test_a_stretch_takes_whole_trials_and_knows_how_long_they_are() -> None:
+    with stretch("rehearsal", 2, "pilot") as work:
+        trial = work.trials[0]
+        assert work.take(1) == work.session.plan.seconds(trial)
+        assert work.session.taken == 1
+        assert [left.id for left in work.trials] != [trial.id]
+        assert work.session.campaign.committed() == {trial.id}
