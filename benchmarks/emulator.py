@@ -4,23 +4,17 @@ Ours, written from how those emulators are described (v2e: Hu, Liu and Delbruck 
 Gehrig and Scaramuzza 2018), and compiled: every millisecond the whole scene is drawn, its logarithm
 is taken, and each pixel whose log intensity has gone by its threshold from its own reference fires,
 at a time on the straight line between the two frames. The same discs, thresholds and dead time as
-the analytic way; neither has noise or a read-out here. All simulated.
-
-`x_frame_emulator` is how many times faster the analytic way is on the same second of a slide, with
-all that it needs: paths, roots, sorting and the reset of its pixels.
+the analytic way, and neither noise nor a read-out. All simulated.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numba import njit
 
-from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, ratio, spread
 from rigs.scene.edges import CUT, level_at
-from rigs.scene.events import EventOptics, Events, MarkerSensor
-from storage.streams import F64, I64
+from rigs.scene.events import EventOptics, Events
+from storage.streams import F64
 
 FRAME_NS = 1_000_000
 
@@ -48,47 +42,6 @@ def emulate(path: F64, optics: EventOptics, threshold: F64) -> Events:
         room = n
     order = np.argsort(t_ns[:n], kind="stable")
     return t_ns[order], x[order], y[order], p[order]
-
-
-def measure(milliseconds: int = 1000, runs: int = RUNS) -> Figures:
-    """Both ways on the beginning of one slide, timed in turn."""
-    optics = replace(EventOptics(), noise_hz=0.0, hot_pixels=0, readout_hz=0.0)
-    layout, loads = _sliding(milliseconds)
-    sensor = MarkerSensor(optics, layout, SEED)
-    t_ns = np.arange(len(loads), dtype=np.int64) * FRAME_NS
-    path = np.ascontiguousarray(sensor.path(loads).transpose(2, 0, 1))
-    frames: list[Events] = []
-    roots: list[Events] = []
-
-    def draw() -> None:
-        frames[:] = [emulate(path, optics, sensor.threshold)]
-
-    def solve() -> None:
-        sensor.reset(loads[0], SEED)
-        roots[:] = [sensor.sense(loads, t_ns)]
-
-    with one_core():
-        taken = alternate(runs, frames=draw, roots=solve)
-    return {
-        **ratio("x_frame_emulator", taken["frames"], taken["roots"]),
-        **spread("frame_emulator_ms_per_s", [t * 1e6 / milliseconds for t in taken["frames"]]),
-        "events": float(len(roots[0][0])),
-        "events_of_frames": float(len(frames[0][0])),
-    }
-
-
-def _sliding(milliseconds: int) -> tuple[F64, F64]:
-    """Places of 19 papillae, and forces that move their markers at 3 px/s with some vibration."""
-    ring = np.repeat([0.0, 5.6, 11.2], [1, 6, 12])
-    angle = np.concatenate([[0.0], np.arange(6) * np.pi / 3, np.arange(12) * np.pi / 6])
-    layout = np.column_stack([ring * np.cos(angle), ring * np.sin(angle)])
-    t: I64 | F64 = np.arange(milliseconds + 1) * 1e-3
-    loads = np.zeros((len(t), 19, 3))
-    away = np.linspace(0.7, 1.3, 19)
-    loads[:, :, 0] = away * (3.0 / 63.0) * t[:, None]
-    loads[:, :, 1] = 1e-3 * np.sin(2 * np.pi * 5.0 * t[:, None] + np.arange(19))
-    loads[:, :, 2] = 0.1
-    return layout, loads.reshape(len(t), -1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -98,12 +98,12 @@ def _bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing
             high = bent
         else:
             low = bent
-        following = bent - miss / (1.0 + compliance * slope)
-        if not low <= following <= high:
-            following = 0.5 * (low + high)
-        if following == bent:
+        change = -miss / (1.0 + compliance * slope)
+        if not low <= bent + change <= high:
+            change = 0.5 * (low + high) - bent
+        bent += change
+        if abs(change) <= _CLOSE * stretch:
             return bent
-        bent = following
     return bent
 
 
@@ -122,6 +122,74 @@ def _leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
+    """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
+
+    q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.
+    """
+    share = h / relaxation_s
+    return np.exp(-share), -np.expm1(-share) / share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _excess(share, table, law, state, i, limit, new_x, new_y, deep, h):  # type: ignore[no-untyped-def]
+    """Force less `limit` times normal force of a tip that has stuck up to a share of a step, N."""
+    decay, gain = relaxing(max(share * h, 1e-12), law.relaxation_s)
+    old_x = state[i, BASE_X] - state[i, PLACE_X]
+    old_y = state[i, BASE_Y] - state[i, PLACE_Y]
+    move_x, move_y = share * (new_x - old_x), share * (new_y - old_y)
+    x, y = old_x + move_x, old_y + move_y
+    along, was = table[i, ALONG], state[i, INDENTATION]
+    sunk = share * (deep - was)
+    pressed = (
+        along * (was + sunk) + state[i, NORMAL_BRANCH] * decay + law.maxwell * along * gain * sunk
+    )  # fmt: skip
+    stretch = np.sqrt(x * x + y * y)
+    bent = _bend_for(
+        stretch, state[i, BENT], table[i, BENDING], table[i, SHORTER], table[i, COMPLIANCE],
+        pressed, along,
+    )  # fmt: skip
+    force, normal, _, _ = _column(bent, table[i, BENDING], table[i, SHORTER], pressed, along)
+    secant = force / stretch if stretch > 0.0 else 0.0
+    # what damps is proportional to the speed, and that is constant
+    soft = table[i, ACROSS] * (law.maxwell * gain + law.damping_s / max(share * h, 1e-12))
+    fx = secant * x + state[i, BRANCH_X] * decay + soft * move_x
+    fy = secant * y + state[i, BRANCH_Y] * decay + soft * move_y
+    return np.sqrt(fx * fx + fy * fy) - limit * normal
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lets_go_at(guess, table, law, state, i, limit, new_x, new_y, deep, h):  # type: ignore[no-untyped-def]
+    """Share of a step at which a stuck tip's force meets its cone: a root of the law itself.
+
+    While a tip sticks its force is a known function of time, relaxation included, so that the
+    slip is located exactly in steps of any length (regula falsi, Illinois).
+    """
+    low, high = 0.0, 1.0
+    below = _excess(low, table, law, state, i, limit, new_x, new_y, deep, h)
+    above = _excess(high, table, law, state, i, limit, new_x, new_y, deep, h)
+    if below >= 0.0 or above <= 0.0:
+        return guess
+    share, side = guess, 0
+    for _ in range(_ITERATIONS):
+        if not low < share < high:
+            share = 0.5 * (low + high)
+        miss = _excess(share, table, law, state, i, limit, new_x, new_y, deep, h)
+        if miss > 0.0:
+            high, above = share, miss
+            below = 0.5 * below if side == 1 else below
+            side = 1
+        else:
+            low, below = share, miss
+            above = 0.5 * above if side == -1 else above
+            side = -1
+        if high - low < 1e-12 or abs(miss) < 1e-16:
+            break
+        share = (low * above - high * below) / (above - below)
+    return share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     """Direction of a sliding tip's force after the drive d: the tractrix.
 
@@ -137,10 +205,19 @@ def _turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     if abs(across) < 1e-300 or after <= 0.0:
         return (fx / size, fy / size) if after > 0.0 else (ux, uy)
     ratio = after / before - 1.0
-    mean = before if abs(ratio) < 1e-12 else (after - before) / np.log1p(ratio)
+    if abs(ratio) < 1e-3:  # the series of ratio / log(1 + ratio)
+        mean = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
+    else:
+        mean = (after - before) / np.log1p(ratio)
     # along < 0 beyond a right angle: 1 + along cancels there
     half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
-    half *= np.exp(-drive / mean)
+    way = drive / mean
+    if way < 0.01:  # the series of exp(-way)
+        half *= 1.0 - way * (
+            1.0 - way * (0.5 - way * (1.0 / 6.0 - way * (1.0 / 24.0 - way / 120.0)))
+        )
+    else:
+        half *= np.exp(-way)
     square = half * half
     cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
     return cosine * ux - sine * uy, sine * ux + cosine * uy
@@ -167,7 +244,11 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     along, bending = table[i, ALONG], table[i, BENDING]
     shortening, compliance = table[i, SHORTER], table[i, COMPLIANCE]
     maxwell = law.maxwell
-    was = state[i, INDENTATION]
+    was, touched = state[i, INDENTATION], 0.0
+    if state[i, MODE] == FREE and deep > 0.0:
+        touched = was / (was - deep) if was < 0.0 else 1.0
+        if was < 0.0:
+            gain = relaxing((1.0 - touched) * h, law.relaxation_s)[1]
     pressed = (
         along * deep + state[i, NORMAL_BRANCH] * decay
         + maxwell * along * gain * (deep - (was if was > 0.0 else 0.0))
@@ -177,10 +258,8 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         return FREE, base_x, base_y, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0
     mode, place_x, place_y = state[i, MODE], state[i, PLACE_X], state[i, PLACE_Y]
     old_x, old_y = state[i, BASE_X] - place_x, state[i, BASE_Y] - place_y
-    touched = 0.0
     if mode == FREE:
         # the tip stands under its base when it touches, on the way there in this step
-        touched = was / (was - deep) if was < 0.0 else 1.0
         place_x = state[i, BASE_X] + touched * (base_x - state[i, BASE_X]) if was < 0.0 else base_x
         place_y = state[i, BASE_Y] + touched * (base_y - state[i, BASE_Y]) if was < 0.0 else base_y
         old_x, old_y = 0.0, 0.0
@@ -207,6 +286,10 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     share, left = -1.0, 1.0
     if not keeps_on:
         share = _leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
+        if mode == STUCK and state[i, INDENTATION] > 0.0 and 0.0 < share < 1.0:
+            share = _lets_go_at(
+                share, table, law, state, i, static * grip, new_x, new_y, deep, h
+            )  # fmt: skip
         left = 1.0 - share
         from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
         before += share * (grip * normal - before)
@@ -221,32 +304,42 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     # left by a bend decides on the coefficient of friction, and so on F
     rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
     towards_x, towards_y = _unit(before * unit_x + rest_x, before * unit_y + rest_y)
-    low, high = 0.0, bent
-    bent = min(state[i, BENT], bent)
-    slip, limit, stretch = 0.0, 0.0, 0.0
     # speed at the end of the step: a line, or a parabola, through the mean speeds of the last steps
     slid_s = left * (1.0 - touched) * h
     weight, rest = 1.0, 0.0
+    low, high, guess = 0.0, bent, state[i, BENT]
     if keeps_on and state[i, SLID_S] > 0.0:
         ahead = slid_s / (slid_s + state[i, SLID_S])
         weight, rest = 1.0 + ahead, -ahead * state[i, SPEED]
         if state[i, SLID_S] == slid_s and state[i, EARLIER] >= 0.0:
             weight = 11.0 / 6.0
             rest = state[i, EARLIER] / 3.0 - 7.0 / 6.0 * state[i, SPEED]
+            # the bend if the tip slid on as it did
+            slides = (2.0 * state[i, SPEED] - state[i, EARLIER]) * slid_s
+            moved = (new_x - old_x) * towards_x + (new_y - old_y) * towards_y
+            guess += (moved - slides) / (1.0 + compliance * bending)
+    bent = min(max(guess, 0.0), high)
+    slip, limit, stretch = 0.0, 0.0, 0.0
+    faster, rate, known = 1.0, 0.0, -1.0
     for _ in range(_ITERATIONS):
         spring, normal, slope, normal_slope = _column(bent, bending, shortening, pressed, along)
         stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
         slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
         slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
-        straight = (slip_x * towards_x + slip_y * towards_y) / slip if slip > 0.0 else 1.0
+        straight = slip_x * towards_x + slip_y * towards_y
+        straight = 1.0 if straight >= slip * (1.0 - 1e-9) else straight / slip
         grip, grip_slope = grip_at(field, i, state[i, PATH] + slip)
         if law.strengthening != 0.0 and slid_s > 0.0:
-            speed = weight * slip / slid_s + rest
-            if speed > 0.0:
+            speed = max(weight * slip / slid_s + rest, 0.0)
+            if known < 0.0 or abs(speed - known) > 1e-4 * (known + law.weak_mm_s):
                 faster = 1.0 + law.strengthening * np.log1p(speed / law.weak_mm_s)
-                rate = law.strengthening / (law.weak_mm_s + speed) * weight / slid_s
-                grip_slope = grip_slope * faster + grip * rate
-                grip *= faster
+                rate = law.strengthening / (law.weak_mm_s + speed)
+                known = speed
+            more = faster + rate * (speed - known)
+            grip_slope *= more
+            if speed > 0.0:
+                grip_slope += grip * rate * weight / slid_s
+            grip *= more
         limit = grip * normal
         limit_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
         pull, pull_slope = limit, limit_slope
@@ -298,6 +391,10 @@ def move_tips(table, field, law, state, sensor, plate_y, start_s, h, decay, gain
             state[i, NORMAL_BRANCH] = -table[i, ALONG] * max(deep, 0.0)
         else:
             soft = law.maxwell * gain
+            if state[i, MODE] == FREE and state[i, INDENTATION] < 0.0:
+                # as in `tip_step`: it touched on the way
+                since = deep / (deep - state[i, INDENTATION])
+                soft = law.maxwell * relaxing(since * h, law.relaxation_s)[1]
             was = state[i, INDENTATION] if state[i, INDENTATION] > 0.0 else 0.0
             state[i, NORMAL_BRANCH] = state[i, NORMAL_BRANCH] * decay + soft * table[i, ALONG] * (
                 deep - was
@@ -324,16 +421,6 @@ def move_tips(table, field, law, state, sensor, plate_y, start_s, h, decay, gain
         state[i, SLID_S] = slid_s
         state[i, SPEED] = slip / slid_s if slid_s > 0.0 else 0.0
         state[i, PATH] += slip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
-    """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
-
-    q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.
-    """
-    share = h / relaxation_s
-    return np.exp(-share), -np.expm1(-share) / share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -41,12 +41,12 @@ def distance_at(x, y, t, k, zero, rows, inverse, curve):  # type: ignore[no-unty
     """
     tau = t - (rows[k] - zero)
     s = tau * inverse[k]
-    dx = x - (curve[0, 0, k] + tau * (curve[0, 1, k] + s * (curve[0, 2, k] + s * curve[0, 3, k])))
-    dy = y - (curve[1, 0, k] + tau * (curve[1, 1, k] + s * (curve[1, 2, k] + s * curve[1, 3, k])))
-    r = curve[2, 0, k] + tau * (curve[2, 1, k] + s * (curve[2, 2, k] + s * curve[2, 3, k]))
-    vx = curve[0, 1, k] + s * (2.0 * curve[0, 2, k] + 3.0 * s * curve[0, 3, k])
-    vy = curve[1, 1, k] + s * (2.0 * curve[1, 2, k] + 3.0 * s * curve[1, 3, k])
-    growth = curve[2, 1, k] + s * (2.0 * curve[2, 2, k] + 3.0 * s * curve[2, 3, k])
+    dx = x - (curve[k, 0] + tau * (curve[k, 1] + s * (curve[k, 2] + s * curve[k, 3])))
+    dy = y - (curve[k, 4] + tau * (curve[k, 5] + s * (curve[k, 6] + s * curve[k, 7])))
+    r = curve[k, 8] + tau * (curve[k, 9] + s * (curve[k, 10] + s * curve[k, 11]))
+    vx = curve[k, 1] + s * (2.0 * curve[k, 2] + 3.0 * s * curve[k, 3])
+    vy = curve[k, 5] + s * (2.0 * curve[k, 6] + 3.0 * s * curve[k, 7])
+    growth = curve[k, 9] + s * (2.0 * curve[k, 10] + 3.0 * s * curve[k, 11])
     away = np.sqrt(dx * dx + dy * dy)
     return away - r, -(dx * vx + dy * vy) - growth * away, away
 
@@ -79,8 +79,8 @@ def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore
 @njit(cache=True, nogil=True, error_model="numpy")
 def _at_row(x, y, k, curve):  # type: ignore[no-untyped-def]
     """Distance of a pixel from the rim at row k, px."""
-    dx, dy = x - curve[0, 0, k], y - curve[1, 0, k]
-    return np.sqrt(dx * dx + dy * dy) - curve[2, 0, k]
+    dx, dy = x - curve[k, 0], y - curve[k, 4]
+    return np.sqrt(dx * dx + dy * dy) - curve[k, 8]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -88,13 +88,13 @@ def _node_rates(node, dx, dy, away, length, tree):  # type: ignore[no-untyped-de
     """Bounds of the distance's rate over the steps of a node; (dx, dy): to the pixel at its end."""
     inverse = 1.0 / away if away > 0.0 else 0.0
     ux, uy = dx * inverse, dy * inverse
-    low_x, high_x = ux * tree[0, node], ux * tree[3, node]
-    low_y, high_y = uy * tree[1, node], uy * tree[4, node]
+    low_x, high_x = ux * tree[node, 0], ux * tree[node, 3]
+    low_y, high_y = uy * tree[node, 1], uy * tree[node, 4]
     least = min(low_x, high_x) + min(low_y, high_y)
     most = max(low_x, high_x) + max(low_y, high_y)
-    speed = tree[6, node]
+    speed = tree[node, 6]
     turn = (turning(speed * length * inverse) if away > 0.0 else 2.0) * speed
-    return -most - tree[5, node] - turn, -least - tree[2, node] + turn
+    return -most - tree[node, 5] - turn, -least - tree[node, 2] + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -105,16 +105,16 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
     (sa, sb) and (sb, sb).
     """
     tau = sa * h
-    dx = x - (curve[0, 0, k] + tau * (curve[0, 1, k] + sa * (curve[0, 2, k] + sa * curve[0, 3, k])))
-    dy = y - (curve[1, 0, k] + tau * (curve[1, 1, k] + sa * (curve[1, 2, k] + sa * curve[1, 3, k])))
+    dx = x - (curve[k, 0] + tau * (curve[k, 1] + sa * (curve[k, 2] + sa * curve[k, 3])))
+    dy = y - (curve[k, 4] + tau * (curve[k, 5] + sa * (curve[k, 6] + sa * curve[k, 7])))
     away = np.sqrt(dx * dx + dy * dy)
     inverse = 1.0 / away if away > 0.0 else 0.0
     ux, uy = dx * inverse, dy * inverse
     low, high, speed = np.inf, -np.inf, 0.0
     for p, q in ((sa, sa), (sa, sb), (sb, sb)):
-        vx = curve[0, 1, k] + (p + q) * curve[0, 2, k] + 3.0 * p * q * curve[0, 3, k]
-        vy = curve[1, 1, k] + (p + q) * curve[1, 2, k] + 3.0 * p * q * curve[1, 3, k]
-        growth = curve[2, 1, k] + (p + q) * curve[2, 2, k] + 3.0 * p * q * curve[2, 3, k]
+        vx = curve[k, 1] + (p + q) * curve[k, 2] + 3.0 * p * q * curve[k, 3]
+        vy = curve[k, 5] + (p + q) * curve[k, 6] + 3.0 * p * q * curve[k, 7]
+        growth = curve[k, 9] + (p + q) * curve[k, 10] + 3.0 * p * q * curve[k, 11]
         rate = -(ux * vx + uy * vy) - growth
         low, high = min(low, rate), max(high, rate)
         speed = max(speed, np.sqrt(vx * vx + vy * vy))
@@ -183,9 +183,9 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 if node > 0:
                     k, end = int(sa), min(int(sb), last)
                     a, b = rows[k] - zero, rows[end] - zero
-                    dx, dy = x - curve[0, 0, end], y - curve[1, 0, end]
+                    dx, dy = x - curve[end, 0], y - curve[end, 4]
                     away = np.sqrt(dx * dx + dy * dy)
-                    gb = away - curve[2, 0, end]
+                    gb = away - curve[end, 8]
                     slowest, fastest = _node_rates(base + node, dx, dy, away, b - a, tree)
                 else:
                     k = -node

@@ -89,7 +89,7 @@ class MarkerSensor:
         self._pending = np.empty(0, np.int64)
         self._phase_ns = 0
         self._trial = 0
-        self._bin: tuple[int, Candidates] | None = None
+        self._bins: dict[int, Candidates] = {}
 
     @property
     def scans(self) -> tuple[int, int]:
@@ -117,7 +117,7 @@ class MarkerSensor:
             seed: the trial's: noise, and when the read-out scans.
         """
         optics = self.optics
-        self._trial, self._bin = seed, None
+        self._trial, self._bins = seed, {}
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
         darken(self._seen, self._dark, self._state)
         see_discs(
@@ -158,19 +158,18 @@ class MarkerSensor:
         return when, x, y, p
 
     def _candidates(self, begin_ns: int, end_ns: int) -> Candidates:
-        """Possible noise of a span of true time, cut from whole bins of the trial."""
-        parts = []
-        for index in range(begin_ns // BIN_NS, -(-end_ns // BIN_NS)):
-            if self._bin is None or self._bin[0] != index:
-                self._bin = (index, candidates(self._noise, self._trial, index))
-            t_ns, place, lot = self._bin[1]
-            low, high = np.searchsorted(t_ns, (begin_ns, end_ns))
-            parts.append((t_ns[low:high], place[low:high], lot[low:high]))
-        if len(parts) == 1:
-            return parts[0]
-        if not parts:
-            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-        t_ns, place, lot = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        """Possible noise of the whole seconds of the trial that a span of true time touches."""
+        first, last = begin_ns // BIN_NS, max((end_ns - 1) // BIN_NS, begin_ns // BIN_NS)
+        # what was drawn before is dropped, what is needed again is kept
+        self._bins = {
+            index: self._bins.get(index) or candidates(self._noise, self._trial, index)
+            for index in range(first, last + 1)
+        }
+        if first == last:
+            return self._bins[first]
+        t_ns, place, lot = (
+            np.concatenate(column) for column in zip(*self._bins.values(), strict=True)
+        )
         return t_ns, place, lot
 
 

@@ -84,7 +84,7 @@ def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):
     """Marker i as cubics between the rows of one block.
 
     Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
-    is curve[0] + tau (curve[1] + s (curve[2] + s curve[3])), px.
+    is c0 + tau (c1 + s (c2 + s c3)), px; a row of `curve` has these of column, row and radius.
 
     Args:
         path: column, row and radius of each marker, (n, 3, m).
@@ -92,27 +92,27 @@ def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):
         first, last: the block's first and last row.
         chord: join rows by straight lines.
         shift, inverse, weights: of `slope_weights`.
-        curve: (3, 4, r), written for steps `first` to `last` - 1; the places also at `last`.
+        curve: (r, 12), written for steps `first` to `last` - 1; the places also at `last`.
     """
     points = min(last - first + 1, 4)
     for c in range(3):
         for k in range(first, last + 1):
-            curve[c, 0, k] = path[i, c, row + k - first]
+            curve[k, 4 * c + 0] = path[i, c, row + k - first]
         for k in range(first, last + 1):
             slope = 0.0
             low = nearest_row(k, first, last)
             for j in range(points):
                 # differences: of what stands still, the slope is 0 to the bit
-                slope += weights[j, k + shift] * (curve[c, 0, low + j] - curve[c, 0, k])
-            curve[c, 1, k] = slope
+                slope += weights[j, k + shift] * (curve[low + j, 4 * c + 0] - curve[k, 4 * c + 0])
+            curve[k, 4 * c + 1] = slope
         for k in range(first, last):
-            rate = (curve[c, 0, k + 1] - curve[c, 0, k]) * inverse[k]
+            rate = (curve[k + 1, 4 * c + 0] - curve[k, 4 * c + 0]) * inverse[k]
             if chord:
-                curve[c, 1, k], curve[c, 2, k], curve[c, 3, k] = rate, 0.0, 0.0
+                curve[k, 4 * c + 1], curve[k, 4 * c + 2], curve[k, 4 * c + 3] = rate, 0.0, 0.0
             else:
-                slope, after = curve[c, 1, k], curve[c, 1, k + 1]
-                curve[c, 2, k] = 3.0 * rate - 2.0 * slope - after
-                curve[c, 3, k] = slope + after - 2.0 * rate
+                slope, after = curve[k, 4 * c + 1], curve[k + 1, 4 * c + 1]
+                curve[k, 4 * c + 2] = 3.0 * rate - 2.0 * slope - after
+                curve[k, 4 * c + 3] = slope + after - 2.0 * rate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -126,7 +126,7 @@ def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-unt
         first, last: the block's first and last row in `t`.
         size: leaves, a power of two, not less than the steps.
         base: where the tree's node 0 is.
-        tree: (7, nodes): lowest rates of column, row and radius, the highest ones, px/ns, and the
+        tree: (nodes, 7): lowest rates of column, row and radius, the highest ones, px/ns, and the
             fastest speed of the centre; written.
 
     Returns:
@@ -136,21 +136,21 @@ def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-unt
     leaves = base + size - first
     for c in range(3):
         for k in range(first, last):
-            begin = curve[c, 1, k]
-            middle = begin + curve[c, 2, k]
-            end = middle + curve[c, 2, k] + 3.0 * curve[c, 3, k]
+            begin = curve[k, 4 * c + 1]
+            middle = begin + curve[k, 4 * c + 2]
+            end = middle + curve[k, 4 * c + 2] + 3.0 * curve[k, 4 * c + 3]
             low, high = min(begin, min(middle, end)), max(begin, max(middle, end))
-            tree[c, leaves + k], tree[3 + c, leaves + k] = low, high
+            tree[leaves + k, c], tree[leaves + k, 3 + c] = low, high
             whole += max(high, -low) * (t[k + 1] - t[k])
         for k in range(last, first + size):
-            tree[c, leaves + k], tree[3 + c, leaves + k] = np.inf, -np.inf
+            tree[leaves + k, c], tree[leaves + k, 3 + c] = np.inf, -np.inf
         for j in range(size - 1, 0, -1):
             a, b = base + 2 * j, base + 2 * j + 1
-            tree[c, base + j] = min(tree[c, a], tree[c, b])
-            tree[3 + c, base + j] = max(tree[3 + c, a], tree[3 + c, b])
+            tree[base + j, c] = min(tree[a, c], tree[b, c])
+            tree[base + j, 3 + c] = max(tree[a, 3 + c], tree[b, 3 + c])
     for j in range(base + 1, base + 2 * size):
-        x, y = max(tree[3, j], -tree[0, j]), max(tree[4, j], -tree[1, j])
-        tree[6, j] = np.sqrt(x * x + y * y)
+        x, y = max(tree[j, 3], -tree[j, 0]), max(tree[j, 4], -tree[j, 1])
+        tree[j, 6] = np.sqrt(x * x + y * y)
     return whole
 
 
@@ -161,8 +161,8 @@ def excursion(t, curve, first, last):  # type: ignore[no-untyped-def]
     The control points of its cubics hold the path, and distances from a point or from a segment
     are convex, so the farthest control point bounds them. Growth counts like a move.
     """
-    x, y, r = curve[0, 0, first], curve[1, 0, first], curve[2, 0, first]
-    dx, dy, dr = curve[0, 0, last] - x, curve[1, 0, last] - y, curve[2, 0, last] - r
+    x, y, r = curve[first, 0], curve[first, 4], curve[first, 8]
+    dx, dy, dr = curve[last, 0] - x, curve[last, 4] - y, curve[last, 8] - r
     square = dx * dx + dy * dy + dr * dr
     scale = 1.0 / square if square > 0.0 else 0.0
     far, far_r = dx * dx + dy * dy, abs(dr)
@@ -172,9 +172,9 @@ def excursion(t, curve, first, last):  # type: ignore[no-untyped-def]
         for j in range(3):
             # the control points of step k: its first one, and the two between its ends
             a, b = third * j, third * (j == 2)
-            px = curve[0, 0, k] + a * curve[0, 1, k] + b * curve[0, 2, k] - x
-            py = curve[1, 0, k] + a * curve[1, 1, k] + b * curve[1, 2, k] - y
-            pr = curve[2, 0, k] + a * curve[2, 1, k] + b * curve[2, 2, k] - r
+            px = curve[k, 0] + a * curve[k, 1] + b * curve[k, 2] - x
+            py = curve[k, 4] + a * curve[k, 5] + b * curve[k, 6] - y
+            pr = curve[k, 8] + a * curve[k, 9] + b * curve[k, 10] - r
             far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
             s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
             ex, ey = px - s * dx, py - s * dy

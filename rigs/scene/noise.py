@@ -72,13 +72,33 @@ def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
     """
     rng = generator(seed, "event noise", index)
     n = int(rng.poisson(rates.total_hz * (BIN_NS * 1e-9)))
-    until = np.cumsum(rng.standard_exponential(n + 1))
-    t_ns = (until[:-1] * (BIN_NS / until[-1])).astype(np.int64) + index * BIN_NS
-    place = rng.integers(0, rates.width, n) << 12 | rng.integers(0, rates.height, n)
-    lot = rng.random(n)
-    hot = np.flatnonzero(lot < rates.hot_share)
-    if len(hot):
-        place[hot] = rates.hot_places[rng.integers(0, len(rates.hot_places), len(hot))]
+    gaps, draws = rng.standard_exponential(n + 1), rng.random((2, n))
+    t_ns, place, lot = _spread(
+        gaps, draws, index * BIN_NS, rates.width, rates.height, rates.hot_share, rates.hot_places
+    )
+    return t_ns, place, lot
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spread(gaps, draws, begin_ns, width, height, hot_share, hot):  # type: ignore[no-untyped-def]
+    """Times from exponential gaps, and places and lots from uniform numbers."""
+    n = draws.shape[1]
+    t_ns, place, lot = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n)
+    whole = 0.0
+    for k in range(n + 1):
+        whole += gaps[k]
+    until = 0.0
+    for k in range(n):
+        until += gaps[k]
+        # rounding must not put the last one into the next bin
+        t_ns[k] = begin_ns + min(np.int64(until / whole * BIN_NS), BIN_NS - 1)
+        lot[k] = draws[1, k]
+        if lot[k] < hot_share:
+            place[k] = hot[int(draws[0, k] * hot.shape[0])]
+        else:
+            pixel = np.int64(draws[0, k] * (width * height))
+            row = pixel // width
+            place[k] = (pixel - row * width) << 12 | row
     return t_ns, place, lot
 
 

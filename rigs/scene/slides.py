@@ -17,8 +17,8 @@ from rigs.scene.springs import Springs, new_tips, track_width
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
-PRESS_STEPS = 12
-HOLD_STEPS = 4
+PRESS_STEPS = 8
+HOLD_STEPS = 1
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def run_slide(
     length_mm: float = 15.0,
     press_mm_s: float = 2.0,
     settled_s: float = 3.0,
-    step_mm: float = 0.2,
+    step_mm: float = 0.6,
 ) -> SlideRun:
     """Press straight in, hold still, slide; every motion at constant speed."""
     steps = max(round(length_mm / step_mm), 1)

@@ -69,15 +69,15 @@ def trace(  # type: ignore[no-untyped-def]
         seen: rectangles in which markers have been, see `edges.darken`; widened.
         origin, aim, place: the lists of `watch`, written.
         pending: packed events of a scan that was not complete, ns after `row_ns[0]` - period.
-        noise_t, noise_place, noise_lot: of `noise.candidates`, in this span of time.
+        noise_t, noise_place, noise_lot: of `noise.candidates`, at least those of this time.
         leak_below: of `noise.NoiseRates`.
 
     Returns:
         time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
     """
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
-    rows, inverse, curve = np.empty(total), np.empty(total), np.empty((3, 4, total))
-    weights, tree, stack = np.empty((4, 2 * total)), np.empty((7, 4 * total)), np.empty((160, 3))
+    rows, inverse, curve = np.empty(total), np.empty(total), np.empty((total, 12))
+    weights, tree, stack = np.empty((4, 2 * total)), np.empty((4 * total, 7)), np.empty((160, 3))
     first, stray = np.empty(total, np.int64), np.empty(total)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
@@ -88,7 +88,8 @@ def trace(  # type: ignore[no-untyped-def]
     room = 1 << 13
     t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
     xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
-    waiting, kept, noise_at, begin = pending.shape[0], 0, 0, 0
+    waiting, kept, begin = pending.shape[0], 0, 0
+    noise_at = np.searchsorted(noise_t, row_ns[0])
     events[:waiting] = pending
     while begin < total - 1:
         blocks = find_blocks(row_ns, begin, block_ns, first)
@@ -98,6 +99,9 @@ def trace(  # type: ignore[no-untyped-def]
         for k in range(last + 1):
             rows[k] = row_ns[begin + k] - row_ns[begin]
         n = waiting
+        if n + noise_t.shape[0] > capacity:
+            capacity = 2 * (n + noise_t.shape[0])
+            events, other = larger(events, capacity), np.empty(capacity, np.int64)
         for block in range(blocks):
             noise_at, n = noise_events(
                 noise_t, noise_place, noise_lot, noise_at, row_ns[begin + first[block + 1]],
@@ -139,7 +143,7 @@ def trace(  # type: ignore[no-untyped-def]
                 while size < b - a:
                     size *= 2
                 whole += bound_rates(rows, curve, a, b, size, 4 * a, tree)
-                dx, dy = curve[0, 0, b] - curve[0, 0, a], curve[1, 0, b] - curve[1, 0, a]
+                dx, dy = curve[b, 0] - curve[a, 0], curve[b, 4] - curve[a, 4]
                 square = dx * dx + dy * dy
                 nearest = radius - CUT * edge - 2.0 * strays
                 # a distance from a point that moves straight sags below a line by that much

@@ -178,13 +178,13 @@ def test_a_block_follows_a_polynomial_that_it_can_hold(rows: int) -> None:
     )
     path = np.zeros((1, 3, rows))
     path[0, 0] = polynomial(t)
-    curve, inverse, weights = np.empty((3, 4, rows)), np.empty(rows), np.empty((4, rows + 1))
+    curve, inverse, weights = np.empty((rows, 12)), np.empty(rows), np.empty((4, rows + 1))
     slope_weights(t, 0, rows - 1, 1, inverse, weights)
     fit_block(path, 0, 0, 0, rows - 1, 1, False, inverse, weights, curve)
     for k in range(rows - 1):
         for s in (0.0, 0.3, 0.5, 1.0):
             tau = s * (t[k + 1] - t[k])
-            c = curve[0, :, k]
+            c = curve[k, :4]
             value = c[0] + tau * (c[1] + s * (c[2] + s * c[3]))
             assert value == pytest.approx(polynomial(t[k] + tau), abs=1e-12)
     fine = np.linspace(0.0, t[-1], 2001)

@@ -25,8 +25,7 @@ def test_slides_let_go_when_expected(level: int, depth: float, speed: float) -> 
     )  # fmt: skip
     found = run_slide(springs, depth, speed, 30.0, settled_s=2.0, step_mm=0.01).slipped_s
     expected = slide_onsets(SKIN, MATERIAL, level, depth, speed, 2.0, 2.0)
-    # a tip that touches within a step of the pressing relaxes from the step's start
-    assert found == pytest.approx(expected, abs=1e-9 if level == 1 else 1e-4)
+    assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_many_slides_at_once_are_the_same_as_one_by_one() -> None:
