@@ -124,7 +124,7 @@ class Scene(StrictModel):
 
     level: Literal["auto", "L1", "L2", "L3"] = "auto"
     """How much physics the contact has (`rigs.scene.springs`); `auto` takes what a plan needs."""
-    step_ms: Literal[1, 2, 4, 8, 16, 32] = 4
+    step_ms: Literal[1, 2, 4, 8, 16, 32] = 2
     """Step of the contact while the plate is held; while it may fall, a millisecond."""
     skin: Skin = Skin()
     friction: Friction = Friction()
@@ -160,13 +160,23 @@ class EventCamera(StrictModel):
     """Pixels that fire all the time; the rig's seed chooses them."""
     hot_hz: Annotated[float, Field(ge=0, le=1000)] = 10.0
     """Mean rate of each of them, always positive."""
-    readout_hz: Literal[0] | Annotated[float, Field(ge=1000, le=10_000)] = 1000.0
+    readout_hz: Annotated[float, Field(ge=0, le=10_000)] = 1000.0
     """Scans a second: an event has the time of the next scan, and in one scan a pixel sends one
-    event at most. 0: every event has its own time."""
+    event at most. At least 1000; 0: every event has its own time."""
     block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
     """What the camera sends together: its latency."""
     path: Literal["cubic", "chord"] = "cubic"
     """How markers go from one step of the contact to the next: smoothly, or straight."""
+
+    @model_validator(mode="after")
+    def _scans(self) -> EventCamera:
+        if 0 < self.readout_hz < 1000:
+            raise KeyedError(
+                "event_camera.readout_hz",
+                self.readout_hz,
+                "must be 0 (no scans), or 1000 to 10000 scans a second",
+            )
+        return self
 
 
 class Reflections(StrictModel):

@@ -360,10 +360,14 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         if abs(change) <= _CLOSE * bent:
             # the next change would be of the order of its square: rounding
             stretch += stretch_slope * change
-            slip = max(slip - stretch_slope * straight * change, 0.0)
             limit += limit_slope * change
             normal += normal_slope * change
             break
+    if soft != 0.0:
+        # a direction that lags behind by a hair would make the way longer, step by step
+        towards_x, towards_y = _unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
+    slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
+    slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
     return (
         SLIDING, base_x - stretch * towards_x, base_y - stretch * towards_y,
         limit * unit_x, limit * unit_y, normal, bent, slip, share,

@@ -1,9 +1,10 @@
 """How an event camera hands its events over: the dead time of a pixel, and the scans of the array.
 
-The DVXplorer does not send an event when it happens: it scans its pixels, and "the constant
-settings guarantee constant timing but only up to about 1000" scans a second (iniVation's engineer
-L. Longinotti in the public forum dv-users; the values are `DVXeFPS` of dv-processing). Its stamps
-run on while a scan is read; here every event of a scan has the time at which the scan begins.
+The DVXplorer does not send an event when it happens: it scans its pixels, by default 5000 times a
+second where few of them fire. "If exact timing is important you can select a different setting, the
+constant ones do guarantee constant timing but only up to about 1000 eFPS" (iniVation's engineer
+L. Longinotti in the forum dv-users; the settings are `DVXeFPS` of dv-processing). Its stamps run on
+while a scan is read; here every event of a scan has the time at which the scan begins.
 
 A pixel has room for one event: it holds the first until it is read and reports nothing else in
 that scan. What it sees meanwhile is not lost from its reference level, as if it were read at once;
