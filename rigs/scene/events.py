@@ -3,7 +3,8 @@
 A pixel of such a camera fires when its log intensity has changed by its threshold. For a disc
 with a known edge that happens when the disc's rim is at a known distance, so the times are roots
 on the disc's path: exact to a microsecond where frames at 1 kHz give half a millisecond (v2e, Hu,
-Liu and Delbruck 2021), and hundreds of times cheaper. Only pixels that may fire are looked at.
+Liu and Delbruck 2021), and more than a hundred times cheaper. Only pixels that may fire are looked
+at.
 
 Discs must not come so near to each other that their edges overlap.
 """
@@ -29,7 +30,7 @@ I64 = npt.NDArray[np.int64]
 U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 Events = tuple[I64, U16, U16, U8]
-"""True time in ns, column, row, polarity; each of shape (n,)."""
+"""True time in ns of the event or of the scan that reads it, column, row, polarity; (n,) each."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,17 @@ class MarkerSensor:
             optics.width, optics.height, optics.noise_hz, optics.leak_share, optics.hot_hz,
             hot_places(optics.width, optics.height, optics.hot_pixels, seed),
         )  # fmt: skip
+        self._leak_below = self._noise.leak_below
+        middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
+        self._projection = (
+            float(optics.px_per_mm), float(optics.shift_mm_per_n), float(optics.growth_mm_per_n),
+            float(optics.radius_mm), *middle,
+        )  # fmt: skip
+        # what the kernel is told in every call; floats also where a setting was written as whole
+        self._fixed = (
+            optics.block_ns, optics.path == "chord", float(optics.contrast), float(optics.edge_px),
+            round(optics.refractory_us * 1e3), optics.period_ns,
+        )  # fmt: skip
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
         self._state = self._dark.copy()
         self._seen: F64 = np.tile([np.inf, -np.inf, np.inf, -np.inf], (len(self._layout_mm), 1))
@@ -102,11 +114,8 @@ class MarkerSensor:
         Args:
             loads: tangential force on the plate x, y and normal force, N, (m, 3 n).
         """
-        optics = self.optics
         result: F64 = markers_in_image(
-            np.ascontiguousarray(loads), self._layout_mm, optics.px_per_mm, optics.shift_mm_per_n,
-            optics.growth_mm_per_n, optics.radius_mm, 0.5 * (optics.width - 1),
-            0.5 * (optics.height - 1),
+            np.ascontiguousarray(loads), self._layout_mm, self._projection
         )  # fmt: skip
         return result
 
@@ -147,19 +156,19 @@ class MarkerSensor:
             t_ns: true time of each row, int64, (m,), strictly rising; every multiple of the
                 optics' `block_ns` between the first and the last one is among them.
         """
-        optics = self.optics
-        *events, self._pending = trace(
-            self.path(loads), t_ns, optics.block_ns, optics.path == "chord", optics.contrast,
-            optics.edge_px, round(optics.refractory_us * 1e3), optics.period_ns, self._phase_ns,
-            self._lowest, self.threshold, self._state, self._fired_ns, self._seen, *self._lists,
-            self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])), self._noise.leak_below,
+        when, x, y, p, self._pending = trace(
+            np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, *self._fixed,
+            self._phase_ns, self._lowest, self.threshold, self._state, self._fired_ns, self._seen,
+            *self._lists, self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])),
+            self._leak_below,
         )  # fmt: skip
-        when, x, y, p = events
         return when, x, y, p
 
     def _candidates(self, begin_ns: int, end_ns: int) -> Candidates:
         """Possible noise of the whole seconds of the trial that a span of true time touches."""
         first, last = begin_ns // BIN_NS, max((end_ns - 1) // BIN_NS, begin_ns // BIN_NS)
+        if first == last and first in self._bins:
+            return self._bins[first]
         # what was drawn before is dropped, what is needed again is kept
         self._bins = {
             index: self._bins.get(index) or candidates(self._noise, self._trial, index)

@@ -16,9 +16,7 @@ COLUMN, ROW, RADIUS = 0, 1, 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def markers_in_image(  # type: ignore[no-untyped-def]
-    loads, layout_mm, px_per_mm, shift_mm_per_n, growth_mm_per_n, radius_mm, middle_x, middle_y
-):
+def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-def]
     """Column, row and radius of every marker under `loads`, px, (n, 3, m).
 
     A papilla is dragged along by friction, which is opposite to its force on the plate.
@@ -26,8 +24,10 @@ def markers_in_image(  # type: ignore[no-untyped-def]
     Args:
         loads: tangential force on the plate x, y and normal force, N, (m, 3 n).
         layout_mm: places of the papillae, (n, 2).
-        middle_x, middle_y: the picture's centre, px.
+        projection: px/mm, how far a marker moves, mm/N, how much it grows, mm/N, its radius
+            without force, mm, and column and row of the picture's centre, px.
     """
+    px_per_mm, shift_mm_per_n, growth_mm_per_n, radius_mm, middle_x, middle_y = projection
     count, rows = layout_mm.shape[0], loads.shape[0]
     path = np.empty((count, 3, rows))
     drag, growth = px_per_mm * shift_mm_per_n, px_per_mm * growth_mm_per_n
@@ -39,6 +39,16 @@ def markers_in_image(  # type: ignore[no-untyped-def]
             path[i, ROW, k] = y + drag * loads[k, 3 * i + 1]
             path[i, RADIUS, k] = radius + growth * loads[k, 3 * i + 2]
     return path
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
+    """Whether marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
+    moves = 0
+    for c in range(3):
+        for k in range(begin, stop):
+            moves += path[i, c, k] != path[i, c, k + 1]
+    return moves == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,16 +107,19 @@ def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):
     points = min(last - first + 1, 4)
     for c in range(3):
         for k in range(first, last + 1):
-            curve[k, 4 * c + 0] = path[i, c, row + k - first]
+            curve[k, 4 * c] = path[i, c, row + k - first]
         for k in range(first, last + 1):
-            slope = 0.0
-            low = nearest_row(k, first, last)
-            for j in range(points):
-                # differences: of what stands still, the slope is 0 to the bit
-                slope += weights[j, k + shift] * (curve[low + j, 4 * c + 0] - curve[k, 4 * c + 0])
+            # differences: of what stands still, the slope is 0 to the bit
+            here, low, w = curve[k, 4 * c], nearest_row(k, first, last), k + shift
+            slope = weights[0, w] * (curve[low, 4 * c] - here)
+            slope += weights[1, w] * (curve[low + 1, 4 * c] - here)
+            if points > 2:
+                slope += weights[2, w] * (curve[low + 2, 4 * c] - here)
+            if points > 3:
+                slope += weights[3, w] * (curve[low + 3, 4 * c] - here)
             curve[k, 4 * c + 1] = slope
         for k in range(first, last):
-            rate = (curve[k + 1, 4 * c + 0] - curve[k, 4 * c + 0]) * inverse[k]
+            rate = (curve[k + 1, 4 * c] - curve[k, 4 * c]) * inverse[k]
             if chord:
                 curve[k, 4 * c + 1], curve[k, 4 * c + 2], curve[k, 4 * c + 3] = rate, 0.0, 0.0
             else:

@@ -12,7 +12,14 @@ from numba import njit
 
 from rigs.scene.crossings import events_of_pixels
 from rigs.scene.edges import CUT, widen
-from rigs.scene.marker_path import bound_rates, excursion, fit_block, slope_weights
+from rigs.scene.marker_path import (
+    bound_rates,
+    excursion,
+    fit_block,
+    markers_in_image,
+    slope_weights,
+    stands_still,
+)
 from rigs.scene.noise import noise_events
 from rigs.scene.readout import read_each, read_scans
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
@@ -53,14 +60,14 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
-    path, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns, phase_ns, lowest,
-    threshold, state, fired, seen, origin, aim, place, pending, noise_t, noise_place, noise_lot,
-    leak_below,
+    loads, layout_mm, projection, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns,
+    phase_ns, lowest, threshold, state, fired, seen, origin, aim, place, pending, noise_t,
+    noise_place, noise_lot, leak_below,
 ):  # fmt: skip
-    """Signal and noise along `path`, as the camera hands them over.
+    """Signal and noise under `loads`, as the camera hands them over.
 
     Args:
-        path: column, row and radius of each marker at each row, px, (n, 3, m).
+        loads, layout_mm, projection: see `marker_path.markers_in_image`.
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
         chord: straight lines between rows in place of cubics.
         period_ns, phase_ns: scans of the read-out begin at phase + k period; period 0: no scans.
@@ -75,6 +82,7 @@ def trace(  # type: ignore[no-untyped-def]
     Returns:
         time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
     """
+    path = markers_in_image(loads, layout_mm, projection)
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
     rows, inverse, curve = np.empty(total), np.empty(total), np.empty((total, 12))
     weights, tree, stack = np.empty((4, 2 * total)), np.empty((4 * total, 7)), np.empty((160, 3))
@@ -110,12 +118,12 @@ def trace(  # type: ignore[no-untyped-def]
         for block in range(blocks):
             slope_weights(rows, first[block], first[block + 1], block, inverse, weights)
         for i in range(path.shape[0]):
+            if stands_still(path, i, begin, stop):
+                continue
             for block in range(blocks):
                 a, b = first[block], first[block + 1]
                 fit_block(path, i, begin + a, a, b, block, chord, inverse, weights, curve)
             strays, off_chord = excursion(rows, curve, 0, last)
-            if strays == 0.0:
-                continue
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
             listed = reaches(i, column, row, radius, strays, origin)
             if not listed and strays <= REACH_PX:
