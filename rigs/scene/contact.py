@@ -368,6 +368,11 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         towards_x, towards_y = _unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
     slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
     slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
+    # the force lies on the cone of the way that is told, to the last bit
+    grip, _ = grip_at(field, i, state[i, PATH] + slip)
+    if known >= 0.0:
+        grip *= faster + rate * (max(weight * slip / slid_s + rest, 0.0) - known)
+    limit = grip * normal
     return (
         SLIDING, base_x - stretch * towards_x, base_y - stretch * towards_y,
         limit * unit_x, limit * unit_y, normal, bent, slip, share,

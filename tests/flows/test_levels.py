@@ -85,9 +85,11 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         assert recording.frame_source == found.source == found.as_json()["source"] == level
         assert found.displacement_px.shape == (len(found.frame_ns), 19)
         assert found.plate_lost == 0
-        # the first frame over the threshold: up to a frame late, early by noise only
+        # the first frame over the threshold: up to a frame late, early by noise only; where a plate
+        # hangs, tips creep before they go, and the noise of its marker counts for more
         errors = errors_ms(found, recording)
-        assert all(-3.0 < error < FRAME_MS + 5.0 for error in errors), errors
+        early = 3.0 if make is kinematic else FRAME_MS + 3.0
+        assert all(-early < error < FRAME_MS + 5.0 for error in errors), errors
         expected.append(frame_bytes * len(found.frame_ns))
         recordings.append(recording)
         labels.append(found)

@@ -123,7 +123,7 @@ def test_a_falling_plate_is_measured_at_its_own_step(
     found = tradeoff.tradeoff(path, rig_path, tmp_path / "out", 1)
     families = [(row["family"], row["name"]) for row in found["variants"]]
     assert families == [
-        *(("levels", f"L{k}") for k in range(4)), ("cubic", "4"), ("chord", "4"),
+        *(("levels", f"L{k}") for k in range(4)), ("cubic", "2"), ("chord", "2"),
     ]  # fmt: skip
     assert any("by a millisecond" in sentence for sentence in found["left_out"])
     assert found["windows"]["samples"]["incipient"] > 0

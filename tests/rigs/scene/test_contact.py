@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rigs.scene.friction import friction_knots, grip_at
@@ -229,6 +229,10 @@ def test_chunks_do_not_matter() -> None:
 
 
 @settings(max_examples=40, deadline=None)
+@example(
+    seed=0, waypoints=[(0.0, 1.0, 1.0), (1.0, 0.0, 0.0)], share=0.2, level=3, variation=0.1,
+    excess=0.0, h=1e-3,
+)  # fmt: skip
 @given(
     seed=st.integers(0, 1000),
     waypoints=st.lists(
