@@ -21,10 +21,11 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
         if isinstance(step, Move):
             moved += at.distance_mm(step.to) if step.recorded else 0.0
             at = step.to
+    plate = plan.protocol.collection.plate is not None
     events = known.noise_events_per_s * seconds + known.signal_events_per_mm * moved
+    events += known.events_per_fall if plate else 0.0
     total = known.fixed_bytes + events * known.bytes_per_event
     if rig.frame_px(plan) is not None:
-        plate = plan.protocol.collection.plate is not None
         total += rig.frame_bytes(plate) * seconds * plan.protocol.collection.recording.sync_rate
     return total
 

@@ -97,6 +97,8 @@ class Estimates(StrictModel):
     noise_events_per_s: float = Field(ge=0)
     signal_events_per_mm: float = Field(ge=0)
     """Events of one millimetre of recorded motion in contact."""
+    events_per_fall: float = Field(default=0.0, ge=0)
+    """Events of a plate that falls, besides."""
     bytes_per_event: float = Field(gt=0)
     bytes_per_frame: float = Field(ge=0)
     """Of one frame without the plate's marker: its papillae; the dark ground costs little."""
