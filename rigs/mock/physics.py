@@ -99,6 +99,13 @@ class Physics:
                 self.springs = replace(self.springs, table=table)
         return last
 
+    def _catch_up(self, now_ns: int) -> None:
+        """Compute rows up to the last millisecond, whatever the step: something begins here."""
+        self.advance(now_ns)
+        behind = np.arange(self.track.end_ns, now_ns + 1, FINE_NS, dtype=np.int64)
+        if len(behind) > 1:
+            self._advance_over(behind)
+
     def _advance_over(self, t_ns: I64) -> None:
         count = len(t_ns) - 1
         sensor = np.ascontiguousarray(self._sensor_at(t_ns[1:]))
@@ -132,10 +139,7 @@ class Physics:
 
     def act(self, action: PlateAction, seconds: float, now_ns: int, mass_kg: float) -> None:
         """Raise the plate and hold it, release it over a ramp, or catch it where it is."""
-        self.advance(now_ns)
-        behind = np.arange(self.track.end_ns, now_ns + 1, FINE_NS, dtype=np.int64)
-        if len(behind) > 1:
-            self._advance_over(behind)
+        self._catch_up(now_ns)
         length = round(seconds * 1e9)
         height = float(self._plate_motion[0])
         if action == "release":
@@ -168,10 +172,11 @@ class Physics:
     # -- what devices look at --------------------------------------------------------------
 
     def keep_loads(self, now_ns: int) -> History:
-        """Keep the forces of every row from the last one on, until `loads` is let go."""
-        done_ns, n = self.advance(now_ns), len(self.tips.state)
+        """Keep the forces of every row from the present on, until `loads` is let go."""
+        self._catch_up(now_ns)
+        n = len(self.tips.state)
         self.loads = History(3 * n)
-        row = self.loads.grow(np.array([done_ns], np.int64))[0]
+        row = self.loads.grow(np.array([self.track.end_ns], np.int64))[0]
         record(self.tips.state, 0.0, np.empty(track_width(n)), row)
         return self.loads
 

@@ -6,14 +6,7 @@ is a return mapping (Simo and Hughes, Computational Inelasticity, 1998, ch. 1): 
 tip sticks; if its force left the friction cone, find the slip that puts it back onto the cone.
 That is stable at any step and stiffness, does not creep, and is exact on straight paths.
 
-Where the direction turns, the tip is dragged behind its base on a line of the cone's radius: a
-tractrix, tan(theta/2) = tan(theta0/2) exp(-s / rho). That is exact for linear springs also while
-the radius grows or shrinks linearly, rho being then its logarithmic mean.
-
-Large deflection comes from one potential, so that it cannot create energy: with the bend b, the
-papilla is compressed by c = depth - 0.6 b^2 / h, and N = k_n c, T = b (k_b - 1.2 N / h). The
-second term is the softening of an axially loaded column, which buckles at 10 E I / h^2 (exact:
-pi^2 E I / h^2); the stiffness left is clamped at 5 % of k_b.
+Columns are in `rigs.scene.column`, turns in `rigs.scene.turning`.
 
 All places are in the plate's frame: millimetres, newtons, seconds. Forces are those of the skin
 on the plate. Rows may be any time apart; the same rows give the same bits in any pieces.
@@ -24,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rigs.scene.column import CLOSE, bend_for, column, relaxing
 from rigs.scene.friction import grip_at
 from rigs.scene.springs import (
     ACROSS,
@@ -56,79 +50,11 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
+from rigs.scene.turning import leaves_at, turned, unit
 
 # a force this little over its limit is rounding, not slip: a tip at rest must stay to the bit
 _ROUNDING = 1.0 + 1e-13
-_LEAST_STIFFNESS = 0.05
 _ITERATIONS = 60
-_CLOSE = 1e-7
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-untyped-def]
-    """Tangential and normal force of a bent column, and their slopes over the bend.
-
-    N = pressed - pressing * shortening * bent^2, not negative.
-    """
-    loss = pressing * shortening * bent
-    normal = pressed - loss * bent
-    normal_slope = -2.0 * loss
-    if normal <= 0.0:
-        normal, normal_slope = 0.0, 0.0
-    stiffness = bending - 2.0 * shortening * normal
-    slope = stiffness - 2.0 * shortening * bent * normal_slope
-    if stiffness < _LEAST_STIFFNESS * bending:
-        stiffness = slope = _LEAST_STIFFNESS * bending
-    return stiffness * bent, normal, slope, normal_slope
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
-    """The bend of a papilla whose tip is `stretch` mm from under its base."""
-    if shortening == 0.0:
-        return stretch / (1.0 + compliance * bending)
-    low, high = 0.0, stretch
-    bent = min(guess, stretch)
-    for _ in range(_ITERATIONS):
-        force, _, slope, _ = _column(bent, bending, shortening, pressed, pressing)
-        miss = bent + compliance * force - stretch
-        if abs(miss) <= 1e-14 * stretch:
-            return bent
-        if miss > 0.0:
-            high = bent
-        else:
-            low = bent
-        change = -miss / (1.0 + compliance * slope)
-        if not low <= bent + change <= high:
-            change = 0.5 * (low + high) - bent
-        bent += change
-        if abs(change) <= _CLOSE * stretch:
-            return bent
-    return bent
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
-    """Share of a step at which the force f + s d last leaves a cone from `start` to `end`."""
-    a = dx * dx + dy * dy - (end - start) ** 2
-    half_b = fx * dx + fy * dy - start * (end - start)
-    c = min(fx * fx + fy * fy - start * start, 0.0)
-    if a == 0.0:
-        return min(max(-0.5 * c / half_b, 0.0), 1.0) if half_b > 0.0 else 0.0
-    root = np.sqrt(max(half_b * half_b - a * c, 0.0))
-    # the larger root if the force outruns the cone, without cancellation
-    share = -c / (half_b + root) if half_b > 0.0 else (root - half_b) / a
-    return min(max(share, 0.0), 1.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
-    """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
-
-    q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.
-    """
-    share = h / relaxation_s
-    return np.exp(-share), -np.expm1(-share) / share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -145,11 +71,11 @@ def _excess(share, table, law, state, i, limit, new_x, new_y, deep, h):  # type:
         along * (was + sunk) + state[i, NORMAL_BRANCH] * decay + law.maxwell * along * gain * sunk
     )  # fmt: skip
     stretch = np.sqrt(x * x + y * y)
-    bent = _bend_for(
+    bent = bend_for(
         stretch, state[i, BENT], table[i, BENDING], table[i, SHORTER], table[i, COMPLIANCE],
         pressed, along,
     )  # fmt: skip
-    force, normal, _, _ = _column(bent, table[i, BENDING], table[i, SHORTER], pressed, along)
+    force, normal, _, _ = column(bent, table[i, BENDING], table[i, SHORTER], pressed, along)
     secant = force / stretch if stretch > 0.0 else 0.0
     # what damps is proportional to the speed, and that is constant
     soft = table[i, ACROSS] * (law.maxwell * gain + law.damping_s / max(share * h, 1e-12))
@@ -190,47 +116,6 @@ def _lets_go_at(guess, table, law, state, i, limit, new_x, new_y, deep, h):  # t
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
-    """Direction of a sliding tip's force after the drive d: the tractrix.
-
-    `before`, `after`: the cone's radius at both ends. Returns a unit vector.
-    """
-    size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
-    if drive == 0.0:
-        return fx / size, fy / size
-    ux, uy = dx / drive, dy / drive
-    if size == 0.0:
-        return ux, uy
-    along, across = (fx * ux + fy * uy) / size, (ux * fy - uy * fx) / size
-    if abs(across) < 1e-300 or after <= 0.0:
-        return (fx / size, fy / size) if after > 0.0 else (ux, uy)
-    ratio = after / before - 1.0
-    if abs(ratio) < 1e-3:  # the series of ratio / log(1 + ratio)
-        mean = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
-    else:
-        mean = (after - before) / np.log1p(ratio)
-    # along < 0 beyond a right angle: 1 + along cancels there
-    half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
-    way = drive / mean
-    if way < 0.01:  # the series of exp(-way)
-        half *= 1.0 - way * (
-            1.0 - way * (0.5 - way * (1.0 / 6.0 - way * (1.0 / 24.0 - way / 120.0)))
-        )
-    else:
-        half *= np.exp(-way)
-    square = half * half
-    cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
-    return cosine * ux - sine * uy, sine * ux + cosine * uy
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _unit(x, y):  # type: ignore[no-untyped-def]
-    """The direction of a vector; x for none."""
-    size = np.sqrt(x * x + y * y)
-    return (x / size, y / size) if size > 0.0 else (1.0, 0.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):  # type: ignore[no-untyped-def]
     """Where tip `i` is after its base moved linearly to a place and depth within `h` seconds.
 
@@ -267,8 +152,8 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     branch_x, branch_y = state[i, BRANCH_X] * decay, state[i, BRANCH_Y] * decay
     soft = table[i, ACROSS] * (maxwell * gain + law.damping_s / h)
     stretch = np.sqrt(new_x * new_x + new_y * new_y)
-    bent = _bend_for(stretch, state[i, BENT], bending, shortening, compliance, pressed, along)
-    force, normal, _, _ = _column(bent, bending, shortening, pressed, along)
+    bent = bend_for(stretch, state[i, BENT], bending, shortening, compliance, pressed, along)
+    force, normal, _, _ = column(bent, bending, shortening, pressed, along)
     secant = force / stretch if stretch > 0.0 else 0.0
     trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
     trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
@@ -285,7 +170,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         return STUCK, place_x, place_y, trial_x, trial_y, normal, bent, 0.0, -1.0
     share, left = -1.0, 1.0
     if not keeps_on:
-        share = _leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
+        share = leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
         if mode == STUCK and state[i, INDENTATION] > 0.0 and 0.0 < share < 1.0:
             share = _lets_go_at(
                 share, table, law, state, i, static * grip, new_x, new_y, deep, h
@@ -295,7 +180,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         before += share * (grip * normal - before)
         share = touched + (1.0 - touched) * share
     if law.exact_turns:
-        unit_x, unit_y = _turned(
+        unit_x, unit_y = turned(
             from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
         )
     else:
@@ -303,7 +188,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
     # left by a bend decides on the coefficient of friction, and so on F
     rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
-    towards_x, towards_y = _unit(before * unit_x + rest_x, before * unit_y + rest_y)
+    towards_x, towards_y = unit(before * unit_x + rest_x, before * unit_y + rest_y)
     # speed at the end of the step: a line, or a parabola, through the mean speeds of the last steps
     slid_s = left * (1.0 - touched) * h
     weight, rest = 1.0, 0.0
@@ -322,7 +207,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
     slip, limit, stretch = 0.0, 0.0, 0.0
     faster, rate, known = 1.0, 0.0, -1.0
     for _ in range(_ITERATIONS):
-        spring, normal, slope, normal_slope = _column(bent, bending, shortening, pressed, along)
+        spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, along)
         stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
         slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
         slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
@@ -357,7 +242,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
         if not low <= bent + change <= high:
             change = 0.5 * (low + high) - bent
         bent += change
-        if abs(change) <= _CLOSE * bent:
+        if abs(change) <= CLOSE * bent:
             # the next change would be of the order of its square: rounding
             stretch += stretch_slope * change
             limit += limit_slope * change
@@ -365,7 +250,7 @@ def tip_step(table, field, law, state, i, base_x, base_y, deep, h, decay, gain):
             break
     if soft != 0.0:
         # a direction that lags behind by a hair would make the way longer, step by step
-        towards_x, towards_y = _unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
+        towards_x, towards_y = unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
     slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
     slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
     # the force lies on the cone of the way that is told, to the last bit

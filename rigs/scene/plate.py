@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.contact import move_tips, record, relaxing, tip_step
+from rigs.scene.column import relaxing
+from rigs.scene.contact import move_tips, record, tip_step
 from rigs.scene.springs import FREE, GAP, LAYOUT_X, LAYOUT_Y
 
 _ITERATIONS = 200

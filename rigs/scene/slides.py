@@ -1,7 +1,7 @@
 """One straight slide by contact alone: forces and slips of a trial without any device.
 
-Levels, grids and benchmarks need thousands of slides and no clock, camera or store. Steps follow
-the way and not the time: what changes along a slide is friction, over tenths of a millimetre.
+Levels, grids and benchmarks need thousands of slides and no clock, camera or store. Onsets are
+exact at any step; its length only says how often forces are told.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def run_slide(
     length_mm: float = 15.0,
     press_mm_s: float = 2.0,
     settled_s: float = 3.0,
-    step_mm: float = 0.6,
+    step_mm: float = 1.0,
 ) -> SlideRun:
     """Press straight in, hold still, slide; every motion at constant speed."""
     steps = max(round(length_mm / step_mm), 1)

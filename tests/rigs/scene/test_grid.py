@@ -27,7 +27,7 @@ def runs() -> tuple[np.ndarray, np.ndarray]:
         itertools.product(DEPTHS, SPEEDS, DIRECTIONS, range(3))
     ):
         springs = springs_of(settings, skin, seed)
-        run = run_slide(springs, depth, speed, direction)
+        run = run_slide(springs, depth, speed, direction, step_mm=0.25)
         rows.append(run.slipped_s)
         motion.append(_motion(run, settings.event_camera.shift_mm_per_n))
     return np.array(rows), np.array(motion)
@@ -97,6 +97,6 @@ def test_an_even_scene_is_silent_in_gross_slip() -> None:
             "scene": {"friction": {"path_variation": 0.0, "static_excess": 0.0}},
         }
     )
-    run = run_slide(springs_of(settings, skin_of(settings), 1), 2.8, 1.0)
+    run = run_slide(springs_of(settings, skin_of(settings), 1), 2.8, 1.0, step_mm=0.25)
     motion = _motion(run, settings.event_camera.shift_mm_per_n)
     assert motion[4] < 1e-3 * motion[0]

@@ -1,0 +1,66 @@
+"""How the force of a tip leaves its friction cone, and how it turns while the tip slides.
+
+Where the direction turns, the tip is dragged behind its base on a line of the cone's radius: a
+tractrix, tan(theta/2) = tan(theta0/2) exp(-s / rho). That is exact for linear springs also while
+the radius grows or shrinks linearly, rho being then its logarithmic mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
+    """Share of a step at which the force f + s d last leaves a cone from `start` to `end`."""
+    a = dx * dx + dy * dy - (end - start) ** 2
+    half_b = fx * dx + fy * dy - start * (end - start)
+    c = min(fx * fx + fy * fy - start * start, 0.0)
+    if a == 0.0:
+        return min(max(-0.5 * c / half_b, 0.0), 1.0) if half_b > 0.0 else 0.0
+    root = np.sqrt(max(half_b * half_b - a * c, 0.0))
+    # the larger root if the force outruns the cone, without cancellation
+    share = -c / (half_b + root) if half_b > 0.0 else (root - half_b) / a
+    return min(max(share, 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+    """Direction of a sliding tip's force after the drive d: the tractrix.
+
+    `before`, `after`: the cone's radius at both ends. Returns a unit vector.
+    """
+    size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
+    if drive == 0.0:
+        return fx / size, fy / size
+    ux, uy = dx / drive, dy / drive
+    if size == 0.0:
+        return ux, uy
+    along, across = (fx * ux + fy * uy) / size, (ux * fy - uy * fx) / size
+    if abs(across) < 1e-300 or after <= 0.0:
+        return (fx / size, fy / size) if after > 0.0 else (ux, uy)
+    ratio = after / before - 1.0
+    if abs(ratio) < 1e-3:  # the series of ratio / log(1 + ratio)
+        mean = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
+    else:
+        mean = (after - before) / np.log1p(ratio)
+    # along < 0 beyond a right angle: 1 + along cancels there
+    half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
+    way = drive / mean
+    if way < 0.01:  # the series of exp(-way)
+        half *= 1.0 - way * (
+            1.0 - way * (0.5 - way * (1.0 / 6.0 - way * (1.0 / 24.0 - way / 120.0)))
+        )
+    else:
+        half *= np.exp(-way)
+    square = half * half
+    cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
+    return cosine * ux - sine * uy, sine * ux + cosine * uy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def unit(x, y):  # type: ignore[no-untyped-def]
+    """The direction of a vector; x for none."""
+    size = np.sqrt(x * x + y * y)
+    return (x / size, y / size) if size > 0.0 else (1.0, 0.0)
