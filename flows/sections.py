@@ -140,7 +140,7 @@ def _collected(campaigns: list[Collected], summary: dict[str, Any], simulated: b
             f"{quality['committed']} of {quality['planned']} planned trials are committed; "
             f"{quality['retaken']} attempts failed a quality gate and were taken again or set "
             f"aside, {quality['quarantined']} attempts stand in quarantine.",
-            f"Of the outside camera {results.source_text(summary)} is kept.",
+            f"Kept of the outside camera: {results.source_text(summary)}.",
         ],
         pictures,
         [Table(columns, rows, "Minutes are of the trials' own clocks, people's work left out.")],
