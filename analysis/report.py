@@ -56,14 +56,26 @@ def render(
     simulated: bool,
 ) -> str:
     """The page as text; everything in it is escaped but the figures' SVG."""
+    return render_page(
+        "report.html", sections, simulated=simulated, campaigns=campaigns, headline=headline
+    )
+
+
+def render_page(
+    template: str, sections: Sequence[Section], *, simulated: bool, **values: object
+) -> str:
+    """A page of sections as text, under the top that `template` and its `values` give it.
+
+    Everything in it is escaped but the figures' SVG.
+    """
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=select_autoescape(),
         undefined=StrictUndefined,
         trim_blocks=True,
     )
-    return environment.get_template("report.html").render(
-        campaigns=campaigns, headline=headline, sections=sections, simulated=simulated
+    return environment.get_template(template).render(
+        sections=sections, simulated=simulated, **values
     )
 
 

@@ -20,6 +20,7 @@ import sys
 
 import numpy as np
 
+from analysis.scene_error import match_events
 from benchmarks.emulator import emulate
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import CHUNK_S, LENGTH_MM, loads_of_slide
@@ -29,7 +30,7 @@ from rigs.mock.settings import MockSettings
 from rigs.mock.skins import skin_of
 from rigs.scene.events import EventOptics, Events, MarkerSensor
 from rigs.scene.slides import run_slide
-from storage.streams import F64, I64
+from storage.streams import F64, I64, EventChunk
 
 TRIALS = 30
 """Random trials of the grid; the same for every run."""
@@ -172,11 +173,9 @@ def _precision(length_mm: float) -> Figures:
         MarkerSensor(EventOptics(**optics), layout, SEED),
     )
     fine = loads_of_slide(settings, length_mm, finer=FINER)
-    a = _by_pixel(_sensed(exact, usual))
-    b = _by_pixel(_sensed(exact, fine))
-    c = _by_pixel(_sensed(scanned, usual))
-    error, shared = _apart_us(a, b)
-    late, _ = _apart_us(a, c)
+    seen = _joined(_sensed(exact, usual))
+    error, shared = _apart_us(seen, _joined(_sensed(exact, fine)))
+    late, _ = _apart_us(seen, _joined(_sensed(scanned, usual)))
     return {
         "event_time_p50_us": float(np.percentile(error, 50)),
         "event_time_p95_us": float(np.percentile(error, 95)),
@@ -185,20 +184,17 @@ def _precision(length_mm: float) -> Figures:
     }
 
 
-def _by_pixel(parts: list[Events]) -> tuple[I64, I64]:
-    """A key of pixel, polarity and ordinal there for each event, and its time, ns."""
+def _joined(parts: list[Events]) -> tuple[EventChunk, I64]:
+    """Events as a chunk, and their times in ns, which a chunk would round."""
     t_ns, x, y, p = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    pixel = (y.astype(np.int64) << 13) | (x.astype(np.int64) << 1) | p
-    order = np.lexsort((t_ns, pixel))
-    pixel, t_ns = pixel[order], t_ns[order]
-    first = np.searchsorted(pixel, pixel, side="left")
-    return (pixel << 20) | (np.arange(len(pixel)) - first), t_ns
+    return EventChunk(x, y, p, t_ns // 1000), t_ns
 
 
-def _apart_us(a: tuple[I64, I64], b: tuple[I64, I64]) -> tuple[F64, float]:
-    _, here, there = np.intersect1d(a[0], b[0], return_indices=True)
-    apart: F64 = np.abs(a[1][here] - b[1][there]) * 1e-3
-    return apart, len(here) / max(len(a[0]), len(b[0]))
+def _apart_us(a: tuple[EventChunk, I64], b: tuple[EventChunk, I64]) -> tuple[F64, float]:
+    """How far partners are apart, and the share of all events that have one."""
+    pairs = match_events(a[0], b[0])
+    apart: F64 = np.abs(a[1][pairs.first] - b[1][pairs.second]) * 1e-3
+    return apart, 1.0 - (pairs.unmatched or 0.0)
 
 
 def _peak_mb(rig: str) -> float:

@@ -7,15 +7,11 @@ again from them alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
-
-import analysis
 from analysis import figures
 from analysis.metrics import CLASSES
-from analysis.report import Figure, Section, Table, number, percent
+from analysis.report import Figure, Section, Table, number, percent, render_page
 from analysis.scene_windows import PHASES
 
 FAMILIES = {
@@ -47,14 +43,10 @@ SENSITIVITY_COLUMNS = (
 
 def render(result: Mapping[str, Any]) -> str:
     """The page as text; everything in it is escaped but the figures' SVG."""
-    folder = Path(analysis.__file__).parent / "templates"
-    environment = Environment(
-        loader=FileSystemLoader(folder), autoescape=select_autoescape(),
-        undefined=StrictUndefined, trim_blocks=True,
+    return render_page(
+        "tradeoff.html", make_sections(result), simulated=True,
+        protocol=result["protocol"], rig=result["rig"],
     )  # fmt: skip
-    return environment.get_template("tradeoff.html").render(
-        protocol=result["protocol"], rig=result["rig"], sections=make_sections(result)
-    )
 
 
 def make_sections(result: Mapping[str, Any]) -> list[Section]:
