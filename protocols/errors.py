@@ -7,6 +7,7 @@ prints it as one message and exits with 2.
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
 
 
@@ -40,6 +41,7 @@ class InputError(ValueError):
 
 
 def _short(value: object, limit: int = 80) -> str:
-    text = value if isinstance(value, str) else repr(value)
+    # a person wrote 0.9, not the type that it was read into
+    text = str(value) if isinstance(value, str | Decimal) else repr(value)
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."

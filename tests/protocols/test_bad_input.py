@@ -1,6 +1,7 @@
 """Whatever is wrong with a protocol file is said with file, key, value and what would be right."""
 
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -227,3 +228,8 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     assert "none.yaml" in caught.value.message
     with pytest.raises(InputError, match="is a folder"):
         load_plan(tmp_path)
+
+
+def test_a_number_is_shown_as_it_was_written() -> None:
+    error = InputError("rig.yaml", "mock.scene.friction.kinetik", Decimal("0.9"), "unknown key")
+    assert str(error) == "rig.yaml: mock.scene.friction.kinetik = 0.9: unknown key"
