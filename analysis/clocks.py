@@ -1,44 +1,37 @@
 """The clock map of a device, from the coded pulses it saw, or a reason why there is none.
 
 Camera, arm and sync box each stamp the same pulses with clocks that started on different days. The
-pulses are coded, so the trains fit together at one place only; this file finds that place and then
-a line through it. It must say no rather than be wrong: a regular train, which fits everywhere, is
-refused, and so is one whose residuals are not jitter (docs/decisions/0002).
+pulses are coded, so the trains fit together at one place only; `analysis.pulse_match` finds that
+place and the pairs, `analysis.clock_line` the line through them, and this file says whether to
+trust it. It must say no rather than be wrong: a regular train, which fits everywhere, is refused,
+and so is one whose residuals are not jitter (docs/decisions/0002, docs/clocks.md).
 
-The way: cut a short piece out of the device's train, cross-correlate it with the reference (FFT)
-under several drifts, and take the best lag; pair pulses by the windowed mode of their differences;
-Theil-Sen line, then all pulses paired by that line, then Huber's M-estimate inside a gate. Times
-stay int64; floats hold differences only.
+Times stay int64; floats hold differences only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
+from analysis.clock_line import ClockLine, fit_line
+from analysis.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
 from analysis.pulse_runs import stray_stretch
-from analysis.robust_line import line_uncertainty, robust_line, theil_sen
 from storage.clockmap import ClockMap
 
 Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
+Rounding = Literal["down", "up", "nearest"]
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-MIN_PULSES = 24
-"""Fewer than this may fit a 16-bit code in more than one place once some are lost."""
-MAX_PEAK_RATIO = 0.9
-"""Second correlation peak over the first: about 0.6 to 0.75 for the code, near 1 when regular."""
 MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
-
-_PIECE_TICKS = 400
-_PIECES = 5
-_BINS_A_TICK = 4
-_MAX_BINS = 1 << 22
+BEND_PPM_S = 2.0
+"""By how much a drift may change in a second; a crystal that warms up by 10 K in a minute makes
+0.4."""
 
 
 class ClockRefused(ValueError):
@@ -59,17 +52,22 @@ class ClockFit:
     """A clock map with what is known about its quality.
 
     Attributes:
-        map: device ns to reference ns.
+        map: device ns to reference ns; more than one piece where the clocks bend.
         pulses_seen: pulses on which the line stands.
         pulses_late: pulses that found a partner but lie outside the gate; not in the line.
         pulses_missed: reference pulses inside the device's train that found no partner.
         pulses_spurious: device pulses without a partner (a second report of a pulse is one).
         residual_median_ns, residual_p95_ns, residual_max_ns: absolute residuals of the pulses seen.
-        drift_ppm: what the reference gains on the device.
+        offset_ns: reference less device in the middle of the train.
+        drift_ppm: what the reference gains on the device, in the mean.
         uncertainty_ns: the map's largest error between the first and the last pulse seen, 95 %:
-            from the residuals, plus half the stamps' resolution, plus what the residuals bend away
-            from a line. A delay that all pulses share cannot be seen and is not in it.
+            from the residuals, what the stamps' unit hides, and what bends between knots. A delay
+            that all pulses share cannot be seen and is not in it.
         peak_ratio: second correlation peak over the first, 0 to 1; low is unambiguous.
+        first_ns, last_ns: the first and the last pulse seen, on the device's clock: the map is
+            vouched for in between.
+        pulse_ns, residual_ns: (n,) pulses seen on the reference clock, and their residuals; not
+            compared and not in `to_json`.
     """
 
     map: ClockMap
@@ -80,9 +78,19 @@ class ClockFit:
     residual_median_ns: float
     residual_p95_ns: float
     residual_max_ns: float
+    offset_ns: int
     drift_ppm: float
     uncertainty_ns: float
     peak_ratio: float
+    first_ns: int
+    last_ns: int
+    pulse_ns: Ints = field(repr=False, compare=False)
+    residual_ns: Floats = field(repr=False, compare=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the single pulses, for a record."""
+        data = {part.name: getattr(self, part.name) for part in fields(self) if part.compare}
+        return {**data, "map": self.map.to_json()}
 
 
 def fit_clock(
@@ -92,9 +100,11 @@ def fit_clock(
     jitter_ns: float = 20_000.0,
     max_drift_ppm: float = 10_000.0,
     resolution_ns: float = 1_000.0,
+    rounding: Rounding = "down",
     in_order: bool = False,
+    start_marker_ns: float | None = None,
 ) -> ClockFit:
-    """The line from a device's clock to the reference, from pulses that both saw.
+    """The map from a device's clock to the reference, from pulses that both saw.
 
     Args:
         device_ns: (m,) int64, the pulses on the device's clock, ns. Pulses may be missing, doubled,
@@ -103,11 +113,14 @@ def fit_clock(
         jitter_ns: the scatter (1 sigma) to be expected of the device's stamps. Residuals whose
             95th percentile exceeds three times this are refused.
         max_drift_ppm: clocks that differ by more are refused.
-        resolution_ns: the unit to which the device cuts its stamps. A cut that all pulses share
-            moves the line unseen, so half of it is added to the uncertainty.
+        resolution_ns: the unit to which the device cuts its stamps.
+        rounding: which way it cuts them: an input that is looked at now and then stamps ``up``. The
+            map takes the middle of what a stamp may mean.
         in_order: the stamps stand in the order in which the pulses came, so that a clock that
             jumps back is seen to do so. It must be known: once they are sorted, such a train looks
             like one that began earlier than the reference and ended earlier.
+        start_marker_ns: the train is regular, and begins with a pulse and this much silence, ns;
+            without it a regular train is refused.
 
     Raises:
         ClockRefused: with its `reason`.
@@ -125,58 +138,70 @@ def fit_clock(
             back_ns = -int(np.diff(np.asarray(times)).min(initial=0))
             if back_ns > jitter_ns:
                 raise ClockRefused("residuals", f"the {name} clock jumps back by {back_ns / 1e9} s")
-    tick = _tick(reference)
-    if jitter_ns > tick / 4:
-        raise ValueError(f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart")
     # differences to a pulse of each train; float64 holds them exactly up to 104 days
     device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
-    x, y = _differences(device, device_0), _differences(reference, reference_0)
-
-    lag, drift, centre, piece, peak_ratio = _coarse(x, y, tick, max_drift_ppm * 1e-6)
-    slope, level = _first_line(x[piece], y, centre, lag, drift, tick)
-    # the piece's line is good to some 10 us at the far ends; a quarter tick leaves room for bends
-    pairs = _pair(x, y, (x - centre) * (1 + slope) + centre + level, tick / 4)
-    _gate_share(x, y, pairs, slope, centre, level)
-
-    px, py = x[pairs[0]], y[pairs[1]]
-    x_mid = float(np.round(px.mean()))
-    line = robust_line(px - x_mid, py - px)
-    slope, level = line.slope, line.level
-    if abs(slope) > max_drift_ppm * 1e-6:
-        raise ClockRefused(
-            "drift", f"the clocks differ by {slope * 1e6:.1f} ppm, more than {max_drift_ppm:g}"
-        )
-    residuals = np.abs(line.residuals[line.inside])
-    p95 = float(np.quantile(residuals, 0.95))
-    if p95 > 3 * jitter_ns or line.inside.mean() < MIN_MATCHED:
-        raise ClockRefused(
-            "residuals",
-            f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
-            f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
-        )
-    stray = stray_stretch(
-        (x - x_mid) * (1 + slope) + x_mid + level, y,
-        pairs[0][line.inside], pairs[1][line.inside], 5 * line.sigma,
-    )  # fmt: skip
+    shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
+    x, y = _differences(device, device_0) + shift, _differences(reference, reference_0)
+    try:
+        tick = tick_of(reference)
+        if jitter_ns > tick / 4:
+            raise ValueError(f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart")
+        match = match_trains(x, y, tick, 1.02 * max_drift_ppm * 1e-6, start_marker_ns)
+    except NoMatchError as error:
+        raise ClockRefused(cast("Reason", error.reason), str(error)) from None
+    _gate_share(x, y, match)
+    px, py = x[match.device], y[match.reference]
+    line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
+    _gate_line(line, jitter_ns, max_drift_ppm)
+    predicted = _extended(line, x)
+    inside = line.inside
+    i, j = match.device[inside], match.reference[inside]
+    stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
     if stray is not None:
         raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
+    return _fit(match, line, x, y, device_0, reference_0)
+
+
+def _fit(
+    match: Match, line: ClockLine, x: Floats, y: Floats, device_0: int, reference_0: int
+) -> ClockFit:
+    inside = line.inside
+    px, py = x[match.device], y[match.reference]
+    residuals = np.abs(line.residuals[inside])
+    knots = np.rint(line.knots).astype(np.int64)
+    images = knots + np.rint(np.interp(knots, line.knots, line.values)).astype(np.int64)
+    if knots.size == 2:
+        slope = float(line.slopes[0])
+        middle = int((knots[0] + knots[1]) // 2)
+        image = middle + round(float(np.interp(middle, line.knots, line.values)))
+        drift = (round(slope * 1e18),)
+        clock = ClockMap((device_0 + middle,), (reference_0 + image,), drift)
+    else:
+        clock = ClockMap.through(
+            [device_0 + int(knot) for knot in knots], [reference_0 + int(image) for image in images]
+        )
+    seen = px[inside]
+    first, last = device_0 + int(seen[0]), device_0 + int(seen[-1])
     in_span = (y >= py.min()) & (y <= py.max())
+    middle_ns = (first + last) // 2
+    run = float(line.knots[-1] - line.knots[0])
     return ClockFit(
-        map=ClockMap(
-            device_0 + int(x_mid),
-            reference_0 + int(x_mid) + round(level),
-            round(slope * 1e9),
-        ),
-        pulses_seen=int(line.inside.sum()),
-        pulses_late=int(px.size - line.inside.sum()),
+        map=clock,
+        pulses_seen=int(inside.sum()),
+        pulses_late=int(px.size - inside.sum()),
         pulses_missed=int(in_span.sum()) - px.size,
         pulses_spurious=x.size - px.size,
         residual_median_ns=float(np.median(residuals)),
-        residual_p95_ns=p95,
+        residual_p95_ns=float(np.quantile(residuals, 0.95)),
         residual_max_ns=float(residuals.max()),
-        drift_ppm=slope * 1e6,
-        uncertainty_ns=line_uncertainty(px - x_mid, line) + resolution_ns / 2,
-        peak_ratio=peak_ratio,
+        offset_ns=clock.to_reference(middle_ns) - middle_ns,
+        drift_ppm=float(line.values[-1] - line.values[0]) / run * 1e6,
+        uncertainty_ns=line.uncertainty,
+        peak_ratio=match.peak_ratio,
+        first_ns=first,
+        last_ns=last,
+        pulse_ns=py[inside].astype(np.int64) + reference_0,
+        residual_ns=line.residuals[inside],
     )
 
 
@@ -200,148 +225,27 @@ def _differences(times: Ints, origin: int) -> Floats:
     return kept
 
 
-def _tick(reference: Ints) -> float:
-    """The grid on which pulses come: the shortest common interval between pulses, ns."""
-    steps = np.diff(reference)
-    tick = float(np.quantile(steps[steps > 0], 0.1)) if (steps > 0).any() else 0.0
-    if tick < 1_000:
-        raise ClockRefused("no_match", f"reference pulses {tick:.0f} ns apart are no pulse train")
-    return tick
+def _extended(line: ClockLine, x: Floats) -> Floats:
+    """x on the reference clock by the line, which goes on straight beyond its ends."""
+    slopes = line.slopes
+    gained = np.interp(x, line.knots, line.values)
+    gained += slopes[0] * np.minimum(x - line.knots[0], 0.0)
+    gained += slopes[-1] * np.maximum(x - line.knots[-1], 0.0)
+    result: Floats = x + gained
+    return result
 
 
-def _coarse(
-    x: Floats, y: Floats, tick: float, max_drift: float
-) -> tuple[float, float, float, NDArray[np.bool_], float]:
-    """Where a piece of the train `x` fits into `y`.
-
-    Returns:
-        lag (ns, of the piece's centre), drift, the centre (ns), the piece (mask on x), and the
-        ratio of the second correlation peak to the first.
-    """
-    width = tick / _BINS_A_TICK
-    y_start = y[0]
-    if y[-1] - y_start > _MAX_BINS * width:
-        raise ClockRefused(
-            "no_match", "the reference pulses span hours: stray stamps, or many trials"
-        )
-    y_bins = np.zeros(int((y[-1] - y_start) / width) + 1)
-    y_bins[((y - y_start) / width).astype(np.int64)] = 1.0
-
-    length = _PIECE_TICKS * tick
-    best: tuple[float, float, float, NDArray[np.bool_], float] | None = None
-    # by rank, not by time: a stray stamp far away must not decide where the pieces lie
-    for rank in _spread(_PIECES):
-        centre = float(x[int(rank * (x.size - 1))])
-        piece = np.abs(x - centre) <= length / 2
-        if piece.sum() < MIN_PULSES:
-            continue
-        centre = float(x[piece][0] + x[piece][-1]) / 2
-        found = _correlate(x[piece] - centre, y_bins, width, max_drift)
-        candidate = (found[0] + y_start - centre, found[1], centre, piece, found[2])
-        if best is None or found[2] < best[4]:
-            best = candidate
-        if found[2] < 0.8:
-            break
-    if best is None:
-        raise ClockRefused(
-            "too_few_pulses", f"no stretch of {length / 1e9:.1f} s holds {MIN_PULSES} pulses"
-        )
-    if best[4] > MAX_PEAK_RATIO:
-        raise ClockRefused(
-            "ambiguous",
-            f"the train fits in more than one place: second peak {best[4]:.3f} of the first "
-            f"(at most {MAX_PEAK_RATIO}); a regular train, or not these pulses",
-        )
-    return best
-
-
-def _spread(count: int) -> list[float]:
-    """Places in 0..1, the middle first."""
-    return sorted(((i + 0.5) / count for i in range(count)), key=lambda place: abs(place - 0.5))
-
-
-def _correlate(
-    piece: Floats, y_bins: Floats, width: float, max_drift: float
-) -> tuple[float, float, float]:
-    """Best (lag of the piece's centre from bin 0 in ns, drift, peak ratio)."""
-    half = max(-float(piece[0]), float(piece[-1])) * (1 + max_drift)
-    bins = 2 * int(half / width + 1) + 1
-    size = int(fft.next_fast_len(y_bins.size + bins + 2, real=True))
-    spectrum = fft.rfft(y_bins, size)
-    # one step of drift moves the piece's ends by a bin
-    steps = int(np.ceil(max_drift * half / width))
-    drifts = np.linspace(-max_drift, max_drift, 2 * steps + 1) if steps else np.zeros(1)
-    scores = np.zeros(size)
-    best = np.zeros(size, np.int64)
-    for row, drift in enumerate(drifts):
-        comb = np.zeros(bins + 2)
-        places = np.unique(np.round(piece * (1 + drift) / width).astype(np.int64) + bins // 2 + 1)
-        # a pulse may fall on either side of an edge: let it count in the neighbours too
-        np.add.at(comb, places, 1.0)
-        np.add.at(comb, places - 1, 0.5)
-        np.add.at(comb, places + 1, 0.5)
-        score = fft.irfft(spectrum * np.conj(fft.rfft(comb, size)), size)
-        best[score > scores] = row
-        np.maximum(scores, score, out=scores)
-    column = int(scores.argmax())
-    first = float(scores[column])
-    # round the train's end a lag is negative
-    lag_bins = column if column < y_bins.size else column - size
-    away = np.abs(np.arange(size) - column)
-    away = np.minimum(away, size - away)
-    second = float(scores[away > 0.6 * _BINS_A_TICK].max())
-    lag = (lag_bins + bins // 2 + 1 + 0.5) * width
-    return lag, float(drifts[best[column]]), second / first if first > 0 else 1.0
-
-
-def _first_line(
-    x: Floats, y: Floats, centre: float, lag: float, drift: float, tick: float
-) -> tuple[float, float]:
-    """A line through the piece: pairs by the windowed mode of their differences, Theil-Sen."""
-    u = x - centre
-    predicted = u * (1 + drift) + centre + lag
-    low = np.searchsorted(y, predicted - tick)
-    high = np.searchsorted(y, predicted + tick)
-    counts = high - low
-    which = np.repeat(np.arange(x.size), counts)
-    first = np.repeat(low - np.concatenate(([0], np.cumsum(counts)[:-1])), counts)
-    partner = first + np.arange(which.size)
-    difference = y[partner] - predicted[which]
-    window = tick / 2
-    ordered = np.sort(difference)
-    held = np.searchsorted(ordered, ordered + window, side="right") - np.arange(ordered.size)
-    start = ordered[int(held.argmax())] if ordered.size else 0.0
-    chosen = (difference >= start) & (difference <= start + window)
-    if chosen.sum() < MIN_PULSES // 2:
-        raise ClockRefused("no_match", "the trains fit nowhere")
-    uc = u[which[chosen]]
-    slope, level = theil_sen(uc, y[partner[chosen]] - x[which[chosen]])
-    return slope, level
-
-
-def _pair(x: Floats, y: Floats, predicted: Floats, gate: float) -> tuple[Ints, Ints]:
-    """Indices into x and y of pulses that are each other's nearest, closer than `gate`."""
-    to_y = _nearest(y, predicted)
-    order = np.argsort(predicted, kind="stable")
-    back = order[_nearest(predicted[order], y)]
-    i = np.flatnonzero((back[to_y] == np.arange(x.size)) & (np.abs(y[to_y] - predicted) <= gate))
-    return i, to_y[i]
-
-
-def _nearest(grid: Floats, values: Floats) -> Ints:
-    right = np.clip(np.searchsorted(grid, values), 1, grid.size - 1)
-    left = right - 1
-    return np.where(values - grid[left] <= grid[right] - values, left, right).astype(np.int64)
-
-
-def _gate_share(
-    x: Floats, y: Floats, pairs: tuple[Ints, Ints], slope: float, centre: float, level: float
-) -> None:
+def _gate_share(x: Floats, y: Floats, match: Match) -> None:
     """Refuse when, where the trains overlap, too few pulses of the shorter have a partner."""
-    matched = int(pairs[0].size)
-    predicted = (x - centre) * (1 + slope) + centre + level
-    low, high = max(predicted.min(), y[0]), min(predicted.max(), y[-1])
-    in_x = int(((predicted >= low) & (predicted <= high)).sum())
+    matched = int(match.device.size)
+    if matched < MIN_PULSES:
+        raise ClockRefused(
+            "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
+        )
+    px, py = x[match.device], y[match.reference]
+    lag = float(np.median(py - px))
+    low, high = max(x[0] + lag, y[0]), min(x[-1] + lag, y[-1])
+    in_x = int(((x + lag >= low) & (x + lag <= high)).sum())
     in_y = int(((y >= low) & (y <= high)).sum())
     share = matched / max(1, min(in_x, in_y))
     if share < MIN_MATCHED:
@@ -350,7 +254,28 @@ def _gate_share(
             f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}); "
             f"{in_x} device and {in_y} reference pulses overlap",
         )
-    if matched < MIN_PULSES:
+
+
+def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
+    """Refuse a line that is too steep, that bends like no clock, or on which too little lies."""
+    steepest = float(line.slopes[np.abs(line.slopes).argmax()]) * 1e6
+    p95 = float(np.quantile(np.abs(line.residuals[line.inside]), 0.95))
+    if p95 > 3 * jitter_ns or line.inside.mean() < MIN_MATCHED:
         raise ClockRefused(
-            "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
+            "residuals",
+            f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
+            f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
         )
+    if line.slope_change > line.slope_change_allowed:
+        raise ClockRefused(
+            "residuals",
+            f"the drift changes by {line.slope_change * 1e6:.1f} ppm within "
+            f"{float(np.diff(line.knots).mean()) / 1e9:.1f} s (at most "
+            f"{line.slope_change_allowed * 1e6:.1f}): a clock jumped",
+        )
+    if abs(steepest) > max_drift_ppm:
+        raise ClockRefused(
+            "drift", f"the clocks differ by {steepest:.1f} ppm, more than {max_drift_ppm:g}"
+        )
+    if not line.straightened:
+        raise ClockRefused("residuals", "what the line leaves over is not jitter: a clock jumped")

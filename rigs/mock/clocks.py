@@ -42,7 +42,7 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
     offset = generator(trial_seed, "clock offset").integers(0, longest, 3, endpoint=True)
     largest = (settings.arm_ppm, settings.event_camera_ppm, settings.frame_camera_ppm)
     arm, events, frames = (
-        ClockMap(0, int(start), round(share * ppm * 1000))
+        ClockMap.line(0, int(start), round(share * ppm * 1000))
         for start, share, ppm in zip(offset, drift, largest, strict=False)
     )
     return TrialClocks(arm, events, frames, round(drift[3] * settings.sync_box_ppm * 1000))
@@ -72,7 +72,7 @@ class FaultyClock(ClockMap):
         gained = np.zeros(np.shape(times), np.int64)
         for fault, due in self._drifts():
             since = np.maximum(np.asarray(times) - due, 0).astype(np.int64)
-            gained += ClockMap(0, 0, round(fault.ppm * 1000)).to_reference(since) - since
+            gained += ClockMap.line(0, 0, round(fault.ppm * 1000)).to_reference(since) - since
         gained += self.jumped_ns(np.asarray(times, np.int64))
         return shown + int(gained) if isinstance(shown, int) else shown + gained
 
@@ -105,7 +105,7 @@ class FaultyClock(ClockMap):
         """
         result = true_ns
         for fault, due in self._drifts():
-            after = ClockMap(due, due, round(fault.ppm * 1000)).to_device(result)
+            after = ClockMap.line(due, due, round(fault.ppm * 1000)).to_device(result)
             result = np.where(result > due, after, result)
         return result
 
@@ -151,16 +151,14 @@ def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
     jumps = [fault for fault in faults.of(ClockJump) if fault.device == device]
     if not hit and not jumps:
         return clock
-    return FaultyClock(
-        clock.device_anchor_ns, clock.reference_anchor_ns, clock.drift_ppb, device, faults
-    )
+    return FaultyClock(clock.device_ns, clock.reference_ns, clock.drift, device, faults)
 
 
 def undisturbed(clock: ClockMap) -> ClockMap:
     """What the device's cycles run by: `clock` without its faults."""
     if type(clock) is ClockMap:
         return clock
-    return ClockMap(clock.device_anchor_ns, clock.reference_anchor_ns, clock.drift_ppb)
+    return ClockMap(clock.device_ns, clock.reference_ns, clock.drift)
 
 
 class HighestStamp:

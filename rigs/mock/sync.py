@@ -39,7 +39,7 @@ class MockSyncBox:
         self.started_ns = 0
         self.stopped_ns: int | None = 0
         self._dark_ns = NEVER
-        self.clock = ClockMap(0, 0, 0)
+        self.clock = ClockMap.line(0, 0)
         self._read = 0
         self._bits: U8 = np.zeros(0, np.uint8)
         self._reports = _PulseFaults(self._world, self, "sync_box")
@@ -53,7 +53,7 @@ class MockSyncBox:
         world = self._world
         self.run += 1
         self.rate_hz, self.started_ns, self.stopped_ns, self._read = rate_hz, world.now_ns, None, 0
-        clock = ClockMap(self.started_ns, 0, world.clocks.sync_box_ppb)
+        clock = ClockMap.line(self.started_ns, 0, world.clocks.sync_box_ppb)
         self.clock = faulty(clock, "sync_box", world.faults)
         self._bits = code_bits(seed, PERIOD)
         self._reports = _PulseFaults(world, self, "sync_box")

@@ -12,7 +12,7 @@ from storage.store import Campaign, Store
 from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
 from storage.writer import TrialWriter
 
-IDENTITY = {"device_anchor_ns": 0, "reference_anchor_ns": 0, "drift_ppb": 0}
+IDENTITY = {"device_ns": [0], "reference_ns": [0], "drift": [0]}
 FRAME = (48, 32)
 
 

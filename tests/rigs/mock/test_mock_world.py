@@ -148,6 +148,6 @@ def test_waiting_backwards_is_refused(devices: MockDevices) -> None:
 
 
 def test_times_near_2_to_the_53_stay_distinct() -> None:
-    clock = ClockMap(0, (1 << 53) - 2, 50_000)
+    clock = ClockMap.line(0, (1 << 53) - 2, 50_000)
     times = clock.to_reference(np.arange(5, dtype=np.int64))
     assert np.diff(times).tolist() == [1, 1, 1, 1]

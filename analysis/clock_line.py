@@ -1,0 +1,241 @@
+"""A clock's line through pulses of which some may be wrong: straight, or bent where the clock bends.
+
+A crystal that warms up drifts by a few ppm more at the end of a trial than at its beginning; a
+straight line is then wrong by a hundred microseconds and does not know it. So the line gets as many
+pieces as its residuals ask for, by a test on their means, and no more. It also says how far it may
+be wrong: the 95 % quantile of the largest error anywhere between the first and the last pulse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_HUBER = 1.345
+_GATE = 5.0
+_MAX_PIECES = 64
+_PIECE_PULSES = 30
+_BLOCK_PULSES = 12
+_CHANCE = 1e-4
+"""How often a straight clock is given more pieces than it needs."""
+_RUNS = (8, 16, 32)
+_DRAWS = 8192
+
+
+def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
+    """Median of the slopes between pulses half the train apart, and the median level at x = 0.
+
+    Not all pairs, as in Theil (1950) and Sen (1968): the near ones say little of the slope, and
+    there are n**2 of them. It stands a quarter of bad points.
+    """
+    half = x.size // 2
+    run = x[half : 2 * half] - x[:half]
+    far = run > 0
+    slope = float(np.median((y[half : 2 * half] - y[:half])[far] / run[far])) if far.any() else 0.0
+    return slope, float(np.median(y - slope * x))
+
+
+@dataclass(frozen=True)
+class ClockLine:
+    """Straight lines that join at knots, and how well pulses lie on them.
+
+    Attributes:
+        knots, values: (k + 1,) x and y of the knots, first and last pulse included, ns.
+        residuals: (n,) y less the line at every pulse, ns.
+        inside: (n,) whether a pulse lies on the line, within 5 sigma.
+        sigma: scatter of the pulses on the line, ns.
+        uncertainty: largest error of the line from the first to the last knot, 95 %, ns.
+        slope_change: largest change of the slope from one piece to the next, and
+        slope_change_allowed: what chance and the limit allow there; ns / ns.
+        straightened: whether what is left over looks like chance.
+    """
+
+    knots: Floats
+    values: Floats
+    residuals: Floats
+    inside: Bools
+    sigma: float
+    uncertainty: float
+    slope_change: float
+    slope_change_allowed: float
+    straightened: bool
+
+    @property
+    def slopes(self) -> Floats:
+        """Slope of each piece, (k,)."""
+        result: Floats = np.diff(self.values) / np.diff(self.knots)
+        return result
+
+
+def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> ClockLine:
+    """The line of a clock through pulses at rising x, with as few pieces as the residuals allow.
+
+    Args:
+        x: (n,) times of the pulses, rising, ns.
+        y: (n,) what the other clock gained there, ns.
+        resolution: unit of the stamps, ns: means that differ by less than half of it are no bend.
+        bend_per_ns: by how much a slope may change in a nanosecond.
+    """
+    slope, level = theil_sen(x, y)
+    floor = max(0.3 * resolution, 0.5)
+    rough = y - slope * x - level
+    # scatter between neighbours is free of any bend
+    local = max(1.4826 * float(np.median(np.abs(np.diff(rough)))) / 2**0.5, floor)
+    knots = x[[0, -1]]
+    values = slope * knots + level
+    while True:
+        values, residuals, inside, sigma = _robust(x, y, knots, values, floor)
+        straight = _is_chance(residuals[inside], knots.size, min(local, sigma), resolution / 2)
+        pieces = knots.size - 1
+        if straight or 2 * pieces > min(_MAX_PIECES, int(inside.sum()) // _PIECE_PULSES):
+            break
+        at = np.flatnonzero(inside)
+        ends = np.linspace(0, at.size - 1, 2 * pieces + 1).round().astype(np.int64)
+        finer = x[at[ends]]
+        finer[0], finer[-1] = x[0], x[-1]
+        values, knots = np.interp(finer, knots, values), finer
+    return _judged(x, knots, values, residuals, inside, sigma, resolution, bend_per_ns, straight)
+
+
+def _robust(
+    x: Floats, y: Floats, knots: Floats, values: Floats, floor: float
+) -> tuple[Floats, Floats, Bools, float]:
+    """Huber's M-estimate of the values at knots on what lies inside 5 robust sigma."""
+    piece = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2)
+    share = (x - knots[piece]) / (knots[piece + 1] - knots[piece])
+    residuals = y - np.interp(x, knots, values)
+    for _ in range(20):
+        size = np.abs(residuals)
+        sigma = max(1.4826 * float(np.median(size)), floor)
+        inside = size <= _GATE * sigma
+        weights = inside * np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-9))
+        new = _least_squares(piece, share, y, weights, knots.size)
+        moved = float(np.abs(new - values).max())
+        values = new
+        residuals = y - (values[piece] + share * (values[piece + 1] - values[piece]))
+        if moved < 1e-3 * sigma:
+            break
+    sigma = float(np.sqrt((residuals[inside] ** 2).sum() / max(1, inside.sum() - knots.size)))
+    return values, residuals, inside, max(sigma, floor)
+
+
+def _normal_matrix(piece: NDArray[np.int64], share: Floats, weights: Floats, n: int) -> Floats:
+    """Of the hat functions at n knots."""
+    matrix = np.zeros((n, n))
+    here, there = np.arange(n - 1), np.arange(1, n)
+    matrix[here, here] += np.bincount(piece, weights * (1 - share) ** 2, n - 1)
+    matrix[there, there] += np.bincount(piece, weights * share**2, n - 1)
+    matrix[here, there] = np.bincount(piece, weights * share * (1 - share), n - 1)
+    matrix[there, here] = matrix[here, there]
+    return matrix
+
+
+def _least_squares(
+    piece: NDArray[np.int64], share: Floats, y: Floats, weights: Floats, n: int
+) -> Floats:
+    right = np.zeros(n)
+    right[:-1] += np.bincount(piece, weights * (1 - share) * y, n - 1)
+    right[1:] += np.bincount(piece, weights * share * y, n - 1)
+    matrix = _normal_matrix(piece, share, weights, n)
+    # a piece with a single pulse in it hangs on its neighbours
+    matrix[np.diag_indices(n)] += 1e-12 * matrix.trace() / n
+    result: Floats = np.linalg.solve(matrix, right)
+    return result
+
+
+def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -> bool:
+    """Whether the means of stretches of the train are as small as chance makes them."""
+    blocks = min(max(8, 4 * (parameters - 1)), residuals.size // _BLOCK_PULSES)
+    if blocks <= parameters:
+        return True
+    edges = np.linspace(0, residuals.size, blocks + 1).round().astype(np.int64)
+    counts = np.diff(edges)
+    means = np.add.reduceat(residuals, edges[:-1]) / counts
+    excess = np.maximum(np.abs(means) - slack, 0.0) if slack > sigma else means
+    square = float((excess**2 * counts).sum()) / sigma**2
+    return square <= float(special.chdtri(blocks - parameters, _CHANCE))
+
+
+def _judged(
+    x: Floats, knots: Floats, values: Floats, residuals: Floats, inside: Bools, sigma: float,
+    resolution: float, bend_per_ns: float, straight: bool,
+) -> ClockLine:  # fmt: skip
+    """The line with its uncertainty."""
+    inner, n = residuals[inside], knots.size
+    piece = np.clip(np.searchsorted(knots, x[inside], side="right") - 1, 0, n - 2)
+    share = (x[inside] - knots[piece]) / (knots[piece + 1] - knots[piece])
+    matrix = _normal_matrix(piece, share, np.ones(inner.size), n)
+    matrix[np.diag_indices(n)] += 1e-12 * matrix.trace() / n
+    # asymptotic variance of Huber's estimate (Huber 1964): E psi^2 / (E psi')^2
+    limit = _HUBER * sigma
+    linear = max(float((np.abs(inner) < limit).mean()), 0.1)
+    variance = float((np.minimum(np.abs(inner), limit) ** 2).mean()) / linear**2
+    variance *= inner.size / max(1, inner.size - n)
+    covariance = variance * np.linalg.inv(matrix)
+    root = np.linalg.cholesky(covariance + (1e-12 * covariance.trace() / n + 1e-6) * np.eye(n))
+    # between knots the error is no larger than at one of them
+    largest = np.abs(_draws(n) @ root.T).max(axis=1)
+    band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
+    band *= float(special.stdtrit(max(1, inner.size - n), 0.975)) / 1.959964
+    change, allowed, sag = 0.0, bend_per_ns, 0.0
+    if n > 2:
+        run = np.diff(knots)
+        # slopes' changes as a linear function of the values
+        to_change = np.zeros((n - 2, n))
+        here = np.arange(n - 2)
+        to_change[here, here], to_change[here, here + 2] = 1 / run[:-1], 1 / run[1:]
+        to_change[here, here + 1] = -1 / run[:-1] - 1 / run[1:]
+        changes = np.abs(to_change @ values)
+        chance = np.sqrt(np.einsum("ij,jk,ik->i", to_change, covariance, to_change))
+        spans = 0.5 * (run[:-1] + run[1:])
+        worst = int((changes - 5 * chance - bend_per_ns * spans).argmax())
+        change = float(changes[worst])
+        allowed = float(5 * chance[worst] + bend_per_ns * spans[worst])
+        # a parabola sags by an eighth of the slope's change over a piece; what changes faster than
+        # clocks bend may be a jump, of which half is wrong next to it
+        smooth = np.minimum(changes, bend_per_ns * spans)
+        sudden = np.maximum(changes - chance - smooth, 0.0)
+        sag = float(((smooth / 8 + sudden / 2) * np.maximum(run[:-1], run[1:])).max())
+    return ClockLine(
+        knots, values, residuals, inside, sigma,
+        1.0 + band + sag + _left_over(inner, sigma) + _locked(inner, resolution),
+        change, allowed, straight,
+    )  # fmt: skip
+
+
+def _left_over(residuals: Floats, sigma: float) -> float:
+    """By how much the mean of a few pulses in a row is off beyond chance, as next to a jump, ns."""
+    sums = np.concatenate([[0.0], np.cumsum(residuals)])
+    worst = 0.0
+    for count in _RUNS:
+        if count <= residuals.size:
+            means, chance = np.abs(sums[count:] - sums[:-count]) / count, sigma / count**0.5
+            # of a clock that drifts away at an end, the mean shows half
+            at_end = 2.0 * (max(float(means[0]), float(means[-1])) - 3.0 * chance)
+            worst = max(worst, float(means.max()) - 5.0 * chance, at_end)
+    return worst
+
+
+def _locked(residuals: Floats, resolution: float) -> float:
+    """What stamps cut to a unit hide where nothing shakes them, ns.
+
+    Jitter spreads stamps over units, and their mean finds the middle; what is left falls as
+    exp(-2 pi^2 sigma^2 / unit^2) (Widrow and Kollar 2008), and is half a unit without any jitter.
+    """
+    if resolution == 0.0 or residuals.size < 2:
+        return 0.0
+    shaken = 1.4826 * float(np.median(np.abs(np.diff(residuals)))) / 2**0.5 / resolution
+    return 0.5 * resolution * float(np.exp(-2 * np.pi**2 * shaken**2))
+
+
+@lru_cache(maxsize=_MAX_PIECES)
+def _draws(n: int) -> Floats:
+    """Normal numbers, the same ones always, (draws, n)."""
+    return np.random.default_rng(n).standard_normal((_DRAWS, n))
