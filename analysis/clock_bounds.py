@@ -34,7 +34,7 @@ class BoundedClock:
     Attributes:
         map: device ns to reference ns, the middle of all lines that are possible.
         uncertainty_ns: the map is off by no more between the first and the last pair, ns.
-        drift_ppm, drift_error_ppm: what the reference gains, and half the range that is possible.
+        drift_ppm, drift_error_ppm: middle and half of the range of drifts that is possible.
         pairs: how many pairs of bounds there were.
         tightest_ns: width of the narrowest of them.
     """
@@ -68,9 +68,58 @@ def fit_bounds(
         raise ValueError(f"{device.size} pairs of bounds; at least {MIN_PAIRS} are needed")
     if (low > high).any():
         raise BoundsContradictError("an instant's earliest time lies after its latest one")
-    origin, image = int(device[0]), int(low[0])
-    x = (device - origin).astype(np.float64)
-    below, above = ((b - image - (device - origin)).astype(np.float64) for b in (low, high))
-    below, above = below[_hull(x, below, 1.0)], above[_hull(x, -above, 1.0)]
-    x_below, x_above = x[_hull_of(x, device, low, origin, image)], x[_hull_of(x, device, high, origin, image, -1.0)]
-    raise NotImplementedError
+    origin, image = int(device.min()), int(low[0])
+    x = (device - origin) * 1e-9
+    least = (low - image - (device - origin)) * 1e-3
+    most = (high - image - (device - origin)) * 1e-3
+    # the line is level + slope x: us over s, that is ppm
+    run = max(float(x.max()), 1e-3)
+    kept_low, kept_high = _upper_hull(x, least), _upper_hull(x, -most)
+    rows = np.concatenate(
+        [
+            -np.stack([np.ones(kept_low.size), x[kept_low]], axis=1),
+            np.stack([np.ones(kept_high.size), x[kept_high]], axis=1),
+        ]
+    )
+    limits = np.concatenate([-least[kept_low], most[kept_high]])
+    drift = (-max_drift_ppm, max_drift_ppm)
+    ranges = []
+    for value in ((1.0, 0.0), (1.0, run), (0.0, 1.0)):
+        ends = []
+        for sign in (1.0, -1.0):
+            found = optimize.linprog(
+                sign * np.array(value), A_ub=rows, b_ub=limits, bounds=((None, None), drift)
+            )
+            if found.status != 0:
+                raise BoundsContradictError(
+                    "no clock that runs straight lies between the bounds: it jumped, it drifts by "
+                    f"more than {max_drift_ppm:g} ppm, or a message took longer than is allowed"
+                )
+            ends.append(sign * float(found.fun))
+        ranges.append((0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])))
+    (at_begin, spread_begin), (at_end, spread_end), (drift_ppm, spread_drift) = ranges
+    slope = (at_end - at_begin) / run
+    return BoundedClock(
+        map=ClockMap((origin,), (image + round(at_begin * 1e3),), (round(slope * 1e12),)),
+        uncertainty_ns=1e3 * max(spread_begin, spread_end) + 1.0,
+        drift_ppm=drift_ppm,
+        drift_error_ppm=spread_drift,
+        pairs=int(device.size),
+        tightest_ns=int((high - low).min()),
+    )
+
+
+def _upper_hull(x: Floats, y: Floats) -> Ints:
+    """Indices of the points on the upper convex hull: the only ones that bind a line from below."""
+    order = np.lexsort((y, x))
+    hull: list[int] = []
+    for k in order.tolist():
+        while len(hull) > 1:
+            a, b = hull[-2], hull[-1]
+            if (x[b] - x[a]) * (y[k] - y[a]) < (y[b] - y[a]) * (x[k] - x[a]):
+                break
+            hull.pop()
+        if hull and x[hull[-1]] == x[k]:
+            hull.pop()
+        hull.append(k)
+    return np.array(hull, np.int64)

@@ -9,6 +9,7 @@ there and each part is fitted by itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,8 +35,8 @@ class Unwrapped:
     @property
     def stretches(self) -> list[slice]:
         """The stretches between restarts, in order; at least one unless there are no stamps."""
-        ends = [*self.starts[1:].tolist(), self.ns.size]
-        return [slice(a, b) for a, b in zip(self.starts.tolist(), ends, strict=True)]
+        edges = [*self.starts.tolist(), self.ns.size]
+        return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def unwrap(
@@ -97,7 +98,7 @@ def unwrap(
         whole[start:] += times[start] - whole[start]
     wraps = sum(
         int(whole[end - 1] // turn - whole[start] // turn)
-        for start, end in zip(starts.tolist(), [*starts[1:].tolist(), whole.size], strict=True)
+        for start, end in pairwise([*starts.tolist(), whole.size])
     )
     return Unwrapped(whole, starts, wraps)
 
@@ -106,4 +107,4 @@ def split_at_restarts(times_ns: Ints, back_ns: int) -> list[slice]:
     """Stretches of whole times that came in order, cut where the clock falls back by `back_ns`."""
     cuts = np.flatnonzero(np.diff(times_ns) < -back_ns) + 1
     edges = [0, *cuts.tolist(), int(times_ns.size)]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [slice(a, b) for a, b in pairwise(edges) if b > a]
