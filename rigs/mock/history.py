@@ -59,7 +59,10 @@ class History:
         return times[first:last], self._rows[first : min(last, self._length)]
 
     def at(self, t_ns: I64) -> F64:
-        """Rows at rising times by straight lines; after the end the last row, (k, width).
+        """Rows at times by straight lines; after the end the last row, (k, width).
+
+        Args:
+            t_ns: (k,); none is before its first or after its last.
 
         Raises:
             IndexError: a time lies before the first row.

@@ -7,7 +7,6 @@ the mean over places along the way (midpoint rule).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -17,7 +16,11 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 Look = Callable[[I64], tuple[F64, F64]]
-"""From rising times, ns, (k,), to tips (k, n, 2) and heights of the plate (k,), in mm."""
+"""From times, ns, (k,), to tips (k, n, 2) and heights of the plate (k,), in mm.
+
+Times rise within an exposure, and from exposure to exposure: none is before the first or after the
+last of them.
+"""
 
 STILL_PX = 0.1
 """Shorter ways than this are drawn at their mean place."""
@@ -55,28 +58,41 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     Places that hardly move are averaged by Simpson's rule over beginning, middle and end.
     """
     half = exposure_ns // 2
-    begin, middle, end = (look(mid_ns + shift) for shift in (-half, 0, half))
-    tips = (begin[0] + 4.0 * middle[0] + end[0]) / 6.0
-    plate = (begin[1] + 4.0 * middle[1] + end[1]) / 6.0
-    # one more thing that moves: the plate, as (m, 1, 2)
-    path = [
-        np.concatenate([places, np.stack([0.0 * height, height], axis=-1)[:, None]], axis=1)
-        for places, height in (begin, middle, end)
-    ]
-    way = px_per_mm * (_length(path[1] - path[0]) + _length(path[2] - path[1]))
-    bend = px_per_mm * _length(path[0] - 2.0 * path[1] + path[2])
-    farthest = way.max(axis=1, initial=0.0)
-    ways = {}
-    for index in np.flatnonzero(
-        (farthest >= STILL_PX) | (bend.max(axis=1, initial=0.0) >= BEND_PX)
-    ).tolist():
-        count = min(max(_FEWEST, math.ceil(farthest[index] / _STEP_PX)), _MOST)
-        # midpoints of equal shares, to a nanosecond
-        shares = (2 * np.arange(count, dtype=np.int64) + 1) * (2 * half) // (2 * count)
-        seen = Way(*look(mid_ns[index] - half + shares))
+    # one look for everything: what it costs is the call
+    tips, plate = look((mid_ns[:, None] + np.array([-half, 0, half], np.int64)).ravel())
+    begin, middle, end = np.moveaxis(tips.reshape(-1, 3, *tips.shape[1:]), 1, 0)
+    low, centre, high = plate.reshape(-1, 3).T
+    way = _length(middle - begin) + _length(end - middle)
+    bend = _length(begin - 2.0 * middle + end)
+    sunk = np.abs(centre - low) + np.abs(high - centre)
+    bowed = np.abs(low - 2.0 * centre + high)
+    farthest = px_per_mm * np.maximum(way.max(axis=1, initial=0.0), sunk)
+    bent = px_per_mm * np.maximum(bend.max(axis=1, initial=0.0), bowed)
+    tips = (begin + 4.0 * middle + end) / 6.0
+    plate = (low + 4.0 * centre + high) / 6.0
+    smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
+    counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
+    ways = _ways(look, mid_ns[smeared] - half, 2 * half, counts, smeared.tolist())
+    for index, seen in ways.items():
         tips[index], plate[index] = seen.tips_mm.mean(axis=0), seen.plate_mm.mean()
-        ways[index] = seen
     return Exposures(tips, plate, ways)
+
+
+def _ways(
+    look: Look, begin_ns: I64, length_ns: int, counts: I64, indices: list[int]
+) -> dict[int, Way]:
+    """The ways of exposures that begin at `begin_ns`, (k,), in `counts` equal shares each."""
+    if not indices:
+        return {}
+    ends = np.cumsum(counts)
+    share = np.arange(ends[-1], dtype=np.int64) - np.repeat(ends - counts, counts)
+    # midpoints of equal shares, to a nanosecond
+    inside = (2 * share + 1) * length_ns // (2 * np.repeat(counts, counts))
+    tips, plate = look(np.repeat(begin_ns, counts) + inside)
+    return {
+        index: Way(tips[end - count : end], plate[end - count : end])
+        for index, end, count in zip(indices, ends.tolist(), counts.tolist(), strict=True)
+    }
 
 
 def moved(way_px: F64) -> npt.NDArray[np.bool_]:
