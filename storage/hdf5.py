@@ -47,7 +47,8 @@ class StreamFile:
         if not len(chunk):
             return
         first, last = int(chunk.t_us[0]), int(chunk.t_us[-1])
-        if (self._last_us is not None and first < self._last_us) or np.any(chunk.t_us[1:] < chunk.t_us[:-1]):
+        backwards = bool(np.any(chunk.t_us[1:] < chunk.t_us[:-1]))
+        if backwards or (self._last_us is not None and first < self._last_us):
             raise ValueError(f"event times run backwards at {first} us")
         if self._offset is None:
             self._offset = first

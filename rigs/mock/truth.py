@@ -65,9 +65,12 @@ def truth_of(
         late = true_ns is not None and true_ns >= torn_ns.get(i, NEVER)
         return None if late else true_ns
 
-    markers = [on_box(there(i, _crossing(t_ns, moved[:, i], threshold_mm))) for i in range(n)]
+    crossed, began = _first(moved > threshold_mm), _first(slid > SLIP_MM)
+    markers = [
+        on_box(there(i, _crossing(t_ns, moved[:, i], threshold_mm, crossed[i]))) for i in range(n)
+    ]
     slips = [
-        on_box(there(i, _first_slip(t_ns, slid[:, i], rows[:, 3 * n + i], reference_true_ns)))
+        on_box(there(i, _first_slip(rows[:, 3 * n + i], reference_true_ns, began[i])))
         for i in range(n)
     ]
     return {
@@ -83,21 +86,22 @@ def truth_of(
     }
 
 
-def _crossing(t_ns: I64, distance: F64, limit: float) -> float | None:
-    """When a distance first exceeds a limit, straight between the rows."""
-    above = np.flatnonzero(distance > limit)
-    if not len(above):
+def _first(above: npt.NDArray[np.bool_]) -> list[int | None]:
+    """First row of each column, (k, n), that is true."""
+    rows = above.argmax(axis=0).tolist()
+    return [row if above[row, i] else None for i, row in enumerate(rows)]
+
+
+def _crossing(t_ns: I64, distance: F64, limit: float, k: int | None) -> float | None:
+    """When a distance, first beyond a limit in row `k`, exceeds it: straight between the rows."""
+    if k is None:
         return None
-    k = int(above[0])
     low, high = float(distance[k - 1]), float(distance[k])
     share = (limit - low) / (high - low)
     return float(t_ns[k - 1]) + share * float(t_ns[k] - t_ns[k - 1])
 
 
-def _first_slip(t_ns: I64, slid: F64, slipped_s: F64, reference_ns: int) -> float | None:
-    """When a tip first went from stick to slip, as the solver located it within its step."""
-    above = np.flatnonzero(slid > SLIP_MM)
-    if not len(above):
-        return None
+def _first_slip(slipped_s: F64, reference_ns: int, k: int | None) -> float | None:
+    """When a tip that slides in row `k` went from stick to slip: located within its step."""
     # a row or two may pass before the way slid counts; the tip began where it last stuck
-    return max(float(slipped_s[above[0]]) * 1e9, float(reference_ns))
+    return None if k is None else max(float(slipped_s[k]) * 1e9, float(reference_ns))

@@ -72,27 +72,18 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     plate = (low + 4.0 * centre + high) / 6.0
     smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
-    ways = _ways(look, mid_ns[smeared] - half, 2 * half, counts, smeared.tolist())
-    for index, seen in ways.items():
-        tips[index], plate[index] = seen.tips_mm.mean(axis=0), seen.plate_mm.mean()
+    ways: dict[int, Way] = {}
+    for count in np.unique(counts).tolist():
+        # ways of as many places are looked at together
+        here = smeared[counts == count]
+        # midpoints of equal shares, to a nanosecond
+        shares = (2 * np.arange(count, dtype=np.int64) + 1) * (2 * half) // (2 * count)
+        along, heights = look((mid_ns[here, None] - half + shares).ravel())
+        along = along.reshape(-1, count, *along.shape[1:])
+        heights = heights.reshape(-1, count)
+        tips[here], plate[here] = along.mean(axis=1), heights.mean(axis=1)
+        ways.update(zip(here.tolist(), map(Way, along, heights), strict=True))
     return Exposures(tips, plate, ways)
-
-
-def _ways(
-    look: Look, begin_ns: I64, length_ns: int, counts: I64, indices: list[int]
-) -> dict[int, Way]:
-    """The ways of exposures that begin at `begin_ns`, (k,), in `counts` equal shares each."""
-    if not indices:
-        return {}
-    ends = np.cumsum(counts)
-    share = np.arange(ends[-1], dtype=np.int64) - np.repeat(ends - counts, counts)
-    # midpoints of equal shares, to a nanosecond
-    inside = (2 * share + 1) * length_ns // (2 * np.repeat(counts, counts))
-    tips, plate = look(np.repeat(begin_ns, counts) + inside)
-    return {
-        index: Way(tips[end - count : end], plate[end - count : end])
-        for index, end, count in zip(indices, ends.tolist(), counts.tolist(), strict=True)
-    }
 
 
 def moved(way_px: F64) -> npt.NDArray[np.bool_]:
