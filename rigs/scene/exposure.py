@@ -7,11 +7,13 @@ the mean over places along the way (midpoint rule).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -60,16 +62,9 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     half = exposure_ns // 2
     # one look for everything: what it costs is the call
     tips, plate = look((mid_ns[:, None] + np.array([-half, 0, half], np.int64)).ravel())
-    begin, middle, end = np.moveaxis(tips.reshape(-1, 3, *tips.shape[1:]), 1, 0)
-    low, centre, high = plate.reshape(-1, 3).T
-    way = _length(middle - begin) + _length(end - middle)
-    bend = _length(begin - 2.0 * middle + end)
-    sunk = np.abs(centre - low) + np.abs(high - centre)
-    bowed = np.abs(low - 2.0 * centre + high)
-    farthest = px_per_mm * np.maximum(way.max(axis=1, initial=0.0), sunk)
-    bent = px_per_mm * np.maximum(bend.max(axis=1, initial=0.0), bowed)
-    tips = (begin + 4.0 * middle + end) / 6.0
-    plate = (low + 4.0 * centre + high) / 6.0
+    tips, plate, farthest, bent = _average(
+        tips.reshape(-1, 3, *tips.shape[1:]), plate.reshape(-1, 3), px_per_mm
+    )
     smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
     ways: dict[int, Way] = {}
@@ -98,3 +93,28 @@ def moved(way_px: F64) -> npt.NDArray[np.bool_]:
 def _length(vector: F64) -> F64:
     result: F64 = np.hypot(vector[..., 0], vector[..., 1])
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
+    """Simpson's mean of tips (m, 3, n, 2) and plate (m, 3) over beginning, middle and end.
+
+    Also the longest way of anything in each exposure, and its largest bend, px, (m,).
+    """
+    m, _, n, _ = tips.shape
+    mean, height = np.empty((m, n, 2)), np.empty(m)
+    way, bend = np.empty(m), np.empty(m)
+    for k in range(m):
+        low, middle, high = plate[k]
+        height[k] = (low + 4.0 * middle + high) / 6.0
+        farthest = abs(middle - low) + abs(high - middle)
+        bent = abs(low - 2.0 * middle + high)
+        for i in range(n):
+            (x0, y0), (x1, y1), (x2, y2) = tips[k, 0, i], tips[k, 1, i], tips[k, 2, i]
+            mean[k, i, 0] = (x0 + 4.0 * x1 + x2) / 6.0
+            mean[k, i, 1] = (y0 + 4.0 * y1 + y2) / 6.0
+            first, second = math.hypot(x1 - x0, y1 - y0), math.hypot(x2 - x1, y2 - y1)
+            farthest = max(farthest, first + second)
+            bent = max(bent, math.hypot(x0 - 2.0 * x1 + x2, y0 - 2.0 * y1 + y2))
+        way[k], bend[k] = px_per_mm * farthest, px_per_mm * bent
+    return mean, height, way, bend
