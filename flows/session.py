@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 
 from flows.quality import Assessment, assess
@@ -234,13 +235,21 @@ class Session:
             "started": started.isoformat(timespec="milliseconds"),
             "ended": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "host": socket.gethostname(),
-            "system": platform.platform(),
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in _PACKAGES},
+            **_installed(),
             "operator": self.operator,
             "skin": self.rig_file.skin.serial,
             "disk_free": shutil.disk_usage(self.campaign.folder).free,
         }
+
+
+@cache
+def _installed() -> Json:
+    """What does not change while a program runs, and takes long to find out."""
+    return {
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in _PACKAGES},
+    }
 
 
 def _cause(error: BaseException) -> str:

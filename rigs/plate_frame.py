@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -62,12 +63,14 @@ class PlateFrame:
         x, y, z = self.axes
         depth = position.depth_mm + self.zero_mm
         xyz = self.origin + position.x_mm * x + position.y_mm * y + depth * z
-        rotation = Rotation.from_matrix(np.column_stack([x, y, z]))
-        rotvec = np.degrees(rotation.as_rotvec())
-        return Pose(
-            (float(xyz[0]), float(xyz[1]), float(xyz[2])),
-            (float(rotvec[0]), float(rotvec[1]), float(rotvec[2])),
-        )
+        return Pose((float(xyz[0]), float(xyz[1]), float(xyz[2])), self._rotvec_deg)
+
+    @cached_property
+    def _rotvec_deg(self) -> tuple[float, float, float]:
+        """How the tool stands: the same for every place."""
+        rotation = Rotation.from_matrix(np.column_stack(tuple(self.axes)))
+        a, b, c = np.degrees(rotation.as_rotvec()).tolist()
+        return a, b, c
 
     def position(self, xyz_mm: Sequence[float]) -> Position:
         """The place in plate coordinates of a tool centre point in the base frame."""

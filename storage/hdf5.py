@@ -12,43 +12,10 @@ from types import TracebackType
 from typing import Any
 
 import h5py
-import hdf5plugin
 import numpy as np
-import numpy.typing as npt
 
+from storage.columns import COLUMNS, INDEX, OFFSET, TRACKS, Array, Column, blank, create
 from storage.streams import I64, EventChunk, FrameChunk, PoseChunk, PulseChunk
-
-Array = npt.NDArray[Any]
-
-EVENT_CHUNK = 1 << 16
-SMALL_CHUNK = 1 << 10
-SMALL_HELD = 1 << 14
-"""Rows of small columns that are held back; each write costs more than what is in it."""
-FORMAT = 1
-
-# column -> (dtype, trailing shape, unit)
-COLUMNS: dict[str, tuple[str, tuple[int, ...], str]] = {
-    "events/x": ("uint16", (), "px"),
-    "events/y": ("uint16", (), "px"),
-    "events/p": ("uint8", (), "1 brighter, 0 darker"),
-    "events/t": ("int64", (), "us of the event camera's clock after t_offset"),
-    "event_pulses/t": ("int64", (), "ns of the event camera's clock"),
-    "arm_pulses/t": ("int64", (), "ns of the arm controller's clock"),
-    "sync_pulses/t": ("int64", (), "ns of the sync box's clock: the trial's time line"),
-    "poses/t": ("int64", (), "ns of the arm controller's clock"),
-    "poses/host": ("int64", (), "ns of the host's monotonic clock"),
-    "poses/xyz": ("float64", (3,), "mm in the arm's base frame"),
-    "poses/rotvec": ("float64", (3,), "degrees, rotation vector"),
-    "frames/number": ("int64", (), "the camera's frame counter"),
-    "frames/t": ("int64", (), "ns of the frame camera's clock, middle of exposure"),
-    "frames/host": ("int64", (), "ns of the host's monotonic clock"),
-    "frames/sync": ("uint8", (), "level of the sync line during exposure"),
-}
-# only there once something came, a row a frame; -1 stands for the number of markers
-TRACKS: dict[str, tuple[str, tuple[int, ...], str]] = {
-    "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
-    "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
-}
 
 
 class StreamFile:
@@ -56,49 +23,20 @@ class StreamFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = h5py.File(path, "w", libver="latest")
-        self._file.attrs["format"] = FORMAT
+        path.write_bytes(blank())
+        self._file = h5py.File(path, "r+", libver="latest")
         self._offset: int | None = None
         self._last_us: int | None = None
-        self._marks: list[Array] = []
         self._next_ms = 0
-        self._pending: dict[str, list[Array]] = {name: [] for name in COLUMNS}
-        self._held = dict.fromkeys(COLUMNS, 0)
-        self.counts = dict.fromkeys(COLUMNS, 0)
-        for name, (dtype, shape, unit) in COLUMNS.items():
-            self._create(name, dtype, shape, unit)
+        self._columns = {name: Column(self._file, name) for name in (*COLUMNS, INDEX)}
 
-    def _create(self, name: str, dtype: str, shape: tuple[int, ...], unit: str) -> None:
-        rows = EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
-        data = self._file.create_dataset(
-            name,
-            (0, *shape),
-            dtype,
-            maxshape=(None, *shape),
-            chunks=(rows, *shape),
-            **hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
-        )
-        data.attrs["unit"] = unit
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows so far, by column."""
+        return {name: column.count for name, column in self._columns.items() if name != INDEX}
 
     def _append(self, name: str, values: Array) -> None:
-        """Gather whole chunks before writing: a partial chunk would be compressed twice."""
-        small = not name.startswith("events/")
-        rows = SMALL_CHUNK if small else EVENT_CHUNK
-        self._pending[name].append(np.asarray(values))
-        self._held[name] += len(values)
-        self.counts[name] += len(values)
-        if self._held[name] >= (SMALL_HELD if small else rows):
-            joined = np.concatenate(self._pending[name])
-            whole = len(joined) // rows * rows
-            self._write(name, joined[:whole])
-            self._pending[name] = [joined[whole:]]
-            self._held[name] = len(joined) - whole
-
-    def _write(self, name: str, values: Array) -> None:
-        data = self._file[name]
-        before = data.shape[0]
-        data.resize(before + len(values), axis=0)
-        data[before:] = values
+        self._columns[name].append(values)
 
     def add_events(self, chunk: EventChunk) -> None:
         """Append events.
@@ -109,7 +47,8 @@ class StreamFile:
         if not len(chunk):
             return
         first, last = int(chunk.t_us[0]), int(chunk.t_us[-1])
-        if (self._last_us is not None and first < self._last_us) or np.any(np.diff(chunk.t_us) < 0):
+        backwards = bool(np.any(chunk.t_us[1:] < chunk.t_us[:-1]))
+        if backwards or (self._last_us is not None and first < self._last_us):
             raise ValueError(f"event times run backwards at {first} us")
         if self._offset is None:
             self._offset = first
@@ -124,7 +63,8 @@ class StreamFile:
     def _mark(self, times: I64, end_ms: int) -> None:
         """Note the first event at or after each millisecond before `end_ms`."""
         marks = np.arange(self._next_ms, end_ms, dtype=np.int64) * 1000
-        self._marks.append(self.counts["events/t"] + np.searchsorted(times, marks, side="left"))
+        before = self._columns["events/t"].count
+        self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
         self._next_ms = max(end_ms, self._next_ms)
 
     def add_pulses(self, group: str, chunk: PulseChunk) -> None:
@@ -151,37 +91,30 @@ class StreamFile:
         The frames' times come first. Every column of tracks gets a row a frame: NaN where a plate's
         marker came later than the first frame, or went.
         """
-        before, after = self.counts["frames/t"] - len(chunk), self.counts["frames/t"]
+        after = self._columns["frames/t"].count
+        before = after - len(chunk)
         found = {"tracks/markers": chunk.markers_px, "tracks/plate": chunk.plate_px}
         for name, values in found.items():
-            if values is None and name not in self.counts:
+            if values is None and name not in self._columns:
                 continue
-            if values is not None and name not in self.counts:
+            if values is not None and name not in self._columns:
                 dtype, _, unit = TRACKS[name]
-                self._create(name, dtype, values.shape[1:], unit)
-                self._pending[name], self._held[name], self.counts[name] = [], 0, 0
-            shape = self._file[name].shape[1:]
-            missing = (before if values is not None else after) - self.counts[name]
+                create(self._file, name, (dtype, values.shape[1:], unit))
+                self._columns[name] = Column(self._file, name)
+            column = self._columns[name]
+            missing = (before if values is not None else after) - column.count
             if missing:
-                self._append(name, np.full((missing, *shape), np.nan, np.float32))
+                column.append(np.full((missing, *column.shape), np.nan, np.float32))
             if values is not None:
-                self._append(name, values)
+                column.append(values)
 
     def finish(self) -> None:
         """Write what is held back and the index, and close the file."""
-        for name, parts in self._pending.items():
-            if self._held[name]:
-                self._write(name, np.concatenate(parts))
-            self._held[name] = 0
         # one more mark, so that the last millisecond has an end
-        self._marks.append(np.full(1, self.counts["events/t"], np.int64))
-        index = np.concatenate(self._marks).astype(np.int64)
-        self._file.create_dataset(
-            "ms_to_idx", data=index, chunks=True, **hdf5plugin.Bitshuffle(cname="zstd", clevel=3)
-        )
-        self._file["ms_to_idx"].attrs["unit"] = "index of the first event at or after this ms"
-        self._file["t_offset"] = np.int64(self._offset or 0)
-        self._file["t_offset"].attrs["unit"] = "us of the event camera's clock"
+        self._append(INDEX, np.full(1, self._columns["events/t"].count, np.int64))
+        for column in self._columns.values():
+            column.flush()
+        self._file[OFFSET][()] = self._offset or 0
         self._file.close()
 
     def abandon(self) -> None:
@@ -194,7 +127,8 @@ class StreamReader:
 
     def __init__(self, path: Path) -> None:
         self._file = h5py.File(path, "r")
-        self.t_offset_us = int(self._file["t_offset"][()])
+        self._opened: dict[str, Any] = {}
+        self.t_offset_us = int(self._file[OFFSET][()])
 
     def __enter__(self) -> StreamReader:
         return self
@@ -207,47 +141,58 @@ class StreamReader:
     ) -> None:
         self._file.close()
 
+    def _data(self, name: str) -> Any:
+        """A column, opened once."""
+        if name not in self._opened:
+            self._opened[name] = self._file[name]
+        return self._opened[name]
+
+    def event_times(self) -> I64:
+        """Times of all events on the camera's clock, us."""
+        times: I64 = self._data("events/t")[:]
+        times += self.t_offset_us
+        return times
+
     def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
         """Events with start <= t < end on the camera's clock; all by default.
 
         Only the part of the file that holds them is read.
         """
-        group = self._file["events"]
-        low, high = 0, group["t"].shape[0]
-        marks = self._file["ms_to_idx"]
+        x, y, p, t = (self._data(f"events/{name}") for name in "xypt")
+        low, high = 0, t.shape[0]
+        marks = self._data(INDEX)
         if start_us is not None and len(marks):
             low = _bracket(marks, start_us - self.t_offset_us, high)[0]
         if end_us is not None and len(marks):
             high = _bracket(marks, end_us - self.t_offset_us, high)[1]
         high = max(low, high)
-        times = group["t"][low:high] + self.t_offset_us
+        times = t[low:high] + self.t_offset_us
         first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
         last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
         last = max(first, last)
         rows = slice(low + first, low + last)
-        return EventChunk(group["x"][rows], group["y"][rows], group["p"][rows], times[first:last])
+        return EventChunk(x[rows], y[rows], p[rows], times[first:last])
 
     def pulses(self, group: str) -> I64:
         """Pulse times of ``event_pulses``, ``arm_pulses`` or ``sync_pulses``, ns."""
-        return np.asarray(self._file[f"{group}/t"][:])
+        return self.column(f"{group}/t")
 
     def poses(self) -> PoseChunk:
         """All arm poses."""
-        group = self._file["poses"]
-        return PoseChunk(group["t"][:], group["host"][:], group["xyz"][:], group["rotvec"][:])
+        return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
 
     def column(self, name: str) -> Array:
         """One column by its name in the file, such as ``frames/t``."""
-        return np.asarray(self._file[name][:])
+        return np.asarray(self._data(name)[:])
 
     def has(self, name: str) -> bool:
         """Whether the file has a column of this name; those of `TRACKS` may be missing."""
-        return name in self._file
+        return name in self._opened or name in self._file
 
     def counts(self) -> dict[str, int]:
         """Rows of every column; 0 for one that is missing."""
         return {
-            name: int(self._file[name].shape[0]) if name in self._file else 0
+            name: int(self._data(name).shape[0]) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS)
         }
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from storage.columns import TRACKS
 from storage.files import read_json, sha256
-from storage.hdf5 import TRACKS, StreamReader
+from storage.hdf5 import StreamReader
 from storage.recording import Recording
 from storage.store import Campaign, Store
 from storage.video import count_frames

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
 from rigs.mock.clocks import FaultyClock, Jitter, Noise, undisturbed
-from rigs.mock.path import Leg
+from rigs.mock.path import TOOL, Leg
 from rigs.mock.sync import MockSyncBox, SyncInput
 from rigs.mock.world import World
 from storage.streams import PoseChunk, PulseChunk
@@ -94,12 +94,12 @@ class MockArm:
         here = int(np.searchsorted(host, world.now_ns, side="right"))
         self._read = first + here
         cycles, true, host = cycles[:here], true[:here], host[:here]
-        state = world.path.states(true)
+        state = world.path.states(true, TOOL)
         xyz = state[:, :3] + self._noise.of(cycles - self._first) * (settings.pose_noise_um * 1e-3)
         stamps = cycles * self._period_ns
         if isinstance(world.clocks.arm, FaultyClock):
             stamps = world.clocks.arm.to_reference(true)
-        return PoseChunk(stamps, host, xyz, state[:, 3:6].copy())
+        return PoseChunk(stamps, host, xyz, state[:, 3:].copy())
 
     def read_pulses(self) -> PulseChunk:
         """Sync pulses seen by the digital input, controller clock."""

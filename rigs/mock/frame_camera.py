@@ -88,16 +88,16 @@ class MockFrameCamera:
         ticks = box.ticks(self._next_tick, min(seen_ns, self._until_ns))
         if self._until_ns == 0:
             ticks = ticks[:0]
-        host = box.true_ns(ticks) + after_ns if len(ticks) else ticks
-        host = self._faults.arrival_ns(ticks, host)
+        true = box.true_ns(ticks) if len(ticks) else ticks
+        host = self._faults.arrival_ns(ticks, true + after_ns)
         host = host[host <= world.now_ns]
         ticks = ticks[: len(host)]
         number = self._number + np.arange(len(ticks), dtype=np.int64)
         self._next_tick += len(ticks)
         self._number += len(ticks)
         kept = ~self._faults.lost(ticks)
+        mid = true[: len(ticks)][kept] + self.mid_exposure_ns
         ticks, number, host = ticks[kept], number[kept], host[kept]
-        mid = box.true_ns(ticks) + self.mid_exposure_ns if len(ticks) else ticks
         stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
         sync = box.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
         if self._view is None:

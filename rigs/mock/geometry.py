@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +14,12 @@ from rigs.mock.settings import Contact
 F64 = npt.NDArray[np.float64]
 
 
+@lru_cache(maxsize=64)
 def matrix(rotvec_deg: tuple[float, float, float]) -> F64:
-    """Rotation matrix of a rotation vector in degrees (Rodrigues), shape (3, 3)."""
+    """Rotation matrix of a rotation vector in degrees (Rodrigues), shape (3, 3), not to be changed.
+
+    Kept: a tool seldom turns.
+    """
     vector = np.radians(np.asarray(rotvec_deg, np.float64))
     angle = float(np.sqrt(vector @ vector))
     if angle == 0.0:

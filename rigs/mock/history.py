@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -59,7 +60,10 @@ class History:
         return times[first:last], self._rows[first : min(last, self._length)]
 
     def at(self, t_ns: I64) -> F64:
-        """Rows at rising times by straight lines; after the end the last row, (k, width).
+        """Rows at times by straight lines; after the end the last row, (k, width).
+
+        Args:
+            t_ns: (k,); none is before its first or after its last.
 
         Raises:
             IndexError: a time lies before the first row.
@@ -69,11 +73,8 @@ class History:
         times, rows = self.between(int(t_ns[0]), int(t_ns[-1]))
         if len(rows) == 1:
             return np.repeat(rows, len(t_ns), axis=0)
-        after = np.clip(np.searchsorted(times, t_ns, side="left"), 1, len(times) - 1)
-        gap = (times[after] - times[after - 1]).astype(np.float64)
-        share = np.clip((t_ns - times[after - 1]) / gap, 0.0, 1.0)[:, None]
-        before = rows[after - 1]
-        result: F64 = before + share * (rows[after] - before)
+        result = np.empty((len(t_ns), rows.shape[1]))
+        _join(times, rows, np.searchsorted(times, t_ns, side="left"), t_ns, result)
         return result
 
     def forget(self, before_ns: int) -> None:
@@ -85,3 +86,15 @@ class History:
             self._rows[:kept] = self._rows[drop : self._length].copy()
             self._t_ns[:kept] = times[drop:].copy()
             self._length = kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _join(times, rows, after, t_ns, result):  # type: ignore[no-untyped-def]
+    """Rows at `t_ns`, each on the straight line to the first row not before it, into `result`."""
+    last = len(times) - 1
+    for k in range(len(t_ns)):
+        i = min(max(after[k], 1), last)
+        share = (t_ns[k] - times[i - 1]) / float(times[i] - times[i - 1])
+        share = min(max(share, 0.0), 1.0)
+        for j in range(rows.shape[1]):
+            result[k, j] = rows[i - 1, j] + share * (rows[i, j] - rows[i - 1, j])

@@ -18,6 +18,9 @@ I64 = npt.NDArray[np.int64]
 TURN_DEG_PER_S = 30.0
 FADE_NS = 200_000_000
 """How long a tremor takes to build up and to die away."""
+EVERY = slice(0, 11)
+TOOL, SENSOR = slice(0, 6), slice(6, 11)
+"""Columns of a state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +34,12 @@ class Leg:
     planned: tuple[int, F64] | None = None
     """When and where it would have ended, had the arm not been stopped."""
 
-    def at(self, t_ns: I64) -> F64:
-        """States at times within the leg, shape (n, 11)."""
+    def at(self, t_ns: I64, columns: slice = EVERY) -> F64:
+        """States at times within the leg, shape (n, 11) or those columns."""
         end_ns, end = self.planned or (self.end_ns, self.end)
+        start = self.start[columns]
         share = (t_ns - self.start_ns) / (end_ns - self.start_ns)
-        result: F64 = self.start + share[:, None] * (end - self.start)
+        result: F64 = start + share[:, None] * (end[columns] - start)
         return result
 
 
@@ -79,24 +83,28 @@ class ArmPath:
         if self.deviation is not None:
             self.deviation.freeze(now_ns)
 
-    def states(self, t_ns: I64) -> F64:
-        """xyz (mm), rotation vector (deg) and sensor vector at rising times, shape (n, 11)."""
-        states = self.commanded(t_ns)
-        return states + self.deviation.at(t_ns) if self.deviation else states
+    def states(self, t_ns: I64, columns: slice = EVERY) -> F64:
+        """xyz (mm), rotation vector (deg) and sensor vector at rising times, shape (n, 11).
 
-    def commanded(self, t_ns: I64) -> F64:
+        Args:
+            columns: those wanted, such as `TOOL`.
+        """
+        states = self.commanded(t_ns, columns)
+        return states + self.deviation.at(t_ns)[:, columns] if self.deviation else states
+
+    def commanded(self, t_ns: I64, columns: slice = EVERY) -> F64:
         """The same, as the arm was told: without its deviation."""
-        result = np.empty((len(t_ns), 11))
-        result[:] = self._rest
-        if self.legs:
-            starts = np.array([leg.start_ns for leg in self.legs], np.int64)
-            which = np.searchsorted(starts, t_ns, side="right") - 1
-            for index in np.unique(which[which >= 0]).tolist():
-                leg, here = self.legs[index], which == index
-                inside = here & (t_ns < leg.end_ns)
-                result[here] = leg.end
-                if leg.end_ns > leg.start_ns:
-                    result[inside] = leg.at(t_ns[inside])
+        result = np.empty((len(t_ns), columns.stop - columns.start))
+        # each leg holds from its start to that of the next
+        begins = np.searchsorted(t_ns, np.array([leg.start_ns for leg in self.legs], np.int64))
+        edges = [*begins.tolist(), len(t_ns)]
+        result[: edges[0]] = self._rest[columns]
+        for leg, first, last in zip(self.legs, edges[:-1], edges[1:], strict=True):
+            if first < last:
+                ended = first + int(np.searchsorted(t_ns[first:last], leg.end_ns))
+                if first < ended:
+                    result[first:ended] = leg.at(t_ns[first:ended], columns)
+                result[ended:last] = leg.end[columns]
         return result
 
     def stirred(self, t_ns: I64) -> F64:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from rigs.capabilities import RigError
 from rigs.mock.faults import NEVER
@@ -41,7 +43,6 @@ def truth_of(
         RigError: the reference is older than the history that is kept (minutes).
     """
     world.advance()
-    n = len(world.skin)
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
     history = world.physics.track
     if reference_true_ns < history.begin_ns:
@@ -50,10 +51,7 @@ def truth_of(
     t_ns, rows = history.between(reference_true_ns, history.end_ns)
     t_ns = t_ns.copy()
     t_ns[0] = reference_true_ns
-    places = rows[:, : 2 * n].reshape(-1, n, 2) - start[: 2 * n].reshape(n, 2)
-    moved = np.hypot(places[:, :, 0], places[:, :, 1])
-    slid = rows[:, 2 * n : 3 * n] - start[2 * n : 3 * n]
-    moved[0], slid[0] = 0.0, 0.0
+    crossed, began = _onsets(rows, start, t_ns, threshold_mm)
 
     def on_box(true_ns: float | None) -> int | None:
         return None if true_ns is None else int(box.to_reference(round(true_ns)))
@@ -65,11 +63,8 @@ def truth_of(
         late = true_ns is not None and true_ns >= torn_ns.get(i, NEVER)
         return None if late else true_ns
 
-    markers = [on_box(there(i, _crossing(t_ns, moved[:, i], threshold_mm))) for i in range(n)]
-    slips = [
-        on_box(there(i, _first_slip(t_ns, slid[:, i], rows[:, 3 * n + i], reference_true_ns)))
-        for i in range(n)
-    ]
+    markers = [on_box(there(i, true_ns)) for i, true_ns in enumerate(crossed)]
+    slips = [on_box(there(i, true_ns)) for i, true_ns in enumerate(began)]
     return {
         "simulated": True,
         "level": world.settings.scene.level,
@@ -83,21 +78,42 @@ def truth_of(
     }
 
 
-def _crossing(t_ns: I64, distance: F64, limit: float) -> float | None:
-    """When a distance first exceeds a limit, straight between the rows."""
-    above = np.flatnonzero(distance > limit)
-    if not len(above):
-        return None
-    k = int(above[0])
-    low, high = float(distance[k - 1]), float(distance[k])
-    share = (limit - low) / (high - low)
-    return float(t_ns[k - 1]) + share * float(t_ns[k] - t_ns[k - 1])
+def _onsets(
+    rows: F64, start: F64, t_ns: I64, threshold_mm: float
+) -> tuple[list[float | None], list[float | None]]:
+    """When each marker's displacement exceeds the threshold, and when its tip began to slide.
+
+    Both in true ns, or None. `rows` are the track's, the first of them `start` in effect.
+    """
+    n = rows.shape[1] // 4
+    crossed: list[float | None] = [None] * n
+    began: list[float | None] = [None] * n
+    moved, slid = (found.tolist() for found in _first_beyond(rows, start, n, threshold_mm, SLIP_MM))
+    for i in range(n):
+        if moved[i]:
+            k = moved[i]
+            way = rows[k - 1 : k + 1, 2 * i : 2 * i + 2] - start[2 * i : 2 * i + 2]
+            low, high = np.hypot(way[:, 0], way[:, 1]).tolist()
+            low = low if k > 1 else 0.0
+            # straight between the rows
+            share = (threshold_mm - low) / (high - low)
+            crossed[i] = float(t_ns[k - 1]) + share * float(t_ns[k] - t_ns[k - 1])
+        if slid[i]:
+            # as the solver located it within its step; a row or two may pass before the way slid
+            # counts: the tip began where it last stuck
+            began[i] = max(float(rows[slid[i], 3 * n + i]) * 1e9, float(t_ns[0]))
+    return crossed, began
 
 
-def _first_slip(t_ns: I64, slid: F64, slipped_s: F64, reference_ns: int) -> float | None:
-    """When a tip first went from stick to slip, as the solver located it within its step."""
-    above = np.flatnonzero(slid > SLIP_MM)
-    if not len(above):
-        return None
-    # a row or two may pass before the way slid counts; the tip began where it last stuck
-    return max(float(slipped_s[above[0]]) * 1e9, float(reference_ns))
+@njit(cache=True, nogil=True)
+def _first_beyond(rows, start, n, moved_mm, slid_mm):  # type: ignore[no-untyped-def]
+    """First rows, (n,) each, in which a marker has moved and its tip has slid further; else 0."""
+    moved, slid = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    for k in range(1, len(rows)):
+        for i in range(n):
+            x, y = rows[k, 2 * i] - start[2 * i], rows[k, 2 * i + 1] - start[2 * i + 1]
+            if not moved[i] and math.hypot(x, y) > moved_mm:
+                moved[i] = k
+            if not slid[i] and rows[k, 2 * n + i] - start[2 * n + i] > slid_mm:
+                slid[i] = k
+    return moved, slid

@@ -22,7 +22,7 @@ from rigs.mock.fault_settings import PlateStuck
 from rigs.mock.faults import FaultBook
 from rigs.mock.geometry import ContactPlane
 from rigs.mock.history import History
-from rigs.mock.path import ArmPath, Leg
+from rigs.mock.path import SENSOR, ArmPath, Leg
 from rigs.mock.physics import Physics
 from rigs.mock.settings import MockSettings
 from rigs.mock.skins import skin_of
@@ -96,7 +96,7 @@ class World:
 
     def _sensor_at(self, t_ns: I64) -> F64:
         """x, y and depth (mm) of the sensor and the slopes of depth at rising times, (k, 5)."""
-        sensor = self.path.states(t_ns)[:, 6:]
+        sensor = self.path.states(t_ns, SENSOR)
         if self._vibration:
             strength = self.path.stirred(t_ns)[:, None]
             sensor[:, :3] += strength * self._vibration.at(t_ns)

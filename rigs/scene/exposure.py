@@ -13,11 +13,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 Look = Callable[[I64], tuple[F64, F64]]
-"""From rising times, ns, (k,), to tips (k, n, 2) and heights of the plate (k,), in mm."""
+"""From times, ns, (k,), to tips (k, n, 2) and heights of the plate (k,), in mm.
+
+Times rise within an exposure, and from exposure to exposure: none is before the first or after the
+last of them.
+"""
 
 STILL_PX = 0.1
 """Shorter ways than this are drawn at their mean place."""
@@ -55,27 +60,24 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     Places that hardly move are averaged by Simpson's rule over beginning, middle and end.
     """
     half = exposure_ns // 2
-    begin, middle, end = (look(mid_ns + shift) for shift in (-half, 0, half))
-    tips = (begin[0] + 4.0 * middle[0] + end[0]) / 6.0
-    plate = (begin[1] + 4.0 * middle[1] + end[1]) / 6.0
-    # one more thing that moves: the plate, as (m, 1, 2)
-    path = [
-        np.concatenate([places, np.stack([0.0 * height, height], axis=-1)[:, None]], axis=1)
-        for places, height in (begin, middle, end)
-    ]
-    way = px_per_mm * (_length(path[1] - path[0]) + _length(path[2] - path[1]))
-    bend = px_per_mm * _length(path[0] - 2.0 * path[1] + path[2])
-    farthest = way.max(axis=1, initial=0.0)
-    ways = {}
-    for index in np.flatnonzero(
-        (farthest >= STILL_PX) | (bend.max(axis=1, initial=0.0) >= BEND_PX)
-    ).tolist():
-        count = min(max(_FEWEST, math.ceil(farthest[index] / _STEP_PX)), _MOST)
+    # one look for everything: what it costs is the call
+    tips, plate = look((mid_ns[:, None] + np.array([-half, 0, half], np.int64)).ravel())
+    tips, plate, farthest, bent = _average(
+        tips.reshape(-1, 3, *tips.shape[1:]), plate.reshape(-1, 3), px_per_mm
+    )
+    smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
+    counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
+    ways: dict[int, Way] = {}
+    for count in np.unique(counts).tolist():
+        # ways of as many places are looked at together
+        here = smeared[counts == count]
         # midpoints of equal shares, to a nanosecond
         shares = (2 * np.arange(count, dtype=np.int64) + 1) * (2 * half) // (2 * count)
-        seen = Way(*look(mid_ns[index] - half + shares))
-        tips[index], plate[index] = seen.tips_mm.mean(axis=0), seen.plate_mm.mean()
-        ways[index] = seen
+        along, heights = look((mid_ns[here, None] - half + shares).ravel())
+        along = along.reshape(-1, count, *along.shape[1:])
+        heights = heights.reshape(-1, count)
+        tips[here], plate[here] = along.mean(axis=1), heights.mean(axis=1)
+        ways.update(zip(here.tolist(), map(Way, along, heights), strict=True))
     return Exposures(tips, plate, ways)
 
 
@@ -91,3 +93,28 @@ def moved(way_px: F64) -> npt.NDArray[np.bool_]:
 def _length(vector: F64) -> F64:
     result: F64 = np.hypot(vector[..., 0], vector[..., 1])
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
+    """Simpson's mean of tips (m, 3, n, 2) and plate (m, 3) over beginning, middle and end.
+
+    Also the longest way of anything in each exposure, and its largest bend, px, (m,).
+    """
+    m, _, n, _ = tips.shape
+    mean, height = np.empty((m, n, 2)), np.empty(m)
+    way, bend = np.empty(m), np.empty(m)
+    for k in range(m):
+        low, middle, high = plate[k]
+        height[k] = (low + 4.0 * middle + high) / 6.0
+        farthest = abs(middle - low) + abs(high - middle)
+        bent = abs(low - 2.0 * middle + high)
+        for i in range(n):
+            (x0, y0), (x1, y1), (x2, y2) = tips[k, 0, i], tips[k, 1, i], tips[k, 2, i]
+            mean[k, i, 0] = (x0 + 4.0 * x1 + x2) / 6.0
+            mean[k, i, 1] = (y0 + 4.0 * y1 + y2) / 6.0
+            first, second = math.hypot(x1 - x0, y1 - y0), math.hypot(x2 - x1, y2 - y1)
+            farthest = max(farthest, first + second)
+            bent = max(bent, math.hypot(x0 - 2.0 * x1 + x2, y0 - 2.0 * y1 + y2))
+        way[k], bend[k] = px_per_mm * farthest, px_per_mm * bent
+    return mean, height, way, bend
