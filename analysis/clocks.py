@@ -145,7 +145,9 @@ def fit_clock(
     try:
         tick = tick_of(reference)
         if jitter_ns > tick / 4:
-            raise ValueError(f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart")
+            raise ValueError(
+                f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart"
+            )
         match = match_trains(x, y, tick, 1.02 * max_drift_ppm * 1e-6, start_marker_ns)
     except NoMatchError as error:
         raise ClockRefused(cast("Reason", error.reason), str(error)) from None

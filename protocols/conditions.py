@@ -15,6 +15,7 @@ from protocols.quantity import (
     PositiveSeconds,
     PositiveSpeed,
 )
+from protocols.timing import SyncGates
 from protocols.yaml_file import StrictModel
 
 
@@ -74,8 +75,8 @@ class Limits(StrictModel):
 class Gates(StrictModel):
     """When a trial is not good enough and is taken again."""
 
-    sync_uncertainty: PositiveSeconds = Decimal("0.001")
-    """95 % uncertainty of events against frames and poses."""
+    sync_uncertainty: SyncGates = SyncGates()
+    """95 % uncertainty of events against frames and poses, by grade."""
     frames_lost: Annotated[int, Field(ge=0)] = 0
     event_gap: PositiveSeconds = Decimal("0.05")
     """Longest silence of the event camera while the arm moves in contact."""

@@ -135,7 +135,12 @@ def test_a_bent_map_meets_its_knots_keeps_order_and_comes_back(
     assert clock.inverse.inverse.device_ns == clock.device_ns
 
 
-@given(first=bent() | st.integers(-(2**60), 2**60).map(lambda t: ClockMap.line(t, 0, -70_000)), after=bent(), span=NINE_YEARS, data=st.data())
+@given(
+    first=bent() | st.integers(-(2**60), 2**60).map(lambda t: ClockMap.line(t, 0, -70_000)),
+    after=bent(),
+    span=NINE_YEARS,
+    data=st.data(),
+)
 def test_two_maps_in_a_row_are_one(
     first: ClockMap, after: ClockMap, span: int, data: st.DataObject
 ) -> None:

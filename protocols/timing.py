@@ -1,0 +1,95 @@
+"""How a rig's devices are timed: which signal reaches which, and how good their clocks are.
+
+A rig file states it, every trial's record keeps it, and synchronising stored data reads it there.
+A grade is a name for how a device's time is known; every grade has its own uncertainty and its own
+gate (docs/clocks.md), and a latency is never shown without it.
+"""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from protocols.quantity import PositiveSeconds
+from protocols.yaml_file import KeyedError, StrictModel
+
+Code = Literal["lfsr", "irregular", "regular"]
+"""What the box sends: 16-bit LFSR, irregular intervals, or a regular train with a start marker."""
+FrameGrade = Literal["hardware trigger", "exposure line", "device time stamps", "host arrival"]
+ArmGrade = Literal["digital input", "host time"]
+EventGrade = Literal["trigger input"]
+Grade = FrameGrade | ArmGrade | EventGrade
+WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")
+"""Grades by which a device's time is known from a wire; the others go through the host."""
+
+CRYSTAL_PPM = 200.0
+CERAMIC_PPM = 5000.0
+
+
+class DeviceClock(StrictModel):
+    """One device's clock."""
+
+    drift_ppm: float = Field(default=CRYSTAL_PPM, gt=0, le=20_000)
+    """The most that it may differ from true time: 200 for a crystal, 5000 for a ceramic
+    resonator."""
+    jitter_us: float = Field(default=20.0, gt=0, le=5_000)
+    """Scatter of its stamps to be expected, one standard deviation."""
+    resolution_us: float = Field(default=1.0, ge=0, le=20_000)
+    """The unit to which its stamps are cut."""
+    rounding: Literal["down", "up", "nearest"] = "down"
+    """Which way; an input that is looked at now and then stamps `up`."""
+
+
+class Delay(StrictModel):
+    """How long a message takes from its device to the host, whatever happens."""
+
+    shortest_us: float = Field(ge=0, le=10_000_000)
+    longest_us: float = Field(gt=0, le=10_000_000)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Delay:
+        if not self.shortest_us < self.longest_us:
+            raise KeyedError("longest_us", self.longest_us, "must be above shortest_us")
+        return self
+
+
+class Timing(StrictModel):
+    """The `timing:` section of a rig file."""
+
+    code: Code = "lfsr"
+    frames: FrameGrade = "hardware trigger"
+    """`hardware trigger`: the box triggers every exposure. `exposure line`: the camera runs by
+    itself and the box stamps its ExposureActive output. `device time stamps`: the host reads the
+    camera's clock now and then. `host arrival`: the camera has no clock to be read."""
+    arm: ArmGrade = "digital input"
+    """`digital input`: the controller sees the pulses. `host time`: only when poses arrived."""
+    sync_box: DeviceClock = DeviceClock()
+    event_camera: DeviceClock = DeviceClock()
+    frame_camera: DeviceClock = DeviceClock()
+    arm_controller: DeviceClock = DeviceClock()
+    pose_delay: Delay = Delay(shortest_us=0, longest_us=20_000)
+    """Of the arm's poses, where `arm` is `host time`."""
+    frame_delay: Delay = Delay(shortest_us=0, longest_us=50_000)
+    """From the end of a frame's exposure to the host, where `frames` is `host arrival`."""
+
+    @property
+    def reads_clocks(self) -> bool:
+        """Whether the host has to read clocks, for some device has no wire."""
+        return self.frames not in WIRED or self.arm not in WIRED
+
+
+class SyncGates(StrictModel):
+    """The largest 95 % uncertainty of events against another device, by its grade."""
+
+    hardware_trigger: PositiveSeconds = Decimal("0.001")
+    exposure_line: PositiveSeconds = Decimal("0.001")
+    device_time_stamps: PositiveSeconds = Decimal("0.005")
+    host_arrival: PositiveSeconds = Decimal("0.03")
+    digital_input: PositiveSeconds = Decimal("0.001")
+    host_time: PositiveSeconds = Decimal("0.015")
+
+    def limit_s(self, grade: str) -> float:
+        """The gate of a grade, s."""
+        return float(getattr(self, grade.replace(" ", "_")))
