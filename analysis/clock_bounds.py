@@ -69,9 +69,9 @@ def fit_bounds(
     if (low > high).any():
         raise BoundsContradictError("an instant's earliest time lies after its latest one")
     origin, image = int(device.min()), int(low[0])
-    x = (device - origin) * 1e-9
-    least = (low - image - (device - origin)) * 1e-3
-    most = (high - image - (device - origin)) * 1e-3
+    x = (device - origin).astype(np.float64) * 1e-9
+    least = (low - image - (device - origin)).astype(np.float64) * 1e-3
+    most = (high - image - (device - origin)).astype(np.float64) * 1e-3
     # the line is level + slope x: us over s, that is ppm
     run = max(float(x.max()), 1e-3)
     kept_low, kept_high = _upper_hull(x, least), _upper_hull(x, -most)

@@ -1,4 +1,4 @@
-"""A clock's line through pulses of which some may be wrong: straight, or bent where the clock bends.
+"""A clock's line through pulses of which some may be wrong: straight, or bent as the clock is.
 
 A crystal that warms up drifts by a few ppm more at the end of a trial than at its beginning; a
 straight line is then wrong by a hundred microseconds and does not know it. So the line gets as many
@@ -115,7 +115,8 @@ def _robust(
         size = np.abs(residuals)
         sigma = max(1.4826 * float(np.median(size)), floor)
         inside = size <= _GATE * sigma
-        weights = inside * np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-9))
+        full = np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-9))
+        weights = np.where(inside, full, 0.0)
         new = _least_squares(piece, share, y, weights, knots.size)
         moved = float(np.abs(new - values).max())
         values = new
@@ -128,7 +129,7 @@ def _robust(
 
 def _normal_matrix(piece: NDArray[np.int64], share: Floats, weights: Floats, n: int) -> Floats:
     """Of the hat functions at n knots."""
-    matrix = np.zeros((n, n))
+    matrix: Floats = np.zeros((n, n))
     here, there = np.arange(n - 1), np.arange(1, n)
     matrix[here, here] += np.bincount(piece, weights * (1 - share) ** 2, n - 1)
     matrix[there, there] += np.bincount(piece, weights * share**2, n - 1)
@@ -140,13 +141,13 @@ def _normal_matrix(piece: NDArray[np.int64], share: Floats, weights: Floats, n: 
 def _least_squares(
     piece: NDArray[np.int64], share: Floats, y: Floats, weights: Floats, n: int
 ) -> Floats:
-    right = np.zeros(n)
+    right: Floats = np.zeros(n)
     right[:-1] += np.bincount(piece, weights * (1 - share) * y, n - 1)
     right[1:] += np.bincount(piece, weights * share * y, n - 1)
     matrix = _normal_matrix(piece, share, weights, n)
     # a piece with a single pulse in it hangs on its neighbours
     matrix[np.diag_indices(n)] += 1e-12 * matrix.trace() / n
-    result: Floats = np.linalg.solve(matrix, right)
+    result: Floats = np.linalg.solve(matrix, right).astype(np.float64)
     return result
 
 
@@ -158,7 +159,8 @@ def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -
     edges = np.linspace(0, residuals.size, blocks + 1).round().astype(np.int64)
     counts = np.diff(edges)
     means = np.add.reduceat(residuals, edges[:-1]) / counts
-    excess = np.maximum(np.abs(means) - slack, 0.0) if slack > sigma else means
+    # a unit that nothing shakes hides what is smaller
+    excess = np.maximum(np.abs(means) - (slack if slack > sigma else 0.0), 0.0)
     square = float((excess**2 * counts).sum()) / sigma**2
     return square <= float(special.chdtri(blocks - parameters, _CHANCE))
 

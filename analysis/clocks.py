@@ -281,3 +281,56 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
         )
     if not line.straightened:
         raise ClockRefused("residuals", "what the line leaves over is not jitter: a clock jumped")
+
+
+def fit_numbered(
+    device_ns: Ints,
+    numbers: Ints,
+    reference_ns: Ints,
+    *,
+    jitter_ns: float = 20_000.0,
+    max_drift_ppm: float = 10_000.0,
+    resolution_ns: float = 1_000.0,
+    rounding: Rounding = "down",
+) -> ClockFit:
+    """The map from a device's clock to the reference, for instants that the device counts.
+
+    A camera that runs by itself exposes at regular intervals, and the box stamps every exposure. A
+    regular train fits anywhere, so both must have seen the first and the last one: number 0 is the
+    first stamp, and the last number must be the last.
+
+    Args:
+        device_ns: (m,) int64 times on the device's clock, ns, in order.
+        numbers: (m,) int64 the device's own count of them, rising; what was lost is left out.
+        reference_ns: (n,) int64 the stamps of all of them on the reference clock, ns, in order.
+        jitter_ns, max_drift_ppm, resolution_ns, rounding: as in `fit_clock`.
+
+    Raises:
+        ClockRefused: with its `reason`.
+    """
+    device, reference = _train(device_ns, "device"), _train(reference_ns, "reference")
+    if (np.diff(device_ns) < 0).any() or (np.diff(reference_ns) < 0).any():
+        raise ClockRefused("residuals", "a clock jumps back")
+    period = float(np.median(np.diff(reference)))
+    steps = np.rint(np.diff(reference) / period).astype(np.int64)
+    counted = np.concatenate([[0], np.cumsum(steps)])
+    # a second report of an edge
+    first = np.concatenate([[True], steps > 0])
+    counted, reference = counted[first], reference[first]
+    if int(counted[-1]) != int(numbers[-1]):
+        raise ClockRefused(
+            "ambiguous",
+            f"the device counts {int(numbers[-1]) + 1} exposures and the box stamped "
+            f"{int(counted[-1]) + 1}: nobody knows which one is missing",
+        )
+    _, i, j = np.intersect1d(numbers, counted, return_indices=True)
+    device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
+    shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
+    x, y = _differences(device, device_0) + shift, _differences(reference, reference_0)
+    if x.size != device.size or y.size != reference.size:
+        raise ClockRefused("residuals", "stamps of another age among the exposures")
+    match = Match(i.astype(np.int64), j.astype(np.int64), 0.0)
+    px, py = x[match.device], y[match.reference]
+    line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
+    _gate_line(line, jitter_ns, max_drift_ppm)
+    return _fit(match, line, x, y, device_0, reference_0)

@@ -34,7 +34,7 @@ _STRIP_NS = 30e9
 
 
 class NoMatchError(ValueError):
-    """The trains fit nowhere, in several places, or hold too little; `reason` is one word for it."""
+    """The trains fit nowhere, in several places, or hold too little; `reason` is a word for it."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -179,7 +179,8 @@ def _correlate(
     which = every.argmax(axis=0)
     scores = every[which, np.arange(size)]
     first = float(scores.max())
-    columns, second = [], 0.0
+    columns: list[int] = []
+    second = 0.0
     left = scores.copy()
     while len(columns) <= _MAX_PLACES:
         column = int(left.argmax())

@@ -6,22 +6,24 @@ again while the rig still stands there.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from analysis.clocks import ClockFit, ClockRefused, fit_clock
+from analysis.synchronise import TrialSync, streams_of, synchronise
 from protocols.conditions import Gates
+from protocols.timing import Timing
 from rigs.rig import TrialRun
 from storage.hdf5 import StreamReader
 from storage.streams import F64, I64
 from storage.writer import DATA
 
-GRADE = "hardware trigger"
-"""How frames are timed: by the sync box's own ticks."""
+UNVOUCHED_S = 0.3
+"""A recording may begin and end this much before and after the pulses on which a clock's fit
+stands: the code may be silent for 16 ticks."""
 BURST_US = 10_000
 """The stretch in which `gates.event_burst` counts events."""
 
@@ -51,43 +53,33 @@ class Assessment:
 
 
 def assess(
-    folder: Path, run: TrialRun, gates: Gates, rate_hz: int, mid_exposure_ns: int | None
+    folder: Path,
+    run: TrialRun,
+    gates: Gates,
+    timing: Timing,
+    rate_hz: int,
+    mid_exposure_ns: int | None,
 ) -> Assessment:
     """Fit the clocks of a sealed trial and hold it against the protocol's gates.
 
     Args:
+        timing: how the rig's devices are timed.
         mid_exposure_ns: from a frame's trigger to its time; None without a video.
     """
-    video = mid_exposure_ns is not None
     with StreamReader(folder / DATA) as reader:
-        reference = reader.pulses("sync_pulses")
-        trains = {"events": reader.pulses("event_pulses"), "arm": reader.pulses("arm_pulses")}
-        frame_times, frame_numbers = reader.column("frames/t"), reader.column("frames/number")
-        if mid_exposure_ns is not None:
-            trains["frames"] = frame_times[reader.column("frames/sync") > 0] - mid_exposure_ns
+        streams = streams_of(reader, mid_exposure_ns)
         event_us = reader.event_times()
-        pose_ns, pose_mm = reader.column("poses/t"), reader.column("poses/xyz")
-    clocks: dict[str, Any] = {"reference": "sync box", "grade": GRADE}
-    limit = float(gates.sync_uncertainty)
-    results: dict[str, dict[str, Any]] = {}
-    for device, pulses in trains.items():
-        name = f"sync_uncertainty_{device}_s"
-        try:
-            fit = fit_clock(pulses, reference, in_order=True)
-        except ClockRefused as refusal:
-            results[name] = {"value": str(refusal), "limit": limit, "passed": False}
-            continue
-        clocks[device] = _fit_json(fit)
-        value = fit.uncertainty_ns / 1e9
-        results[name] = {"value": value, "limit": limit, "passed": value <= limit}
-    if video:
-        lost = _frames_lost(frame_numbers, run, rate_hz)
+        pose_mm = reader.column("poses/xyz")
+    sync = synchronise(streams, timing, rate_hz)
+    results = _sync_gates(sync, gates, run, mid_exposure_ns is not None)
+    if mid_exposure_ns is not None:
+        lost = _frames_lost(streams.frame_number, run, rate_hz)
         results["frames_lost"] = {
             "value": lost,
             "limit": gates.frames_lost,
             "passed": lost <= gates.frames_lost,
         }
-    gap = _event_gap(event_us, clocks, run)
+    gap = _event_gap(event_us, sync, run)
     gap_limit = float(gates.event_gap)
     results["event_gap_s"] = {"value": gap, "limit": gap_limit, "passed": 0 <= gap <= gap_limit}
     burst = _event_burst(event_us)
@@ -96,28 +88,67 @@ def assess(
         "limit": gates.event_burst,
         "passed": burst <= gates.event_burst,
     }
-    away, away_limit = _path_deviation(pose_ns, pose_mm, run), float(gates.path_deviation)
+    away, away_limit = _path_deviation(streams.pose_ns, pose_mm, run), float(gates.path_deviation)
     results["path_deviation_mm"] = {
         "value": away,
         "limit": away_limit,
         "passed": 0 <= away <= away_limit,
     }
     return Assessment(
-        clocks,
+        sync.to_json(),
         results,
         {
             "events": len(event_us),
-            "frames": len(frame_times),
-            "poses": len(pose_ns),
-            "pulses": len(reference),
+            "frames": len(streams.frame_ns),
+            "poses": len(streams.pose_ns),
+            "pulses": len(streams.sync_pulses),
         },
     )
 
 
-def _fit_json(fit: ClockFit) -> dict[str, Any]:
-    data = asdict(fit)
-    data["map"] = fit.map.to_json()
-    return data
+def _sync_gates(
+    sync: TrialSync, gates: Gates, run: TrialRun, video: bool
+) -> dict[str, dict[str, Any]]:
+    """Every device has a clock map, good enough for its grade and for all of the recording."""
+    limits = gates.sync_uncertainty
+    results: dict[str, dict[str, Any]] = {}
+    for device in ("events", "arm", "frames")[: 3 if video else 2]:
+        name = f"sync_uncertainty_{device}_s"
+        known = sync.devices.get(device)
+        if known is None:
+            results[name] = {"value": sync.refused[device], "limit": None, "passed": False}
+            continue
+        grade = "digital input" if device == "events" else known.grade
+        # a latency is a difference: both maps count
+        both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
+        value = (known.uncertainty_ns if both is None else both) / 1e9
+        limit = limits.limit_s(grade)
+        passed = value <= limit
+        results[name] = {"value": value, "limit": limit, "grade": known.grade, "passed": passed}
+    beyond = _unvouched_s(sync, run)
+    results["sync_unvouched_s"] = {
+        "value": beyond,
+        "limit": UNVOUCHED_S,
+        "passed": 0 <= beyond <= UNVOUCHED_S,
+    }
+    return results
+
+
+def _unvouched_s(sync: TrialSync, run: TrialRun) -> float:
+    """How long, at either end, the recording goes on beyond the pulses of a clock's fit, s.
+
+    -1 where the arm's clock is not known.
+    """
+    if "arm" not in sync.devices:
+        return -1.0
+    start, end = (int(sync.devices["arm"].map.to_reference(t)) for t in run.recorded_ns)
+    beyond = 0
+    for device in sync.devices.values():
+        if device.fit is not None:
+            first = device.map.to_reference(device.fit.first_ns)
+            last = device.map.to_reference(device.fit.last_ns)
+            beyond = max(beyond, first - start, end - last)
+    return beyond / 1e9
 
 
 def _frames_lost(numbers: I64, run: TrialRun, rate_hz: int) -> int:
@@ -130,17 +161,15 @@ def _frames_lost(numbers: I64, run: TrialRun, rate_hz: int) -> int:
     return max(gaps, expected - 1 - len(numbers), 0)
 
 
-def _event_gap(event_us: I64, clocks: dict[str, Any], run: TrialRun) -> float:
+def _event_gap(event_us: I64, sync: TrialSync, run: TrialRun) -> float:
     """Longest silence of the event camera while the arm moved in contact, seconds.
 
     -1 when it cannot be told, because a clock has no map or there are no events.
     """
-    from storage.clockmap import ClockMap
-
-    if "events" not in clocks or "arm" not in clocks or not len(event_us):
+    if "events" not in sync.devices or "arm" not in sync.devices or not len(event_us):
         return -1.0
     moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
-    arm, events = (ClockMap.from_json(clocks[name]["map"]) for name in ("arm", "events"))
+    arm, events = (sync.devices[name].map for name in ("arm", "events"))
     start, end = (
         int(events.to_device(int(arm.to_reference(t)))) // 1000
         for t in (moving.start_ns, moving.end_ns)

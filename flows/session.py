@@ -120,6 +120,7 @@ class Session:
                     folder,
                     run,
                     collection.gates,
+                    self.rig.timing,
                     collection.recording.sync_rate,
                     self.rig.frames.mid_exposure_ns if frame_px is not None else None,
                 )
@@ -207,6 +208,11 @@ class Session:
             "depth_zero_mm": run.zero_mm,
             "counts": found.counts,
             "clocks": found.clocks,
+            "timing": {
+                "rig": self.rig.timing.model_dump(mode="json"),
+                "rate_hz": self.plan.protocol.collection.recording.sync_rate,
+                "mid_exposure_ns": self.rig.frames.mid_exposure_ns if frame_px else None,
+            },
             "quality": {"passed": found.passed, "gates": found.gates},
             "steps": [
                 {

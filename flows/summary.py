@@ -40,7 +40,6 @@ def make_summary(
         "samples": windows["samples"],
         **experiments["kinematic"],
     }
-    first = next((recording for item in campaigns for _, recording in item.trials), None)
     return {
         "simulated": store.simulated,
         "kinematic": kinematic,
@@ -48,7 +47,7 @@ def make_summary(
         "disturbance": experiments["disturbance"],
         "labels": {"error_ms": evaluation["label_error_ms"], "source": _sources(campaigns)},
         "detection": evaluation["detection"],
-        "sync": _sync(campaigns, first),
+        "sync": _sync(campaigns),
         "quality": _quality(campaigns),
         "planned": {item.name: _planned(item) for item in campaigns},
         "timing_s": timing.read(store),
@@ -74,15 +73,25 @@ def _sources(campaigns: list[Collected]) -> dict[str, int]:
     return {name: found[name] for name in ("video", "tracks")}
 
 
-def _sync(campaigns: list[Collected], first: Any) -> dict[str, Any]:
-    worst = [
-        recording.record["clocks"]["events"]["uncertainty_ns"] / 1e3
-        for item in campaigns
-        for _, recording in item.trials
-    ]
+def _sync(campaigns: list[Collected]) -> dict[str, Any]:
+    """How the trials' devices were timed, and the worst uncertainty of events against each."""
+    grades: dict[str, set[str]] = {}
+    worst: dict[str, float] = {}
+    for item in campaigns:
+        for _, recording in item.trials:
+            clocks = recording.record["clocks"]
+            for device in ("events", "frames", "arm"):
+                if device in clocks:
+                    grades.setdefault(device, set()).add(clocks[device]["grade"])
+                    both = clocks[device]["uncertainty_ns"]
+                    both += clocks["events"]["uncertainty_ns"] if device != "events" else 0.0
+                    worst[device] = max(worst.get(device, 0.0), both / 1e3)
+    named = {device: " or ".join(sorted(found)) for device, found in grades.items()}
     return {
-        "grade": None if first is None else first.record["clocks"]["grade"],
-        "worst_uncertainty_us": max(worst, default=None),
+        "grade": named.get("frames", named.get("arm")),
+        "grades": named,
+        "worst_uncertainty_us": max(worst.values(), default=None),
+        "worst_against_events_us": worst,
     }
 
 

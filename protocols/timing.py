@@ -24,6 +24,8 @@ Grade = FrameGrade | ArmGrade | EventGrade
 WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")
 """Grades by which a device's time is known from a wire; the others go through the host."""
 
+MARKER_TICKS = 16
+"""A regular train begins with a pulse and this many ticks without one; then every second tick."""
 CRYSTAL_PPM = 200.0
 CERAMIC_PPM = 5000.0
 
@@ -73,6 +75,10 @@ class Timing(StrictModel):
     """Of the arm's poses, where `arm` is `host time`."""
     frame_delay: Delay = Delay(shortest_us=0, longest_us=50_000)
     """From the end of a frame's exposure to the host, where `frames` is `host arrival`."""
+
+    def start_marker_ns(self, rate_hz: float) -> float | None:
+        """From a regular train's first pulse to its second, ns; None where there is a code."""
+        return MARKER_TICKS * 1e9 / rate_hz if self.code == "regular" else None
 
     @property
     def reads_clocks(self) -> bool:

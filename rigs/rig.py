@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
+from protocols.timing import Timing
 from rigs.capabilities import (
     Arm,
     ArmFault,
@@ -93,6 +94,7 @@ class Rig:
     operator: Operator
     frame: PlateFrame
     poll_s: float
+    timing: Timing = field(default_factory=Timing)
     touch_mm: float = 0.0
     plate: Plate | None = None
     simulation: Simulation | None = None
