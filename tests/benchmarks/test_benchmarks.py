@@ -16,7 +16,7 @@ from benchmarks.trials import stretch
 TINY: dict[str, dict[str, Any]] = {
     "storage": {"events": 30_000, "frames": 3, "size": 96, "runs": 1},
     "scene": {"length_mm": 1.0, "runs": 1, "trials": 0, "grid": 8},
-    "clocks": {"trains": 3, "seconds": 10.0},
+    "clocks": {"trains": 3},
     "labels": {"frames": 5, "runs": 1},
 }
 PROMISED = {
@@ -31,7 +31,7 @@ PROMISED = {
     },
     "clocks": {
         "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
-        "index_worst_error_us", "xcorr_worst_error_us",
+        "index_worst_error_us", "nearest_worst_error_us", "pyxdf_worst_error_us",
     },
     "labels": {
         "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
