@@ -6,6 +6,8 @@ would have found, with the noise that was measured there. Times, numbers and syn
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
 
@@ -144,12 +146,15 @@ class MockFrameCamera:
         """Unit noise of the plate's marker and every papilla, (k, 1 + m, 2), by frame number."""
         things = 1 + len(self._world.skin)
         result = np.empty((len(number), things, 2))
-        for block in np.unique(number // _NOISE_FRAMES).tolist():
+        blocks, inside = np.divmod(number, _NOISE_FRAMES)
+        # numbers rise: what is of one block stands together
+        edges = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), len(number)]
+        for first, last in itertools.pairwise(edges if len(number) else ()):
+            block = int(blocks[first])
             if self._noise is None or self._noise[0] != block:
                 draw = generator(self._world.seed, "centroid noise", block)
                 self._noise = block, draw.standard_normal((_NOISE_FRAMES, things, 2))
-            mine = number // _NOISE_FRAMES == block
-            result[mine] = self._noise[1][number[mine] % _NOISE_FRAMES]
+            result[first:last] = self._noise[1][inside[first:last]]
         return result
 
 

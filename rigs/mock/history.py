@@ -32,7 +32,7 @@ class History:
         """Room for rows at times after the last one, to be filled by the caller, (k, width)."""
         n = len(t_ns)
         if self._length + n > len(self._rows):
-            size = max(2 * len(self._rows), self._length + n)
+            size = max(4 * len(self._rows), self._length + n)
             rows, times = np.empty((size, self._rows.shape[1])), np.empty(size, np.int64)
             rows[: self._length] = self._rows[: self._length]
             times[: self._length] = self._t_ns[: self._length]

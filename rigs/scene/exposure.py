@@ -66,6 +66,8 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
         tips.reshape(-1, 3, *tips.shape[1:]), plate.reshape(-1, 3), px_per_mm
     )
     smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
+    if not len(smeared):
+        return Exposures(tips, plate)
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
     ways: dict[int, Way] = {}
     for count in np.unique(counts).tolist():
