@@ -11,8 +11,8 @@ I64 = npt.NDArray[np.int64]
 
 
 _ROOM = 1 << 15
-"""Rows at first: few trials need more, and growing copies them all. Memory that is not written to is
-not taken."""
+"""Rows at first: few trials need more, and growing copies them all. What is not written to takes no
+memory."""
 _FEW = 512
 
 
