@@ -10,6 +10,7 @@ import itertools
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from rigs.capabilities import RigError
 from rigs.mock.clocks import Jitter
@@ -132,13 +133,13 @@ class MockFrameCamera:
         noise = self._centroid_noise(number)
         markers = view.centre_px(seen.tips_mm)
         # as the tracker does it: a marker cut by the picture's edge is not measured
-        markers[~_inside(markers, view.radius_px(seen.tips_mm) + 1.0, self._size)] = np.nan
+        _blank_cut(markers, view.radius_px(seen.tips_mm) + 1.0, *self._size)
         markers += settings.centroid_noise_px * noise[:, 1:]
         if not self._world.plate_marked:
             return markers.astype(np.float32), None
         plate = view.marker.centre_px(seen.plate_mm)
-        whole = np.full(len(plate), 0.5 * view.marker.size_px)
-        plate[~_inside(plate, whole, self._size)] = np.nan
+        whole = np.full((len(plate), 1), 0.5 * view.marker.size_px)
+        _blank_cut(plate[:, None], whole, *self._size)
         plate += settings.plate_noise_px * noise[:, 0]
         return markers.astype(np.float32), plate.astype(np.float32)
 
@@ -158,11 +159,15 @@ class MockFrameCamera:
         return result
 
 
-def _inside(place_px: F64, reach_px: F64, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Whether squares of that half side about (..., 2) places lie in the picture, (...,)."""
-    low = place_px >= reach_px[..., None]
-    high = place_px <= np.array(size) - 1 - reach_px[..., None]
-    return np.asarray((low & high).all(axis=-1))
+@njit(cache=True, nogil=True)
+def _blank_cut(place_px, reach_px, width, height):  # type: ignore[no-untyped-def]
+    """NaN where a square about a place, (k, m, 2), leaves the picture; half sides (k, m)."""
+    for k in range(place_px.shape[0]):
+        for i in range(place_px.shape[1]):
+            (x, y), reach = place_px[k, i], reach_px[k, i]
+            inside = x >= reach and y >= reach
+            if not (inside and x <= width - 1 - reach and y <= height - 1 - reach):
+                place_px[k, i] = np.nan
 
 
 def _optics(settings: MockSettings) -> FrameOptics:
