@@ -1,7 +1,8 @@
 """Writing files so that after a crash each one is whole or absent.
 
 Every write in the project goes through here: a temporary file beside the target, flushed to the
-disk, then renamed over it, then the folder flushed too.
+disk, then renamed over it, then the folder flushed too. In a folder that is still aside and becomes
+visible by a rename of its own, files are only flushed.
 """
 
 from __future__ import annotations
@@ -69,8 +70,26 @@ def write_json(path: Path, data: Any) -> None:
     Raises:
         ValueError: a NaN or an infinity, which JSON has no word for.
     """
+    write_text(path, _json_text(data))
+
+
+def write_json_aside(path: Path, data: Any) -> None:
+    """Write JSON in a folder that nobody looks into yet: flushed, neither atomic nor its entry.
+
+    Whoever makes the folder visible flushes its entries before.
+
+    Raises:
+        ValueError: as `write_json`.
+    """
+    with path.open("wb") as handle:
+        handle.write(_json_text(data).encode())
+        handle.flush()
+        os.fsync(handle.fileno())
+
+
+def _json_text(data: Any) -> str:
     text = json.dumps(data, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    write_text(path, text + "\n")
+    return text + "\n"
 
 
 def read_json(path: Path) -> dict[str, Any]:

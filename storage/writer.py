@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.files import sha256, sync_file, sync_folder, write_json
+from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
 from storage.streams import EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
 from storage.video import VideoWriter
@@ -138,22 +138,23 @@ class TrialWriter:
     def set_aside(self, quarantine: Path, record: Json, provenance: Json, cause: Json) -> None:
         """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
         self.seal()
+        write_json_aside(self.folder / "cause.json", cause)
         self._finish_folder(record, provenance)
-        write_json(self.folder / "cause.json", cause)
         quarantine.parent.mkdir(parents=True, exist_ok=True)
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)
 
     def _finish_folder(self, record: Json, provenance: Json) -> None:
-        write_json(self.folder / RECORD, record)
-        write_json(self.folder / PROVENANCE, provenance)
+        write_json_aside(self.folder / RECORD, record)
+        write_json_aside(self.folder / PROVENANCE, provenance)
         sums = {}
         for name in (DATA, FRAMES, RECORD):
             path = self.folder / name
             if path.exists():
-                sync_file(path)
+                if name != RECORD:  # whose writer did it
+                    sync_file(path)
                 sums[name] = {"sha256": sha256(path), "bytes": path.stat().st_size}
-        write_json(self.folder / CHECKSUMS, sums)
+        write_json_aside(self.folder / CHECKSUMS, sums)
         sync_folder(self.folder)
 
     def abandon(self) -> None:

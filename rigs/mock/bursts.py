@@ -31,6 +31,8 @@ class Bursts:
             scans: time between two scans of the read-out, and when one begins, true ns; 0 where
                 every event has its own time. The burst's events carry the times of scans, too.
         """
+        if not self._world.faults.of(EventBurst):
+            return events
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
 

@@ -75,10 +75,9 @@ class MockEventCamera:
         )
         self._next_ns = last_ns
         loads.forget(last_ns)
-        kept = t_ns >= self._begun_ns
-        for begin, end in world.faults.gaps_ns():
-            kept &= (t_ns < begin) | (t_ns >= end)
-        if not kept.all():
+        gaps = [(t_ns[0], self._begun_ns)] if len(t_ns) and t_ns[0] < self._begun_ns else []
+        for begin, end in [*gaps, *world.faults.gaps_ns()]:
+            kept = (t_ns < begin) | (t_ns >= end)
             t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
         stamps = world.clocks.event_camera.to_reference(t_ns) // 1000
         return EventChunk(x, y, p, self._stamps.of(stamps))

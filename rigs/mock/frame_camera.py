@@ -6,8 +6,11 @@ would have found, with the noise that was measured there. Times, numbers and syn
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from rigs.capabilities import RigError
 from rigs.mock.clocks import Jitter
@@ -130,13 +133,13 @@ class MockFrameCamera:
         noise = self._centroid_noise(number)
         markers = view.centre_px(seen.tips_mm)
         # as the tracker does it: a marker cut by the picture's edge is not measured
-        markers[~_inside(markers, view.radius_px(seen.tips_mm) + 1.0, self._size)] = np.nan
+        _blank_cut(markers, view.radius_px(seen.tips_mm) + 1.0, *self._size)
         markers += settings.centroid_noise_px * noise[:, 1:]
         if not self._world.plate_marked:
             return markers.astype(np.float32), None
         plate = view.marker.centre_px(seen.plate_mm)
-        whole = np.full(len(plate), 0.5 * view.marker.size_px)
-        plate[~_inside(plate, whole, self._size)] = np.nan
+        whole = np.full((len(plate), 1), 0.5 * view.marker.size_px)
+        _blank_cut(plate[:, None], whole, *self._size)
         plate += settings.plate_noise_px * noise[:, 0]
         return markers.astype(np.float32), plate.astype(np.float32)
 
@@ -144,20 +147,27 @@ class MockFrameCamera:
         """Unit noise of the plate's marker and every papilla, (k, 1 + m, 2), by frame number."""
         things = 1 + len(self._world.skin)
         result = np.empty((len(number), things, 2))
-        for block in np.unique(number // _NOISE_FRAMES).tolist():
+        blocks, inside = np.divmod(number, _NOISE_FRAMES)
+        # numbers rise: what is of one block stands together
+        edges = [0, *(np.flatnonzero(np.diff(blocks)) + 1).tolist(), len(number)]
+        for first, last in itertools.pairwise(edges if len(number) else ()):
+            block = int(blocks[first])
             if self._noise is None or self._noise[0] != block:
                 draw = generator(self._world.seed, "centroid noise", block)
                 self._noise = block, draw.standard_normal((_NOISE_FRAMES, things, 2))
-            mine = number // _NOISE_FRAMES == block
-            result[mine] = self._noise[1][number[mine] % _NOISE_FRAMES]
+            result[first:last] = self._noise[1][inside[first:last]]
         return result
 
 
-def _inside(place_px: F64, reach_px: F64, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Whether squares of that half side about (..., 2) places lie in the picture, (...,)."""
-    low = place_px >= reach_px[..., None]
-    high = place_px <= np.array(size) - 1 - reach_px[..., None]
-    return np.asarray((low & high).all(axis=-1))
+@njit(cache=True, nogil=True)
+def _blank_cut(place_px, reach_px, width, height):  # type: ignore[no-untyped-def]
+    """NaN where a square about a place, (k, m, 2), leaves the picture; half sides (k, m)."""
+    for k in range(place_px.shape[0]):
+        for i in range(place_px.shape[1]):
+            (x, y), reach = place_px[k, i], reach_px[k, i]
+            inside = x >= reach and y >= reach
+            if not (inside and x <= width - 1 - reach and y <= height - 1 - reach):
+                place_px[k, i] = np.nan
 
 
 def _optics(settings: MockSettings) -> FrameOptics:

@@ -10,13 +10,19 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 
+_ROOM = 1 << 15
+"""Rows at first: few trials need more, and growing copies them all. What is not written to takes no
+memory."""
+_FEW = 512
+
+
 class History:
     """A growing table of rows at rising times; it is never asked before it has a row."""
 
     def __init__(self, width: int) -> None:
         self._length = 0
-        self._rows = np.empty((1024, width))
-        self._t_ns = np.empty(1024, np.int64)
+        self._rows = np.empty((_ROOM, width))
+        self._t_ns = np.empty(_ROOM, np.int64)
 
     @property
     def begin_ns(self) -> int:
@@ -81,8 +87,9 @@ class History:
         """Drop rows that nobody needs who asks from `before_ns` on."""
         times = self._t_ns[: self._length]
         drop = max(int(np.searchsorted(times, before_ns, side="right")) - 1, 0)
-        if drop > len(self._rows) // 2:
-            kept = self._length - drop
+        kept = self._length - drop
+        # in one place while that is cheap, so that what is read next lies in the cache
+        if drop > max(_FEW, kept):
             self._rows[:kept] = self._rows[drop : self._length].copy()
             self._t_ns[:kept] = times[drop:].copy()
             self._length = kept

@@ -109,6 +109,8 @@ class ArmPath:
 
     def stirred(self, t_ns: I64) -> F64:
         """How much the arm trembles at rising times, 0 to 1: it fades in and out with motion."""
+        if not len(t_ns):
+            return np.zeros(0)
         runs: list[tuple[int, int]] = []
         for leg in self.legs:
             if runs and runs[-1][1] == leg.start_ns:
@@ -117,6 +119,8 @@ class ArmPath:
                 runs.append((leg.start_ns, leg.end_ns))
         result = np.zeros(len(t_ns))
         for start, end in runs:
+            if start > t_ns[-1] or end + FADE_NS < t_ns[0]:
+                continue
             risen = np.clip((np.minimum(t_ns, end) - start) / FADE_NS, 0.0, 1.0)
             fallen = np.maximum(t_ns - end, 0) / FADE_NS
             np.maximum(result, risen - fallen, out=result)

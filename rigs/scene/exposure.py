@@ -66,6 +66,8 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
         tips.reshape(-1, 3, *tips.shape[1:]), plate.reshape(-1, 3), px_per_mm
     )
     smeared = np.flatnonzero((farthest >= STILL_PX) | (bent >= BEND_PX))
+    if not len(smeared):
+        return Exposures(tips, plate)
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
     ways: dict[int, Way] = {}
     for count in np.unique(counts).tolist():
@@ -113,8 +115,10 @@ def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
             (x0, y0), (x1, y1), (x2, y2) = tips[k, 0, i], tips[k, 1, i], tips[k, 2, i]
             mean[k, i, 0] = (x0 + 4.0 * x1 + x2) / 6.0
             mean[k, i, 1] = (y0 + 4.0 * y1 + y2) / 6.0
-            first, second = math.hypot(x1 - x0, y1 - y0), math.hypot(x2 - x1, y2 - y1)
+            first = math.sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2)
+            second = math.sqrt((x2 - x1) ** 2 + (y2 - y1) ** 2)
             farthest = max(farthest, first + second)
-            bent = max(bent, math.hypot(x0 - 2.0 * x1 + x2, y0 - 2.0 * y1 + y2))
+            bow_x, bow_y = x0 - 2.0 * x1 + x2, y0 - 2.0 * y1 + y2
+            bent = max(bent, math.sqrt(bow_x**2 + bow_y**2))
         way[k], bend[k] = px_per_mm * farthest, px_per_mm * bent
     return mean, height, way, bend

@@ -87,7 +87,7 @@ def test_a_disk_that_fills_up_at_the_commit(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         write_json(path, data)
 
-    monkeypatch.setattr("storage.writer.write_json", no_room)
+    monkeypatch.setattr("storage.writer.write_json_aside", no_room)
     with pytest.raises(StoreError, match="its disk is full"):
         take_all(work)
     monkeypatch.undo()

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from storage.columns import COLUMNS, SMALL_HELD
 from storage.hdf5 import StreamFile, StreamReader
-from storage.streams import EventChunk
+from storage.streams import EventChunk, PulseChunk
 from tests.storage.trials import events
 
 
@@ -29,6 +30,7 @@ def test_events_come_back_however_they_were_chunked(count: int, tmp_path: Path) 
         write(tmp_path / f"{pieces}.h5", whole, pieces)
         with StreamReader(tmp_path / f"{pieces}.h5") as reader:
             found = reader.events()
+            assert np.array_equal(reader.event_times(), whole.t_us)
         for name in ("x", "y", "p", "t_us"):
             assert np.array_equal(getattr(found, name), getattr(whole, name))
 
@@ -86,3 +88,28 @@ def test_times_near_two_to_the_62_stay_apart(tmp_path: Path) -> None:
     write(tmp_path / "t.h5", whole, 1)
     with StreamReader(tmp_path / "t.h5") as reader:
         assert np.array_equal(reader.events().t_us, whole.t_us)
+
+
+def test_small_columns_come_back_from_beyond_what_is_held(tmp_path: Path) -> None:
+    times = np.arange(2 * SMALL_HELD + 5, dtype=np.int64)
+    file = StreamFile(tmp_path / "t.h5")
+    for start in range(0, len(times), 1000):
+        file.add_pulses("arm_pulses", PulseChunk(times[start : start + 1000]))
+    file.add_pulses("sync_pulses", PulseChunk(times))
+    assert file.counts["arm_pulses/t"] == len(times)
+    file.finish()
+    with StreamReader(tmp_path / "t.h5") as reader:
+        assert np.array_equal(reader.pulses("arm_pulses"), times)
+        assert np.array_equal(reader.pulses("sync_pulses"), times)
+        assert reader.counts()["arm_pulses/t"] == len(times)
+        assert reader.counts()["tracks/markers"] == 0
+
+
+def test_a_file_without_anything_has_every_column(tmp_path: Path) -> None:
+    StreamFile(tmp_path / "t.h5").finish()
+    with StreamReader(tmp_path / "t.h5") as reader:
+        assert set(reader.counts().values()) == {0}
+        assert not reader.has("tracks/markers")
+        assert len(reader.event_times()) == 0
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert all(file[name].attrs["unit"] for name in (*COLUMNS, "ms_to_idx", "t_offset"))

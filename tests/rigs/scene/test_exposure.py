@@ -67,3 +67,16 @@ def test_no_frames_are_no_exposures() -> None:
     found = seen(MOTIONS["fall"], [])
     assert found.tips_mm.shape == (0, 2, 2)
     assert not found.ways
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_exposures_seen_together_are_those_seen_one_by_one(name: str) -> None:
+    mids = [5_000_000, 8_000_000, 10_000_000, 13_000_000, 40_000_000]
+    together = seen(MOTIONS[name], mids, lambda ms: -0.01 * ms)
+    for index, mid in enumerate(mids):
+        alone = seen(MOTIONS[name], [mid], lambda ms: -0.01 * ms)
+        assert np.array_equal(together.tips_mm[index], alone.tips_mm[0])
+        assert together.plate_mm[index] == alone.plate_mm[0]
+        assert (index in together.ways) == (0 in alone.ways)
+        if index in together.ways:
+            assert np.array_equal(together.ways[index].tips_mm, alone.ways[0].tips_mm)
