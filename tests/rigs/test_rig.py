@@ -15,7 +15,7 @@ from rigs.capabilities import ArmFault, ArmState, RigError
 from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig, StopRequested
 from rigs.rig_file import RigFile
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 from tests.conftest import ROOT, SMALL
 
 RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
@@ -49,6 +49,15 @@ class Memory:
 
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         self._keep("sync pulses", chunk.t_ns)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        self._keep("exposures", chunk.t_ns)
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        self._keep("box reads", chunk.device_ns)
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        self._keep("frame camera reads", chunk.device_ns)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         self._keep("pose times", chunk.t_ns)
