@@ -119,6 +119,17 @@ class FaultyClock(ClockMap):
             result = np.where(result > due, after, result)
         return result
 
+    def pace_ns(self, true_ns: I64) -> I64:
+        """True times at which an undisturbed clock has the cycles that come at `true_ns`.
+
+        The inverse of `cycle_ns`.
+        """
+        result = true_ns
+        for fault, due in reversed(self._drifts()):
+            before = ClockMap.line(due, due, round(fault.ppm * 1000)).to_reference(result)
+            result = np.where(result > due, before, result)
+        return result
+
     def _drifts(self) -> list[tuple[ClockDrift, int]]:
         return [
             (fault, due)
@@ -128,11 +139,14 @@ class FaultyClock(ClockMap):
 
     def _jumps(self) -> list[tuple[int, int]]:
         """True times at which the clock jumps, rising, and by how much, ns."""
-        found = [*self.faults.spans(ClockJump), *self.faults.spans(ClockRestart)]
-        mine = [(due, fault) for fault, due, _ in found if fault.device == self.device]
+        mine: list[tuple[int, ClockJump | ClockRestart]] = []
+        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockJump)]
+        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockRestart)]
         jumps: list[tuple[int, int]] = []
         total = 0
         for due, fault in sorted(mine, key=lambda item: item[0]):
+            if fault.device != self.device:
+                continue
             if isinstance(fault, ClockJump):
                 jump_ns = round(fault.seconds * 1e9)
             else:
@@ -251,3 +265,14 @@ class Jitter:
         if self._sigma_ns == 0.0:
             return np.zeros(len(numbers), np.int64)
         return np.rint(self._noise.of(numbers)[:, 0] * self._sigma_ns).astype(np.int64)
+
+
+class Lateness:
+    """How much later than they might messages come: half-normal, cut at four sigma."""
+
+    def __init__(self, seed: int, purpose: str, longest_us: float) -> None:
+        self._jitter = Jitter(seed, purpose, longest_us / 4)
+
+    def ns(self, numbers: I64) -> I64:
+        """Delays of the messages `numbers` (not negative), 0 to the longest, shape (n,)."""
+        return np.abs(self._jitter.ns(numbers))

@@ -124,6 +124,45 @@ def test_a_trial_depends_on_nothing_that_ran_before() -> None:
         assert np.array_equal(first.all(name), second.all(name)), name
 
 
+@pytest.mark.parametrize(
+    ("timing", "streams"),
+    [
+        ({}, set()),
+        ({"frames": "exposure line"}, {"exposures"}),
+        ({"frames": "device time stamps"}, {"box reads", "frame camera reads"}),
+        ({"frames": "host arrival"}, {"box reads"}),
+        ({"arm": "host time"}, {"box reads"}),
+    ],
+)
+def test_what_is_read_besides_is_what_the_timing_needs(
+    timing: dict[str, Any], streams: set[str]
+) -> None:
+    data = {**RIG, "timing": timing, "mock": {"frame_camera": {"level": "tracks"}}}
+    rig = build_rig(validate(RigFile, data, "test"))
+    rig.connect()
+    sink = Memory()
+    run(rig, short_plan(), sink)
+    possible = {"exposures", "box reads", "frame camera reads"}
+    assert possible & set(sink.parts) == streams
+    for name in streams & {"box reads", "frame camera reads"}:
+        times = sink.all(name)
+        assert len(times) >= 8  # one a poll
+        assert np.all(np.diff(times) > 0)
+    assert (len(sink.all("arm pulses")) > 0) == ("arm" not in timing)
+    if "exposures" in streams:
+        assert len(sink.all("exposures")) >= len(sink.all("frame numbers"))
+
+
+def test_the_box_is_started_with_the_rigs_code() -> None:
+    rig = build_rig(validate(RigFile, {**RIG, "timing": {"code": "regular"}}, "test"))
+    rig.connect()
+    sink = Memory()
+    rig.listen(0.6, sink, 100)
+    gaps = np.diff(sink.all("sync pulses"))
+    assert gaps[0] == 160_000_000
+    assert np.all(gaps[1:] == 20_000_000)
+
+
 class Journal:
     """Notes every call of a device, and hands it on."""
 
