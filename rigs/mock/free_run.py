@@ -136,9 +136,9 @@ class ExposureLine:
         ticks = camera.ticks(self._read, until_ns)
         self._read += len(ticks)
         true_ns = camera.true_ns(ticks)
-        edges = true_ns + self._jitter.ns(ticks)
+        exposed = np.ones(len(ticks), np.bool_)
         for fault, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
             if fault.device == "frame_camera":
-                edges = edges[(true_ns < begin_ns) | (true_ns >= end_ns)]
-                true_ns = true_ns[(true_ns < begin_ns) | (true_ns >= end_ns)]
+                exposed &= (true_ns < begin_ns) | (true_ns >= end_ns)
+        edges: I64 = (true_ns + self._jitter.ns(ticks))[exposed]
         return edges
