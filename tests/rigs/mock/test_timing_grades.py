@@ -2,105 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
 
-from protocols.timing import FrameGrade, Timing
+from protocols.timing import FrameGrade
 from rigs.mock.clocks import trial_clocks
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import Arm, Clocks, FrameCamera, MockSettings
+from rigs.mock.settings import Clocks
 from rigs.pulse_code import code_bits
-from storage.streams import ClockReads, FrameChunk, PoseChunk
+from tests.rigs.mock.standing import CODE, on_box, record, rig, same
 
-CODE = 4321
 EXPOSURE_NS = 2_000_000
 FREE: tuple[FrameGrade, ...] = ("exposure line", "device time stamps", "host arrival")
-
-
-def rig(
-    timing: dict[str, Any], *faults: dict[str, Any], clocks: dict[str, Any] | None = None,
-    camera: dict[str, Any] | None = None, arm: dict[str, Any] | None = None, seed: int = 7,
-) -> MockDevices:  # fmt: skip
-    """A rig that has no pictures, ready for a trial."""
-    data = {
-        "frame_camera": FrameCamera(level="tracks", **(camera or {})).model_dump(),
-        "arm": Arm(**(arm or {})).model_dump(),
-        "clocks": Clocks(**(clocks or {})).model_dump(),
-        "faults": list(faults),
-    }
-    devices = build_mock(MockSettings.model_validate(data), Timing(**timing))
-    devices.arm.connect()
-    devices.begin_trial(seed)
-    return devices
-
-
-@dataclass
-class Streams:
-    """What came in one recording, in whole arrays."""
-
-    frames: dict[str, np.ndarray]
-    poses: dict[str, np.ndarray]
-    exposures: np.ndarray
-    arm_pulses: np.ndarray
-    truth: dict[str, Any]
-
-    def true_clock(self, name: str) -> np.ndarray:
-        """(n, 2): that clock and the box's, ns."""
-        return np.array(self.truth["clocks"][name])
-
-
-def record(devices: MockDevices, seconds: float = 3.0, chunk_s: float = 0.25) -> Streams:
-    """Stand still and read all streams every so often."""
-    frames: list[FrameChunk] = []
-    poses: list[PoseChunk] = []
-    exposures, arm_pulses = [], []
-
-    def read() -> None:
-        frames.append(devices.frames.read())
-        poses.append(devices.arm.read_poses())
-        exposures.append(devices.sync.read_exposures().t_ns)
-        arm_pulses.append(devices.arm.read_pulses().t_ns)
-
-    devices.arm.read_poses()
-    devices.frames.start()
-    devices.sync.start(100.0, CODE, devices.timing.code)
-    end_ns = devices.world.now_ns + round(seconds * 1e9)
-    while (left_ns := end_ns - devices.world.now_ns) > 0:
-        devices.clock.wait(min(chunk_s, left_ns / 1e9))
-        read()
-    devices.frames.stop()
-    devices.sync.stop()
-    devices.clock.wait(0.1)
-    read()
-
-    def joined(chunks: list[Any], *names: str) -> dict[str, np.ndarray]:
-        return {name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in names}
-
-    return Streams(
-        joined(frames, "number", "t_ns", "host_ns", "sync"),
-        joined(poses, "t_ns", "host_ns"),
-        np.concatenate(exposures),
-        np.concatenate(arm_pulses),
-        devices.truth(devices.world.now_ns),
-    )
-
-
-def on_box(pairs: np.ndarray, device_ns: np.ndarray) -> np.ndarray:
-    """Device times on the box's clock by the true pairs, float ns; good to far below 1 us."""
-    drift = (pairs[-1, 1] - pairs[0, 1]) / (pairs[-1, 0] - pairs[0, 0])
-    return pairs[0, 1] + (device_ns - pairs[0, 0]) * drift
-
-
-def same(one: Streams, other: Streams) -> None:
-    for stream in ("frames", "poses"):
-        for name, values in getattr(one, stream).items():
-            assert np.array_equal(values, getattr(other, stream)[name]), f"{stream} {name}"
-    for stream in ("exposures", "arm_pulses"):
-        assert np.array_equal(getattr(one, stream), getattr(other, stream)), stream
-    assert one.truth == other.truth
 
 
 # -- a camera that runs by itself ----------------------------------------------------------
@@ -257,64 +171,6 @@ def test_late_messages_hold_up_the_next_ones() -> None:
             assert np.any(np.diff(stream["host_ns"]) == 0)
         assert np.all(np.diff(found.frames["number"]) == 1)
         assert np.all(np.diff(found.poses["t_ns"]) == 2_000_000)
-
-
-# -- reads of clocks -----------------------------------------------------------------------
-
-
-def read_often(devices: MockDevices, device: Any, n: int = 400) -> ClockReads:
-    """Reads 20 ms apart, in whole arrays."""
-    reads = []
-    for _ in range(n):
-        devices.clock.wait(0.02)
-        reads.append(device.read_clock())
-        assert [len(reads[-1]), reads[-1].device_ns.dtype] == [1, np.int64]
-    names = ("device_ns", "before_ns", "after_ns")
-    return ClockReads(*(np.concatenate([getattr(r, name) for r in reads]) for name in names))
-
-
-@pytest.mark.parametrize("name", ["sync_box", "frame_camera"])
-def test_a_read_brackets_the_truth(name: str) -> None:
-    devices = rig({"frames": "device time stamps"})
-    devices.clock.wait(0.3)
-    devices.frames.start()
-    devices.sync.start(100.0, CODE)
-    device = devices.sync if name == "sync_box" else devices.frames
-    reads = read_often(devices, device)
-    box = devices.sync.clock
-    clock = box if name == "sync_box" else devices.world.clocks.frame_camera
-    unit = 1000 if name == "sync_box" else 1
-    assert np.all(clock.to_reference(reads.before_ns) // unit * unit <= reads.device_ns)
-    assert np.all(reads.device_ns <= clock.to_reference(reads.after_ns))
-    question = clock.to_device(reads.device_ns) - reads.before_ns
-    whole = reads.after_ns - reads.before_ns
-    assert question.min() >= 200_000 - 1000
-    assert whole.min() >= 400_000
-    assert whole.max() <= 10_000_000
-    assert whole.mean() == pytest.approx(600_000, rel=0.1)
-    assert np.all(reads.before_ns[1:] >= reads.after_ns[:-1])
-    assert np.all(reads.device_ns % unit == 0)
-
-
-def test_the_host_asks_again_only_after_an_answer() -> None:
-    clocks = {"read_shortest_us": 3000.0, "read_spread_us": 0.0}
-    devices = rig({"frames": "device time stamps"}, clocks=clocks)
-    devices.sync.start(100.0, CODE)
-    first, second = devices.sync.read_clock(), devices.sync.read_clock()
-    assert second.before_ns[0] == first.after_ns[0] == 6_000_000
-    assert second.device_ns[0] - first.device_ns[0] == pytest.approx(6_000_000, abs=2000)
-
-
-def test_reads_belong_to_the_trials_seed() -> None:
-    found = []
-    for seed in (3, 3, 4):
-        devices = rig({"frames": "device time stamps"}, seed=99)
-        devices.frames.read_clock()
-        devices.begin_trial(seed)
-        found.append(read_often(devices, devices.frames, 10))
-    assert np.array_equal(found[0].after_ns, found[1].after_ns)
-    assert np.array_equal(found[0].device_ns, found[1].device_ns)
-    assert not np.array_equal(found[0].after_ns, found[2].after_ns)
 
 
 # -- the arm -------------------------------------------------------------------------------
