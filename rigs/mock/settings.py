@@ -54,7 +54,7 @@ class Skin(StrictModel):
     def _layers(self) -> Skin:
         if len(self.ring_counts) != len(self.heights_mm):
             raise KeyedError(
-                "scene.skin.heights_mm",
+                "mock.scene.skin.heights_mm",
                 list(self.heights_mm),
                 f"must hold one height for each of the {len(self.ring_counts)} layers",
             )
@@ -112,7 +112,7 @@ class Contact(StrictModel):
     def _turn(self) -> Contact:
         if math.hypot(*self.nominal_rotvec_deg) > 360.0:
             raise KeyedError(
-                "scene.contact.nominal_rotvec_deg",
+                "mock.scene.contact.nominal_rotvec_deg",
                 list(self.nominal_rotvec_deg),
                 "is a rotation vector in degrees, at most 360 long",
             )
@@ -172,7 +172,7 @@ class EventCamera(StrictModel):
     def _scans(self) -> EventCamera:
         if 0 < self.readout_hz < 1000:
             raise KeyedError(
-                "event_camera.readout_hz",
+                "mock.event_camera.readout_hz",
                 self.readout_hz,
                 "must be 0 (no scans), or 1000 to 10000 scans a second",
             )

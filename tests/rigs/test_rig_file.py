@@ -52,6 +52,11 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "mock.event_camera.noise_hz",
         "greater than or equal to 0",
     ),
+    "scans that are too few": (
+        _set("mock", to={"event_camera": {"readout_hz": 5}}),
+        "mock.event_camera.readout_hz",
+        "must be 0 (no scans), or 1000 to 10000",
+    ),
     "scale that is not drawn": (
         _set("frame_camera", "scale_px_per_mm", to=12),
         "frame_camera.scale_px_per_mm",
