@@ -24,7 +24,7 @@ from rigs.build import simulated_rig
 from rigs.levels import with_level
 from rigs.mock.devices import MockDevices, build_mock
 from rigs.rig_file import load_rig_file
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 
 ROOT = Path(__file__).parent.parent
 WINDOW_US = 30_000
@@ -58,6 +58,15 @@ class Film:
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         """Not shown."""
 
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Not shown."""
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        """Not shown."""
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        """Not shown."""
+
     def add_poses(self, chunk: PoseChunk) -> None:
         """Not shown."""
 
@@ -66,7 +75,7 @@ def take(plan: Plan, trial: Trial) -> tuple[MockDevices, Film, dict[str, Any]]:
     """One trial on the default rig."""
     file, _ = load_rig_file(ROOT / "rigs" / "mock.yaml")
     file = with_level(file, plan)
-    devices, film = build_mock(file.mock), Film()
+    devices, film = build_mock(file.mock, file.timing), Film()
     rig = simulated_rig(file, devices)
     rig.connect()
     mass = plan.mass_kg(trial)

@@ -26,7 +26,7 @@ from rigs.mock.skins import skin_of
 from rigs.rig import Rig, TrialRun
 from rigs.rig_file import RigFile
 from rigs.scene.onsets import retraction_onsets
-from storage.streams import EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
 
 MOTION = frozenset({"slide", "retract"})
 PERFECT = Clocks(
@@ -101,6 +101,15 @@ class _Memory:
         pass
 
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        pass
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        pass
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        pass
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
         pass
 
     def add_poses(self, chunk: PoseChunk) -> None:

@@ -33,7 +33,7 @@ class _MockSimulation:
 
 def build_rig(file: RigFile) -> Rig:
     """The rig that a rig file describes, not connected yet."""
-    return simulated_rig(file, build_mock(file.mock))
+    return simulated_rig(file, build_mock(file.mock, file.timing))
 
 
 def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
@@ -49,6 +49,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         operator=devices.operator,
         frame=PlateFrame.taught((plane.centre, plane.right, plane.above)),
         poll_s=float(file.poll),
+        timing=file.timing,
         touch_mm=file.calibration.touch_depth,
         plate=devices.plate,
         simulation=_MockSimulation(devices),

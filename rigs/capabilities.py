@@ -14,7 +14,8 @@ from enum import Enum
 from typing import Any, Protocol, runtime_checkable
 
 from protocols.program import PlateAction
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
+from protocols.timing import Code
+from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
 
 
 class RigError(RuntimeError):
@@ -82,7 +83,7 @@ class Clock(Protocol):
 
 @runtime_checkable
 class Arm(Protocol):
-    """A six-axis arm with a controller clock and a digital input on the sync line."""
+    """A six-axis arm with a controller clock, and perhaps a digital input on the sync line."""
 
     def connect(self) -> None:
         """Open the connection; bounded. Raises ArmFault."""
@@ -106,7 +107,10 @@ class Arm(Protocol):
         """Poses since the last call."""
 
     def read_pulses(self) -> PulseChunk:
-        """Sync pulses seen by the digital input since the last call, controller clock."""
+        """Sync pulses seen by the digital input since the last call, controller clock.
+
+        Empty where the input is not wired.
+        """
 
     def stop(self) -> None:
         """Stop now; safe to call at any time and more than once; never unlocks anything."""
@@ -144,16 +148,19 @@ class FrameCamera(Protocol):
 
     px_per_mm: float
     mid_exposure_ns: int
-    """From the trigger to the middle of the exposure, which is what a frame's time says."""
+    """From the start of the exposure to its middle, which is what a frame's time says."""
 
     def set_region(self, width_px: int, height_px: int) -> None:
         """Read out a centred region only."""
 
     def start(self) -> None:
-        """Begin to grab on the sync box's ticks; the frame counter restarts at 0."""
+        """Begin to grab, on the sync box's ticks or freely; the frame counter restarts at 0."""
 
     def read(self) -> FrameChunk:
         """Frames since the last call."""
+
+    def read_clock(self) -> ClockReads:
+        """Read the camera's clock once: one row. Only asked of a camera that has one to read."""
 
     def stop(self) -> None:
         """Stop grabbing."""
@@ -166,14 +173,24 @@ class FrameCamera(Protocol):
 class SyncBox(Protocol):
     """Ticks at a fixed rate: triggers frames, and sends a pulse on each tick with a code bit 1."""
 
-    def start(self, rate_hz: float, seed: int) -> None:
-        """Begin ticks and the pseudo-random code (16-bit LFSR from `seed`, not 0)."""
+    def start(self, rate_hz: float, seed: int, code: Code) -> None:
+        """Begin ticks and a code of `rigs.pulse_code` from `seed`, 1 to 65,535."""
 
     def read_pulses(self) -> PulseChunk:
         """Pulses sent since the last call; the box's clock starts at 0 with `start`."""
 
+    def read_exposures(self) -> PulseChunk:
+        """Starts of the frame camera's exposures since the last call, box clock.
+
+        Exposures are seen from `start` to `close`, also those whose frame is lost later; none
+        where the camera's output is not wired.
+        """
+
+    def read_clock(self) -> ClockReads:
+        """Read the box's clock once: one row."""
+
     def stop(self) -> None:
-        """Stop the ticks."""
+        """Stop the ticks; the clock goes on."""
 
     def close(self) -> None:
         """Give the device back."""

@@ -1,9 +1,16 @@
-"""The pseudo-random code on the sync line: what makes a train of pulses unambiguous.
+"""The code on the sync line: what makes a train of pulses unambiguous.
 
 A regular train looks the same after a shift by one period, so a device that misses its first
-pulse would be aligned wrongly by one tick. The bits of a maximal linear-feedback shift register
-never repeat a run of 16 within 65,535 ticks (11 minutes at 100 Hz), so any 16 of them say where
-in the train one is. The sync box, the frame camera's sync line and the decoder share this file.
+pulse would be aligned wrongly by one tick. Three codes say where in the train one is; which one a
+sync box sends is told by the rig file (`protocols.timing.Timing.code`):
+
+* ``lfsr``: bits of a maximal linear-feedback shift register. A run of 16 never comes again within
+  65,535 ticks (11 minutes at 100 Hz), so any 16 of them say where in the train one is.
+* ``irregular``: pulses at pseudo-random intervals, for a box that times pulses and knows no bits.
+* ``regular``: pulses at equal intervals after one long silence, the start marker, for a box that
+  can do nothing else. Only who sees the marker knows where he is.
+
+The sync box, the frame camera's sync line and the decoder share this file.
 """
 
 from __future__ import annotations
@@ -11,31 +18,70 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-PERIOD = (1 << 16) - 1
-"""Ticks until the code comes again."""
+from protocols.timing import Code
+
+SEEDS = (1 << 16) - 1
+"""Seeds are 1 to this, whatever the code."""
+PERIOD = SEEDS
+"""Ticks until the code `lfsr` comes again; the others do not."""
 TAPS = (16, 14, 13, 11)
 """Of the Fibonacci register x^16 + x^14 + x^13 + x^11 + 1, which is primitive."""
+SHORTEST_TICKS, LONGEST_TICKS = 2, 9
+"""Intervals of the code `irregular`."""
+MARKER_TICKS = 16
+"""From the first pulse of the code `regular` to its second."""
+REGULAR_TICKS = 2
+"""Between all later pulses of the code `regular`."""
 
 U8 = npt.NDArray[np.uint8]
+_WORD = (1 << 32) - 1
+_SPREAD = 2_654_435_761
 
 
-def code_bits(seed: int, n: int) -> U8:
-    """The first `n` bits of the code, shape (n,), uint8 of 0 and 1.
+def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
+    """The first `n` bits of a code, one a tick, shape (n,), uint8: 1 is a pulse on that tick.
 
-    Bit 0 is the lowest bit of `seed`; each step shifts the register down and feeds the exclusive
-    or of its taps in at the top.
+    ``lfsr``: bit 0 is the lowest bit of `seed`; each step shifts the register down and feeds the
+    exclusive or of its taps in at the top. The bits repeat after `PERIOD`.
+
+    ``irregular``: a pulse on tick 0, then one after each interval in turn. Intervals are drawn by
+    a xorshift generator of 32 bits, here as a sync box has it in C (all unsigned, modulo 2**32)::
+
+        uint32_t x = seed * 2654435761u;
+        uint32_t interval(void) {           // ticks to the next pulse, 2 to 9
+            x ^= x << 13; x ^= x >> 17; x ^= x << 5;
+            return 2 + (x >> 29);
+        }
+
+    ``regular``: pulses on the ticks 0, 16, 18, 20 and so on, whatever the seed.
 
     Args:
-        seed: state of the register, 1 to 65,535 (0 would stay 0 for ever).
-        n: how many bits; they repeat after `PERIOD`.
+        seed: 1 to 65,535 (a register in the state 0 would stay there for ever).
+        n: how many bits; any number, a trial may be longer than `PERIOD`.
 
     Raises:
         ValueError: `seed` outside 1 to 65,535, or `n` negative.
     """
-    if not 1 <= seed <= PERIOD:
-        raise ValueError(f"seed = {seed}: the register's state must be 1 to {PERIOD}")
+    if not 1 <= seed <= SEEDS:
+        raise ValueError(f"seed = {seed}: must be 1 to {SEEDS}")
     if n < 0:
         raise ValueError(f"n = {n}: must not be negative")
+    return {"lfsr": _lfsr, "irregular": _irregular, "regular": _regular}[code](seed, n)
+
+
+def start_marker_ns(code: Code, rate_hz: float) -> float | None:
+    """The silence after the first pulse that marks a train's start, ns of the box's clock.
+
+    Args:
+        rate_hz: ticks a second.
+
+    Returns:
+        None for a code that any part of a train is known by.
+    """
+    return MARKER_TICKS * 1e9 / rate_hz if code == "regular" else None
+
+
+def _lfsr(seed: int, n: int) -> U8:
     once = np.zeros(max(n if n < PERIOD else PERIOD, 16), np.uint8)
     once[:16] = (seed >> np.arange(16)) & 1
     done, leap = 16, 1
@@ -51,3 +97,24 @@ def code_bits(seed: int, n: int) -> U8:
         once[done : done + count] = parts[0] ^ parts[1] ^ parts[2] ^ parts[3]
         done += count
     return np.resize(once, n) if n > len(once) else once[:n]
+
+
+def _irregular(seed: int, n: int) -> U8:
+    bits = np.zeros(n, np.uint8)
+    state, tick = seed * _SPREAD & _WORD, 0
+    pulses = []
+    while tick < n:
+        pulses.append(tick)
+        state ^= state << 13 & _WORD
+        state ^= state >> 17
+        state ^= state << 5 & _WORD
+        tick += SHORTEST_TICKS + (state >> 29)
+    bits[pulses] = 1
+    return bits
+
+
+def _regular(seed: int, n: int) -> U8:
+    bits = np.zeros(n, np.uint8)
+    bits[:1] = 1
+    bits[MARKER_TICKS::REGULAR_TICKS] = 1
+    return bits

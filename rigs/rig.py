@@ -81,6 +81,7 @@ class Rig:
 
     Attributes:
         poll_s: how often streams are read and stop requests looked at.
+        timing: which signal reaches which device, and so what else has to be read.
         touch_mm: how deep the centre papilla is when touching off notices it.
         simulation: the world behind a simulated rig, None on a real one.
     """
@@ -286,7 +287,7 @@ class Rig:
         self.events.start()
         if with_frames:
             self.frames.start()
-        self.sync.start(rate_hz, seed % 65535 + 1)
+        self.sync.start(rate_hz, seed % 65535 + 1, self.timing.code)
 
     def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
         """Stop the pulses, and read what the cameras still hold before they stop."""
@@ -303,6 +304,12 @@ class Rig:
         sink.add_arm_pulses(self.arm.read_pulses())
         sink.add_sync_pulses(self.sync.read_pulses())
         sink.add_frames(self.frames.read())
+        if self.timing.frames == "exposure line":
+            sink.add_exposures(self.sync.read_exposures())
+        if self.timing.reads_clocks:
+            sink.add_box_reads(self.sync.read_clock())
+        if self.timing.frames == "device time stamps":
+            sink.add_frame_camera_reads(self.frames.read_clock())
 
     def _home(self, home: Position, seed: int) -> None:
         """To where a motion begins; only then is a simulated trial's randomness drawn."""

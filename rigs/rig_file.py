@@ -14,7 +14,9 @@ from protocols.hashing import hash_text
 from protocols.plan import Plan
 from protocols.program import Move
 from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
+from protocols.timing import Timing
 from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from rigs.mock.promises import check_promises
 from rigs.mock.settings import MockSettings
 from rigs.rig_inheritance import read_rig, rig_path
 
@@ -137,6 +139,8 @@ class RigFile(StrictModel):
     skin: Skin
     frame_camera: FrameCameraSpec
     estimates: Estimates
+    timing: Timing = Timing()
+    """Which signal reaches which device, and how good their clocks are."""
     mock: MockSettings
 
     @model_validator(mode="after")
@@ -155,6 +159,12 @@ class RigFile(StrictModel):
                 told,
                 f"must be mock.frame_camera.px_per_mm = {drawn:g}",
             )
+        return self
+
+    @model_validator(mode="after")
+    def _promises_are_kept(self) -> RigFile:
+        """The simulated clocks are no worse than `timing` says."""
+        check_promises(self.mock, self.timing)
         return self
 
     @property

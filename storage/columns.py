@@ -48,6 +48,16 @@ TRACKS: dict[str, Kind] = {
     "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
     "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
 }
+# only there once something came, for they depend on which wires a rig has
+TIMING: dict[str, Kind] = {
+    "exposures/t": ("int64", (), "ns of the sync box's clock, start of an exposure"),
+    "box_reads/t": ("int64", (), "ns of the sync box's clock"),
+    "box_reads/before": ("int64", (), "ns of the host's monotonic clock"),
+    "box_reads/after": ("int64", (), "ns of the host's monotonic clock"),
+    "frame_camera_reads/t": ("int64", (), "ns of the frame camera's clock"),
+    "frame_camera_reads/before": ("int64", (), "ns of the host's monotonic clock"),
+    "frame_camera_reads/after": ("int64", (), "ns of the host's monotonic clock"),
+}
 INDEX, OFFSET = "ms_to_idx", "t_offset"
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
 _PACKED = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)

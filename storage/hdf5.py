@@ -14,8 +14,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from storage.columns import COLUMNS, INDEX, OFFSET, TRACKS, Array, Column, blank, create
-from storage.streams import I64, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.columns import COLUMNS, INDEX, OFFSET, TIMING, TRACKS, Array, Column, blank, create
+from storage.streams import I64, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+
+_READS = ("t", "before", "after")
 
 
 class StreamFile:
@@ -70,6 +72,25 @@ class StreamFile:
     def add_pulses(self, group: str, chunk: PulseChunk) -> None:
         """Append pulses to ``event_pulses``, ``arm_pulses`` or ``sync_pulses``."""
         self._append(f"{group}/t", chunk.t_ns)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Append starts of exposures to ``exposures``."""
+        self._append_late({"exposures/t": chunk.t_ns})
+
+    def add_clock_reads(self, group: str, chunk: ClockReads) -> None:
+        """Append reads of a clock to ``box_reads`` or ``frame_camera_reads``."""
+        columns = zip(_READS, (chunk.device_ns, chunk.before_ns, chunk.after_ns), strict=True)
+        self._append_late({f"{group}/{name}": values for name, values in columns})
+
+    def _append_late(self, columns: dict[str, I64]) -> None:
+        """Append to columns of `TIMING`, which are made when the first row comes."""
+        for name, values in columns.items():
+            if not len(values):
+                continue
+            if name not in self._columns:
+                create(self._file, name, TIMING[name])
+                self._columns[name] = Column(self._file, name)
+            self._append(name, values)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""
@@ -174,8 +195,21 @@ class StreamReader:
         return EventChunk(x[rows], y[rows], p[rows], times[first:last])
 
     def pulses(self, group: str) -> I64:
-        """Pulse times of ``event_pulses``, ``arm_pulses`` or ``sync_pulses``, ns."""
-        return self.column(f"{group}/t")
+        """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
+
+        Exposures are empty where the sync box sees none.
+        """
+        return self._late(f"{group}/t")
+
+    def clock_reads(self, group: str) -> ClockReads:
+        """All of ``box_reads`` or ``frame_camera_reads``; empty where nobody read that clock."""
+        return ClockReads(*(self._late(f"{group}/{name}") for name in _READS))
+
+    def _late(self, name: str) -> I64:
+        """A column of times; empty if it is one of `TIMING` that was never made."""
+        if name in TIMING and not self.has(name):
+            return np.empty(0, np.int64)
+        return self.column(name)
 
     def poses(self) -> PoseChunk:
         """All arm poses."""
@@ -186,14 +220,15 @@ class StreamReader:
         return np.asarray(self._data(name)[:])
 
     def has(self, name: str) -> bool:
-        """Whether the file has a column of this name; those of `TRACKS` may be missing."""
+        """Whether the file has a column of this name; those of `TRACKS` and
+        `TIMING` may be missing."""
         return name in self._opened or name in self._file
 
     def counts(self) -> dict[str, int]:
         """Rows of every column; 0 for one that is missing."""
         return {
             name: int(self._data(name).shape[0]) if self.has(name) else 0
-            for name in (*COLUMNS, *TRACKS)
+            for name in (*COLUMNS, *TRACKS, *TIMING)
         }
 
 

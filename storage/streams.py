@@ -39,13 +39,28 @@ class EventChunk:
 
 @dataclass(frozen=True)
 class PulseChunk:
-    """Rising edges of the sync line as one device saw them, shape (n,)."""
+    """Rising edges as one device saw them, of the sync line or of another one, shape (n,)."""
 
     t_ns: I64
     """That device's clock, nanoseconds (a microsecond counter times 1,000)."""
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+
+@dataclass(frozen=True)
+class ClockReads:
+    """A device's clock, read by the host between a question and its answer, n times."""
+
+    device_ns: I64
+    """What the device's clock showed, nanoseconds, shape (n,)."""
+    before_ns: I64
+    """Host's monotonic clock when it asked, nanoseconds, shape (n,)."""
+    after_ns: I64
+    """Host's monotonic clock when it had the answer, nanoseconds, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.device_ns)
 
 
 @dataclass(frozen=True)
@@ -74,11 +89,12 @@ class FrameChunk:
     number: I64
     """The camera's own frame counter, shape (n,); a gap is a lost frame."""
     t_ns: I64
-    """Middle of exposure on the camera's clock, nanoseconds, shape (n,)."""
+    """Middle of exposure on the camera's clock, nanoseconds, shape (n,); `host_ns` again from a
+    camera that has no clock to be read."""
     host_ns: I64
     """Host's monotonic clock at reception, nanoseconds, shape (n,)."""
     sync: U8
-    """Level of the sync line during the exposure: 0 or 1, shape (n,)."""
+    """Level of the sync line during the exposure: 0 or 1, shape (n,); 0 where none is wired."""
     markers_px: F32 | None = None
     """Instead of pictures: column and row of every papilla's marker in the order of the skin's
     layout, shape (n, m, 2), NaN where it was not seen whole."""
@@ -114,6 +130,15 @@ class Sink(Protocol):
 
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         """Append the pulses that the sync box says it sent, on its own clock."""
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Append the starts of exposures that the sync box saw, on its own clock."""
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the sync box's clock."""
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the frame camera's clock."""
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""

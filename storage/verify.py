@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.columns import TRACKS
+from storage.columns import TIMING, TRACKS
 from storage.files import read_json, sha256
 from storage.hdf5 import StreamReader
 from storage.recording import Recording
@@ -82,7 +82,8 @@ def _contents(folder: Path) -> list[Problem]:
         problems.append(Problem(str(folder / RECORD), f"is of trial {record['trial']}"))
     with StreamReader(folder / DATA) as reader:
         counts = reader.counts()
-        for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t"):
+        made = [name for name in TIMING if reader.has(name)]
+        for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t", *made):
             if np.any(np.diff(reader.column(name)) < 0):
                 problems.append(Problem(str(folder / DATA), f"{name} runs backwards"))
     found = {

@@ -10,7 +10,7 @@ import numpy as np
 
 from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
-from storage.streams import EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
 from storage.video import VideoWriter
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
@@ -68,6 +68,18 @@ class TrialWriter:
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         """Append pulses sent by the sync box."""
         self._streams.add_pulses("sync_pulses", chunk)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Append starts of exposures seen by the sync box."""
+        self._streams.add_exposures(chunk)
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the sync box's clock."""
+        self._streams.add_clock_reads("box_reads", chunk)
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the frame camera's clock."""
+        self._streams.add_clock_reads("frame_camera_reads", chunk)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
-from rigs.mock.clocks import FaultyClock, Jitter, Noise, undisturbed
+from rigs.mock.clocks import FaultyClock, Lateness, Noise, undisturbed
 from rigs.mock.path import TOOL, Leg
 from rigs.mock.sync import MockSyncBox, SyncInput
 from rigs.mock.world import World
@@ -18,10 +18,14 @@ BACKLOG_NS = 120_000_000_000
 
 
 class MockArm:
-    """An arm without ramps: each segment runs at its speed from its first nanosecond."""
+    """An arm without ramps: each segment runs at its speed from its first nanosecond.
 
-    def __init__(self, world: World, box: MockSyncBox) -> None:
-        self._world = world
+    Args:
+        wired: whether the sync line reaches its digital input.
+    """
+
+    def __init__(self, world: World, box: MockSyncBox, *, wired: bool = True) -> None:
+        self._world, self._wired = world, wired
         self._input = SyncInput(world, box, "arm")
         self._connected = False
         self._period_ns = round(1e9 / world.settings.arm.pose_rate_hz)
@@ -36,7 +40,9 @@ class MockArm:
         self._first = -(-self._cycles.to_reference(world.now_ns) // self._period_ns)
         self._read = self._first
         self._noise = Noise(world.seed, "pose noise", 3)
-        self._late = Jitter(world.seed, "arm reception", 50.0)
+        late_us = world.settings.arm.arrival_jitter_us
+        self._late = Lateness(world.seed, "arm reception", late_us)
+        self._arrived_ns = 0
 
     def connect(self) -> None:
         """Open the connection."""
@@ -90,10 +96,13 @@ class MockArm:
         end = clock.to_reference(world.now_ns) // self._period_ns + 1
         cycles = np.arange(first, max(end, first), dtype=np.int64)
         true = clock.to_device(cycles * self._period_ns)
-        host = true + latency + np.abs(self._late.ns(cycles - self._first))
+        host = true + latency + self._late.ns(cycles - self._first)
+        # in order: a pose that is late holds up the next one
+        host = np.maximum(np.maximum.accumulate(host), self._arrived_ns)
         here = int(np.searchsorted(host, world.now_ns, side="right"))
         self._read = first + here
         cycles, true, host = cycles[:here], true[:here], host[:here]
+        self._arrived_ns = max(self._arrived_ns, int(host.max(initial=0)))
         state = world.path.states(true, TOOL)
         xyz = state[:, :3] + self._noise.of(cycles - self._first) * (settings.pose_noise_um * 1e-3)
         stamps = cycles * self._period_ns
@@ -102,7 +111,9 @@ class MockArm:
         return PoseChunk(stamps, host, xyz, state[:, 3:].copy())
 
     def read_pulses(self) -> PulseChunk:
-        """Sync pulses seen by the digital input, controller clock."""
+        """Sync pulses seen by the digital input, controller clock; none where it is not wired."""
+        if not self._wired:
+            return PulseChunk(np.empty(0, np.int64))
         stamp = self._world.clocks.arm.to_reference(self._input.edges_ns())
         grid = self._world.settings.arm.input_sampling_us * 1000
         return PulseChunk(-(-stamp // grid) * grid if grid else stamp)

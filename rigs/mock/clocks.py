@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import ClockDrift, ClockJump, Device
+from rigs.mock.fault_settings import ClockDrift, ClockJump, ClockRestart, Device
 from rigs.mock.faults import FaultBook
 from rigs.mock.settings import Clocks
 from rigs.scene.randomness import generator
@@ -22,6 +22,11 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 HOUR_NS = 3_600_000_000_000
 JITTER_BLOCK = 4096
+_CLOCK_FAULTS: tuple[type[ClockDrift | ClockJump | ClockRestart], ...] = (
+    ClockDrift,
+    ClockJump,
+    ClockRestart,
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClock
 
 @dataclass(frozen=True)
 class FaultyClock(ClockMap):
-    """True time to device time by a clock that drifts more, or jumps, at known moments.
+    """True time to device time by a clock that drifts more, jumps or restarts at known moments.
 
     The map of its superclass is the undisturbed clock: what the device's cycles run by.
     """
@@ -69,10 +74,7 @@ class FaultyClock(ClockMap):
             TypeError, OverflowError: as the undisturbed map.
         """
         shown = super().to_reference(times)
-        gained = np.zeros(np.shape(times), np.int64)
-        for fault, due in self._drifts():
-            since = np.maximum(np.asarray(times) - due, 0).astype(np.int64)
-            gained += ClockMap.line(0, 0, round(fault.ppm * 1000)).to_reference(since) - since
+        gained = self._drifted_ns(np.asarray(times, np.int64))
         gained += self.jumped_ns(np.asarray(times, np.int64))
         return shown + int(gained) if isinstance(shown, int) else shown + gained
 
@@ -83,7 +85,8 @@ class FaultyClock(ClockMap):
     def to_device(self, times: int | npt.NDArray[np.integer[Any]]) -> int | I64:
         """The first true time, to the ns, at which the clock shows at least `times`.
 
-        A clock that jumps back shows some times twice, one that jumps on leaves some out.
+        A clock that jumps back shows some times twice, and one that jumps on leaves some out. A
+        time within the trial is preferred to one before it.
         """
         if not isinstance(times, int | np.integer):
             flat = [self._first(int(t)) for t in np.asarray(times).ravel()]
@@ -93,9 +96,16 @@ class FaultyClock(ClockMap):
     def jumped_ns(self, true_ns: I64) -> I64:
         """By how much the clock has jumped at true times, ns, shape of `true_ns`."""
         gained = np.zeros(true_ns.shape, np.int64)
-        for fault, due, _ in self.faults.spans(ClockJump):
-            if fault.device == self.device:
-                gained += np.where(true_ns >= due, round(fault.seconds * 1e9), 0)
+        for due, jump_ns in self._jumps():
+            gained += np.where(true_ns >= due, jump_ns, 0)
+        return gained
+
+    def _drifted_ns(self, true_ns: I64) -> I64:
+        """What the clock has gained by drifting more at true times, ns."""
+        gained = np.zeros(true_ns.shape, np.int64)
+        for fault, due in self._drifts():
+            since = np.maximum(true_ns - due, 0)
+            gained += ClockMap.line(0, 0, round(fault.ppm * 1000)).to_reference(since) - since
         return gained
 
     def cycle_ns(self, true_ns: I64) -> I64:
@@ -109,6 +119,17 @@ class FaultyClock(ClockMap):
             result = np.where(result > due, after, result)
         return result
 
+    def pace_ns(self, true_ns: I64) -> I64:
+        """True times at which an undisturbed clock has the cycles that come at `true_ns`.
+
+        The inverse of `cycle_ns`.
+        """
+        result = true_ns
+        for fault, due in reversed(self._drifts()):
+            before = ClockMap.line(due, due, round(fault.ppm * 1000)).to_reference(result)
+            result = np.where(result > due, before, result)
+        return result
+
     def _drifts(self) -> list[tuple[ClockDrift, int]]:
         return [
             (fault, due)
@@ -116,26 +137,55 @@ class FaultyClock(ClockMap):
             if fault.device == self.device
         ]
 
+    def _jumps(self) -> list[tuple[int, int]]:
+        """True times at which the clock jumps, rising, and by how much, ns."""
+        mine: list[tuple[int, ClockJump | ClockRestart]] = []
+        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockJump)]
+        mine += [(due, fault) for fault, due, _ in self.faults.spans(ClockRestart)]
+        jumps: list[tuple[int, int]] = []
+        total = 0
+        for due, fault in sorted(mine, key=lambda item: item[0]):
+            if fault.device != self.device:
+                continue
+            if isinstance(fault, ClockJump):
+                jump_ns = round(fault.seconds * 1e9)
+            else:
+                before = super().to_reference(due) + int(self._drifted_ns(np.array(due, np.int64)))
+                jump_ns = -(before + total)
+            total += jump_ns
+            jumps.append((due, jump_ns))
+        return jumps
+
     def _first(self, shown: int) -> int:
-        jumps = {due for fault, due, _ in self.faults.spans(ClockJump)}
+        dues = sorted({due for due, _ in self._jumps()})
+        # a clock that began again at 0 shows what it may have shown long before the trial, too
+        for low, high in zip([0, *dues], [*dues, 1 << 61], strict=True):
+            if low < high and self.to_reference(low) <= shown <= self.to_reference(high - 1):
+                return self._halved(shown, low, high)
         low = -(1 << 61)
-        for high in [*sorted(jumps), 1 << 61]:
-            # between jumps the clock never runs backwards, so that halving finds the time
+        for high in [*dues, 1 << 61]:
             if self.to_reference(high - 1) >= shown:
-                while low < high - 1:
-                    middle = (low + high - 1) // 2
-                    if self.to_reference(middle) >= shown:
-                        high = middle + 1
-                    else:
-                        low = middle + 1
-                return low
+                return self._halved(shown, low, high)
             low = high
         raise OverflowError(f"the clock never shows {shown} ns")
+
+    def _halved(self, shown: int, low: int, high: int) -> int:
+        """The first time from `low` on, before `high`, at which the clock shows at least `shown`.
+
+        Between jumps the clock never runs backwards, so that halving finds the time.
+        """
+        while low < high - 1:
+            middle = (low + high - 1) // 2
+            if self.to_reference(middle) >= shown:
+                high = middle + 1
+            else:
+                low = middle + 1
+        return low
 
 
 def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
     """The same clocks, disturbed where the trial's faults say so; otherwise as they are."""
-    if not faults.of(ClockDrift) and not faults.of(ClockJump):
+    if not any(faults.of(kind) for kind in _CLOCK_FAULTS):
         return clocks
     return replace(
         clocks,
@@ -147,9 +197,8 @@ def with_faults(clocks: TrialClocks, faults: FaultBook) -> TrialClocks:
 
 def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
     """`clock`, as the trial's faults disturb it."""
-    hit = [fault for fault in faults.of(ClockDrift) if fault.device == device]
-    jumps = [fault for fault in faults.of(ClockJump) if fault.device == device]
-    if not hit and not jumps:
+    hit = [fault.device for kind in _CLOCK_FAULTS for fault in faults.of(kind)]
+    if device not in hit:
         return clock
     return FaultyClock(clock.device_ns, clock.reference_ns, clock.drift, device, faults)
 
@@ -216,3 +265,14 @@ class Jitter:
         if self._sigma_ns == 0.0:
             return np.zeros(len(numbers), np.int64)
         return np.rint(self._noise.of(numbers)[:, 0] * self._sigma_ns).astype(np.int64)
+
+
+class Lateness:
+    """How much later than they might messages come: half-normal, cut at four sigma."""
+
+    def __init__(self, seed: int, purpose: str, longest_us: float) -> None:
+        self._jitter = Jitter(seed, purpose, longest_us / 4)
+
+    def ns(self, numbers: I64) -> I64:
+        """Delays of the messages `numbers` (not negative), 0 to the longest, shape (n,)."""
+        return np.abs(self._jitter.ns(numbers))

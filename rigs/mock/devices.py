@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from protocols.timing import Timing
 from rigs.mock.arm import MockArm
 from rigs.mock.event_camera import MockEventCamera
 from rigs.mock.frame_camera import MockFrameCamera
+from rigs.mock.free_run import ExposureLine, FreeRun
 from rigs.mock.guard import on_cable, on_disk
 from rigs.mock.people import MockPlate, SimulatedOperator, VirtualClock
 from rigs.mock.settings import MockSettings
 from rigs.mock.sync import MockSyncBox
-from rigs.mock.truth import truth_of
+from rigs.mock.truth import clocks_of, truth_of
 from rigs.mock.world import World
 from storage.streams import Sink
 
@@ -29,6 +31,7 @@ class MockDevices:
     plate: MockPlate
     operator: SimulatedOperator
     world: World
+    timing: Timing
 
     def begin_trial(self, seed: int) -> None:
         """Make what follows depend on `seed` and the program alone; see `World.begin_trial`."""
@@ -39,23 +42,46 @@ class MockDevices:
         return on_disk(sink, self.world)
 
     def truth(self, reference_true_ns: int, threshold_px: float = 2.0) -> dict[str, Any]:
-        """What really happened since `reference_true_ns`; see `rigs.mock.truth.truth_of`."""
-        return truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px)
+        """What really happened since `reference_true_ns`, and what the clocks truly showed.
+
+        See `truth_of` and `clocks_of` in `rigs.mock.truth`.
+        """
+        stopped_ns = self.sync.stopped_ns
+        recorded_ns = (
+            self.sync.started_ns,
+            (self.world.now_ns if stopped_ns is None else stopped_ns),
+        )
+        return {
+            **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px),
+            "clocks": clocks_of(self.world, self.sync.clock, recorded_ns, self.timing.frames),
+        }
 
 
-def build_mock(settings: MockSettings) -> MockDevices:
-    """The devices of a simulated rig. The same settings give the same rig."""
+def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevices:
+    """The devices of a simulated rig. The same settings give the same rig.
+
+    Args:
+        timing: which signals reach which device; left out, all that there are.
+    """
+    timing = timing or Timing()
     world = World(settings)
-    sync = MockSyncBox(world)
+    free_run = None if timing.frames == "hardware trigger" else FreeRun(world)
+    line = None
+    if free_run is not None and timing.frames == "exposure line":
+        line = ExposureLine(world, free_run)
+    sync = MockSyncBox(world, line)
+    arm = MockArm(world, sync, wired=timing.arm == "digital input")
+    frames = MockFrameCamera(world, free_run or sync, timing.frames)
     return MockDevices(
         clock=VirtualClock(world),
-        arm=on_cable(MockArm(world, sync), "arm", world),
+        arm=on_cable(arm, "arm", world),
         events=on_cable(MockEventCamera(world, sync), "event_camera", world),
-        frames=on_cable(MockFrameCamera(world, sync), "frame_camera", world),
+        frames=on_cable(frames, "frame_camera", world),
         sync=on_cable(sync, "sync_box", world),
         plate=MockPlate(world),
         operator=SimulatedOperator(world),
         world=world,
+        timing=timing,
     )
 
 

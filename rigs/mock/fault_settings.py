@@ -16,6 +16,7 @@ Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Papilla = Annotated[int, Field(ge=0, le=10_000)]
 Device = Literal["arm", "event_camera", "frame_camera", "sync_box"]
+RestartDevice = Literal["arm", "event_camera", "frame_camera"]
 PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 
@@ -114,6 +115,13 @@ class ClockJump(_TimedFault):
     """Forwards, or backwards when negative."""
 
 
+class ClockRestart(_TimedFault):
+    """A device's clock begins again at 0, as after a moment without power."""
+
+    kind: Literal["clock_restart"]
+    device: RestartDevice
+
+
 class PulsesLost(_TimedFault):
     """Sync pulses that a device does not report."""
 
@@ -197,6 +205,7 @@ AnyFault = (
     | EventBurst
     | ClockDrift
     | ClockJump
+    | ClockRestart
     | PulsesLost
     | PulsesDuplicated
     | PulsesLate

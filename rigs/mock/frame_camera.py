@@ -1,5 +1,7 @@
 """The simulated frame camera: pictures or tracks on every tick, on its own clock, and losses.
 
+Ticks are the sync box's, or the camera's own where it runs by itself.
+
 At the level `tracks` no picture is drawn: every frame gives the places that tracking its picture
 would have found, with the noise that was measured there. Times, numbers and sync bits are the same.
 """
@@ -12,17 +14,19 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from protocols.timing import FrameGrade
 from rigs.capabilities import RigError
-from rigs.mock.clocks import Jitter
+from rigs.mock.clock_reads import ClockReader
+from rigs.mock.clocks import Jitter, Lateness
 from rigs.mock.frame_faults import FrameFaults
+from rigs.mock.free_run import FreeRun, Trigger
 from rigs.mock.settings import MockSettings
-from rigs.mock.sync import MockSyncBox
 from rigs.mock.world import World
 from rigs.scene.exposure import Exposures, expose
 from rigs.scene.frames import FrameOptics, PlateView
 from rigs.scene.randomness import generator
 from rigs.scene.reflections import Reflections
-from storage.streams import FrameChunk
+from storage.streams import ClockReads, FrameChunk
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -33,15 +37,24 @@ _NOISE_FRAMES = 256
 
 
 class MockFrameCamera:
-    """The camera that looks through the plate, triggered by every tick of the sync box."""
+    """The camera that looks through the plate.
 
-    def __init__(self, world: World, box: MockSyncBox) -> None:
-        self._world, self._box = world, box
-        self._faults = FrameFaults(world, box)
+    Args:
+        trigger: what starts its exposures, the sync box or the camera itself.
+        grade: how its frames' times are known; only `host arrival` changes what it says.
+    """
+
+    def __init__(
+        self, world: World, trigger: Trigger, grade: FrameGrade = "hardware trigger"
+    ) -> None:
+        self._world, self._trigger = world, trigger
+        self._faults = FrameFaults(world, trigger)
+        self._has_clock = grade != "host arrival"
+        self._clock_reader = ClockReader(world, "frame_camera")
         settings = world.settings.frame_camera
         self.px_per_mm, self.rate_hz = settings.px_per_mm, settings.rate_hz
         self.mid_exposure_ns = settings.exposure_us * 500
-        """From a tick to the middle of its exposure."""
+        """From the start of an exposure, which is its tick, to its middle."""
         self._size = (settings.width, settings.height)
         self._view: PlateView | None = None
         self._begin()
@@ -49,10 +62,13 @@ class MockFrameCamera:
 
     def _begin(self) -> None:
         self._running, self._until_ns = False, 0
-        self._run, self._next_tick, self._number = self._box.run, 0, 0
+        self._run, self._next_tick, self._number = self._trigger.run, 0, 0
         self._jitter = Jitter(
             self._world.seed, "frame stamps", self._world.settings.clocks.frame_jitter_us
         )
+        late_us = 0.0 if self._has_clock else self._world.settings.frame_camera.arrival_jitter_us
+        self._late = Lateness(self._world.seed, "frame arrivals", late_us)
+        self._arrived_ns = 0
         self._noise: tuple[int, F64] | None = None
 
     def set_region(self, width_px: int, height_px: int) -> None:
@@ -74,35 +90,42 @@ class MockFrameCamera:
             self._size, self._view = (width_px, height_px), None
 
     def start(self) -> None:
-        """Begin to grab on the sync box's ticks."""
-        self._run, self._number = self._box.run, 0
-        self._next_tick = self._box.tick_at(self._world.now_ns)
+        """Begin to grab, on the sync box's ticks or its own."""
+        if isinstance(self._trigger, FreeRun):
+            self._trigger.start()
+        self._run, self._number = self._trigger.run, 0
+        self._next_tick = self._trigger.tick_at(self._world.now_ns)
         self._running, self._until_ns = True, _NEVER
 
     def read(self) -> FrameChunk:
         """Frames since the last call whose read-out is over."""
-        world, box, settings = self._world, self._box, self._world.settings.frame_camera
+        world, trigger, settings = self._world, self._trigger, self._world.settings.frame_camera
         world.advance()
-        if box.run != self._run:
-            self._run, self._next_tick = box.run, 0
+        if trigger.run != self._run:
+            self._run, self._next_tick = trigger.run, 0
         exposed_ns = 2 * self.mid_exposure_ns
         after_ns = exposed_ns + settings.latency_us * 1000
         seen_ns = world.now_ns - max(after_ns, exposed_ns + world.step_ns)
-        ticks = box.ticks(self._next_tick, min(seen_ns, self._until_ns))
+        ticks = trigger.ticks(self._next_tick, min(seen_ns, self._until_ns))
         if self._until_ns == 0:
             ticks = ticks[:0]
-        true = box.true_ns(ticks) if len(ticks) else ticks
-        host = self._faults.arrival_ns(ticks, true + after_ns)
+        true = trigger.true_ns(ticks) if len(ticks) else ticks
+        host = self._faults.arrival_ns(ticks, true + after_ns) + self._late.ns(ticks)
+        # in order: a frame that is late holds up the next one
+        host = np.maximum(np.maximum.accumulate(host), self._arrived_ns)
         host = host[host <= world.now_ns]
         ticks = ticks[: len(host)]
         number = self._number + np.arange(len(ticks), dtype=np.int64)
         self._next_tick += len(ticks)
         self._number += len(ticks)
+        self._arrived_ns = max(self._arrived_ns, int(host.max(initial=0)))
         kept = ~self._faults.lost(ticks)
         mid = true[: len(ticks)][kept] + self.mid_exposure_ns
         ticks, number, host = ticks[kept], number[kept], host[kept]
-        stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
-        sync = box.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
+        stamp = host
+        if self._has_clock:
+            stamp = world.clocks.frame_camera.to_reference(mid + self._jitter.ns(ticks))
+        sync = trigger.bits(ticks) if len(ticks) else np.empty(0, np.uint8)
         if self._view is None:
             self._view = PlateView(_optics(world.settings), *self._size)
         seen = expose(world.tips_at, mid, exposed_ns, self.px_per_mm)
@@ -118,8 +141,14 @@ class MockFrameCamera:
         self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.ways)
         return FrameChunk(images, number, stamp, host, sync)
 
+    def read_clock(self) -> ClockReads:
+        """The camera's clock now: one row."""
+        return self._clock_reader.read(self._world.clocks.frame_camera)
+
     def stop(self) -> None:
         """Stop grabbing; frames exposed before can still be read."""
+        if isinstance(self._trigger, FreeRun):
+            self._trigger.stop()
         if self._running:
             self._running, self._until_ns = False, self._world.now_ns
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
-from rigs.mock.sync import MockSyncBox
+from rigs.mock.free_run import Trigger
 from rigs.mock.world import World
 from rigs.scene.exposure import Exposures, Way
 
@@ -21,8 +21,8 @@ OUT_OF_SIGHT_MM = 500.0
 class FrameFaults:
     """The frame camera's share in the faults of whatever trial runs."""
 
-    def __init__(self, world: World, box: MockSyncBox) -> None:
-        self._world, self._box = world, box
+    def __init__(self, world: World, trigger: Trigger) -> None:
+        self._world, self._trigger = world, trigger
 
     def lost(self, ticks: I64) -> Mask:
         """Which frames never reach the host, (k,) for the frames on k ticks."""
@@ -30,11 +30,11 @@ class FrameFaults:
         if not len(ticks):
             return lost
         for fault, begin_ns, _ in self._world.faults.spans(FramesLost):
-            first = self._box.tick_at(begin_ns)
+            first = self._trigger.tick_at(begin_ns)
             lost |= (ticks >= first) & (ticks < first + fault.count)
         for gone, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
             if gone.device == "frame_camera":
-                true_ns = self._box.true_ns(ticks)
+                true_ns = self._trigger.true_ns(ticks)
                 lost |= (true_ns >= begin_ns) & (true_ns < end_ns)
         return lost
 
@@ -47,12 +47,12 @@ class FrameFaults:
         """
         arrival = on_time_ns
         for fault, begin_ns, _ in self._world.faults.spans(FrameLate):
-            first = self._box.tick_at(begin_ns)
+            first = self._trigger.tick_at(begin_ns)
             after = ticks >= first
             if after.any():
                 last_late = np.minimum(ticks[after], first + fault.count - 1)
                 # on time they come a fixed while after their ticks
-                early = self._box.true_ns(ticks[after]) - self._box.true_ns(last_late)
+                early = self._trigger.true_ns(ticks[after]) - self._trigger.true_ns(last_late)
                 late = on_time_ns[after] - early + round(fault.seconds * 1e9)
                 arrival = arrival.copy()
                 arrival[after] = np.maximum(arrival[after], late)

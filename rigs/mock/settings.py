@@ -54,7 +54,7 @@ class Skin(StrictModel):
     def _layers(self) -> Skin:
         if len(self.ring_counts) != len(self.heights_mm):
             raise KeyedError(
-                "scene.skin.heights_mm",
+                "mock.scene.skin.heights_mm",
                 list(self.heights_mm),
                 f"must hold one height for each of the {len(self.ring_counts)} layers",
             )
@@ -112,7 +112,7 @@ class Contact(StrictModel):
     def _turn(self) -> Contact:
         if math.hypot(*self.nominal_rotvec_deg) > 360.0:
             raise KeyedError(
-                "scene.contact.nominal_rotvec_deg",
+                "mock.scene.contact.nominal_rotvec_deg",
                 list(self.nominal_rotvec_deg),
                 "is a rotation vector in degrees, at most 360 long",
             )
@@ -172,7 +172,7 @@ class EventCamera(StrictModel):
     def _scans(self) -> EventCamera:
         if 0 < self.readout_hz < 1000:
             raise KeyedError(
-                "event_camera.readout_hz",
+                "mock.event_camera.readout_hz",
                 self.readout_hz,
                 "must be 0 (no scans), or 1000 to 10000 scans a second",
             )
@@ -232,6 +232,9 @@ class FrameCamera(StrictModel):
     corners does with fractions of a pixel; where nothing moves it is a tenth of this."""
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 4000
     """From the end of exposure to the host."""
+    arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 5000.0
+    """How much later a frame may come where arrival is all that is known of its time
+    (`timing.frames: host arrival`); half-normal, four standard deviations wide."""
 
 
 class Arm(StrictModel):
@@ -241,6 +244,8 @@ class Arm(StrictModel):
     pose_noise_um: NonNegative = 2.0
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1000
     """From a controller's cycle to the host."""
+    arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 200.0
+    """How much later a pose may come; half-normal, four standard deviations wide."""
     vibration_um: NonNegative = 15.0
     """Largest tremor along each axis while the arm moves, of which each trial has a random share;
     the reported poses do not show it."""
@@ -255,16 +260,34 @@ class Arm(StrictModel):
 class Clocks(StrictModel):
     """How far the devices' clocks are from the truth. Drifts belong to the rig."""
 
-    arm_ppm: Annotated[float, Field(ge=0, le=1000)] = 50.0
-    """Largest drift, either way; each rig's seed draws its own."""
-    event_camera_ppm: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    frame_camera_ppm: Annotated[float, Field(ge=0, le=1000)] = 20.0
-    sync_box_ppm: Annotated[float, Field(ge=0, le=1000)] = 10.0
+    arm_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
+    """Largest drift, either way; each rig's seed draws its own. `timing` has to promise as much."""
+    event_camera_ppm: Annotated[float, Field(ge=0, le=20_000)] = 30.0
+    frame_camera_ppm: Annotated[float, Field(ge=0, le=20_000)] = 20.0
+    sync_box_ppm: Annotated[float, Field(ge=0, le=20_000)] = 10.0
     offset_h: Annotated[float, Field(ge=0, le=1e6)] = 12.0
     """Longest time that a clock has run before a trial begins; drawn anew every trial."""
     pulse_jitter_us: NonNegative = 2.0
     """Standard deviation of the stamp of a pulse on arm and event camera."""
     frame_jitter_us: NonNegative = 1.0
+    exposure_jitter_us: NonNegative = 1.0
+    """Standard deviation of the sync box's stamp of an exposure that it did not trigger."""
+    read_shortest_us: NonNegative = 200.0
+    """What a question for a device's clock takes at least, and its answer."""
+    read_spread_us: NonNegative = 100.0
+    """Mean of what either takes besides, exponentially distributed."""
+    read_longest_us: NonNegative = 5000.0
+    """Where that is cut."""
+
+    @model_validator(mode="after")
+    def _reads(self) -> Clocks:
+        if self.read_longest_us < self.read_shortest_us:
+            raise KeyedError(
+                "mock.clocks.read_longest_us",
+                self.read_longest_us,
+                f"must be at least read_shortest_us = {self.read_shortest_us:g}",
+            )
+        return self
 
 
 class MockSettings(StrictModel):

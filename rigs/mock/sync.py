@@ -5,31 +5,40 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from protocols.timing import Code
 from rigs.capabilities import RigError
+from rigs.mock.clock_reads import ClockReader
 from rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
 from rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, PulsesLost
 from rigs.mock.faults import NEVER
+from rigs.mock.free_run import ExposureLine
 from rigs.mock.world import World
-from rigs.pulse_code import PERIOD, code_bits
+from rigs.pulse_code import SEEDS, code_bits
 from storage.clockmap import ClockMap
-from storage.streams import PulseChunk
+from storage.streams import ClockReads, PulseChunk
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 
 REPORT_NS = 100_000
 """From an edge to its report; longer than any jitter, so that no edge is reported early."""
+_BITS = 1 << 12
+"""Bits of the code that are made at first; more when they are needed."""
 
 
 class MockSyncBox:
-    """Ticks at a fixed rate with a pseudo-random code on the line.
+    """Ticks at a fixed rate with a code on the line, and an input for the camera's exposures.
+
+    Args:
+        exposures: the frame camera's output, where it is wired.
 
     Attributes:
         run: counts the starts, so that devices notice a new train.
     """
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, world: World, exposures: ExposureLine | None = None) -> None:
+        self._world, self._exposures = world, exposures
+        self._clock_reader = ClockReader(world, "sync_box")
         self._reset()
         self.run = 0
         world.on_begin.append(self._reset)
@@ -41,21 +50,22 @@ class MockSyncBox:
         self._dark_ns = NEVER
         self.clock = ClockMap.line(0, 0)
         self._read = 0
+        self._code: tuple[int, Code] = 1, "lfsr"
         self._bits: U8 = np.zeros(0, np.uint8)
         self._reports = _PulseFaults(self._world, self, "sync_box")
 
-    def start(self, rate_hz: float, seed: int) -> None:
+    def start(self, rate_hz: float, seed: int, code: Code = "lfsr") -> None:
         """Begin ticks and code; a train that runs is given up."""
         if not 0.0 < rate_hz <= 10_000.0:
             raise RigError("sync box", f"rate {rate_hz} Hz: must lie between 0 and 10,000")
-        if not 1 <= seed <= PERIOD:
-            raise RigError("sync box", f"seed {seed}: must lie between 1 and {PERIOD}")
+        if not 1 <= seed <= SEEDS:
+            raise RigError("sync box", f"seed {seed}: must lie between 1 and {SEEDS}")
         world = self._world
         self.run += 1
         self.rate_hz, self.started_ns, self.stopped_ns, self._read = rate_hz, world.now_ns, None, 0
         clock = ClockMap.line(self.started_ns, 0, world.clocks.sync_box_ppb)
         self.clock = faulty(clock, "sync_box", world.faults)
-        self._bits = code_bits(seed, PERIOD)
+        self._code, self._bits = (seed, code), code_bits(seed, _BITS, code)
         self._reports = _PulseFaults(world, self, "sync_box")
         if world.faults.recording_ns is None:
             world.faults.recording_ns = self.started_ns
@@ -76,6 +86,18 @@ class MockSyncBox:
         if isinstance(self.clock, FaultyClock):
             sent = sent + self.clock.jumped_ns(true_ns)
         return PulseChunk(sent // 1000 * 1000)
+
+    def read_exposures(self) -> PulseChunk:
+        """Starts of exposures since the last call, box clock, whole microseconds."""
+        if self._exposures is None or self.rate_hz == 0.0:
+            return PulseChunk(np.empty(0, np.int64))
+        edges = self._exposures.edges_ns(self._world.now_ns - REPORT_NS)
+        edges = edges[(edges >= self.started_ns) & (edges < self._dark_ns)]
+        return PulseChunk(self.clock.to_reference(edges) // 1000 * 1000)
+
+    def read_clock(self) -> ClockReads:
+        """The box's clock now, whole microseconds: one row."""
+        return self._clock_reader.read(self.clock, 1000)
 
     def stop(self) -> None:
         """Stop the ticks; pulses sent before can still be read."""
@@ -127,7 +149,11 @@ class MockSyncBox:
 
     def bits(self, ticks: I64) -> U8:
         """The code at ticks."""
-        return self._bits[ticks % PERIOD]
+        most = int(ticks.max(initial=-1)) + 1
+        if most > len(self._bits):
+            seed, code = self._code
+            self._bits = code_bits(seed, max(most, 2 * len(self._bits)), code)
+        return self._bits[ticks]
 
 
 class SyncInput:
@@ -210,7 +236,7 @@ class _PulseFaults:
             due = self._book.due_ns(fault)
             if fault.device == self._device and due is not None:
                 first = self._box.tick_at(due)
-                # the code never stays 0 for more than 15 ticks
+                # no code stays 0 for more than 15 ticks
                 after = np.arange(first, first + 16 * fault.count + 16, dtype=np.int64)
                 hit = after[self._box.bits(after) == 1][: fault.count].tolist()
                 seconds = 0.0 if isinstance(fault, PulsesLost) else fault.seconds

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from protocols.timing import FrameGrade
 from rigs.capabilities import RigError
 from rigs.mock.faults import NEVER
 from rigs.mock.world import World
-from storage.clockmap import ClockMap
+from storage.clockmap import IDENTITY, ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -75,6 +76,30 @@ def truth_of(
         "per_papilla_ns": markers,
         "first_slip_ns": min((t for t in slips if t is not None), default=None),
         "slip_per_papilla_ns": slips,
+    }
+
+
+def clocks_of(
+    world: World, box: ClockMap, recorded_ns: tuple[int, int], frames: FrameGrade
+) -> dict[str, list[list[int]]]:
+    """What the clocks showed every second of a recording, without any jitter.
+
+    Args:
+        box: true time to sync box time.
+        recorded_ns: true times at which the recording began and ended; the end is added.
+        frames: with `host arrival` the frame camera's stamps are by the host's clock.
+
+    Returns:
+        For `arm`, `event_camera` and `frame_camera` pairs of that clock and the box's, ns.
+    """
+    start_ns, end_ns = recorded_ns
+    times = [*range(start_ns, end_ns, 1_000_000_000), end_ns]
+    clocks = world.clocks
+    found = {"arm": clocks.arm, "event_camera": clocks.event_camera}
+    found["frame_camera"] = IDENTITY if frames == "host arrival" else clocks.frame_camera
+    return {
+        name: [[clock.to_reference(t), box.to_reference(t)] for t in times]
+        for name, clock in found.items()
     }
 
 

@@ -95,7 +95,10 @@ def test_rigs_that_ship_are_known_by_name() -> None:
     assert needed["rehearsal"] < 0.2 * needed["mock"]
     done = sliplab("plan", "protocols/pilot.yaml", "--rig", "abacus")
     assert done.returncode == 2
-    assert "abacus: no such file, nor a rig that ships: mock, mock_noisy, rehearsal" in done.stderr
+    assert (
+        "abacus: no such file, nor a rig that ships: mock, mock_noisy, mock_weak, rehearsal"
+        in done.stderr
+    )
 
 
 def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rigs.capabilities import ArmFault, ArmState, RigError
 from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig, StopRequested
 from rigs.rig_file import RigFile
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 from tests.conftest import ROOT, SMALL
 
 RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
@@ -49,6 +49,15 @@ class Memory:
 
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         self._keep("sync pulses", chunk.t_ns)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        self._keep("exposures", chunk.t_ns)
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        self._keep("box reads", chunk.device_ns)
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        self._keep("frame camera reads", chunk.device_ns)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         self._keep("pose times", chunk.t_ns)
@@ -113,6 +122,45 @@ def test_a_trial_depends_on_nothing_that_ran_before() -> None:
     run(other, plan, second)
     for name in first.parts:
         assert np.array_equal(first.all(name), second.all(name)), name
+
+
+@pytest.mark.parametrize(
+    ("timing", "streams"),
+    [
+        ({}, set()),
+        ({"frames": "exposure line"}, {"exposures"}),
+        ({"frames": "device time stamps"}, {"box reads", "frame camera reads"}),
+        ({"frames": "host arrival"}, {"box reads"}),
+        ({"arm": "host time"}, {"box reads"}),
+    ],
+)
+def test_what_is_read_besides_is_what_the_timing_needs(
+    timing: dict[str, Any], streams: set[str]
+) -> None:
+    data = {**RIG, "timing": timing, "mock": {"frame_camera": {"level": "tracks"}}}
+    rig = build_rig(validate(RigFile, data, "test"))
+    rig.connect()
+    sink = Memory()
+    run(rig, short_plan(), sink)
+    possible = {"exposures", "box reads", "frame camera reads"}
+    assert possible & set(sink.parts) == streams
+    for name in streams & {"box reads", "frame camera reads"}:
+        times = sink.all(name)
+        assert len(times) >= 8  # one a poll
+        assert np.all(np.diff(times) > 0)
+    assert (len(sink.all("arm pulses")) > 0) == ("arm" not in timing)
+    if "exposures" in streams:
+        assert len(sink.all("exposures")) >= len(sink.all("frame numbers"))
+
+
+def test_the_box_is_started_with_the_rigs_code() -> None:
+    rig = build_rig(validate(RigFile, {**RIG, "timing": {"code": "regular"}}, "test"))
+    rig.connect()
+    sink = Memory()
+    rig.listen(0.6, sink, 100)
+    gaps = np.diff(sink.all("sync pulses"))
+    assert gaps[0] == 160_000_000
+    assert np.all(gaps[1:] == 20_000_000)
 
 
 class Journal:

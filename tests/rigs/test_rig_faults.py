@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rigs.capabilities import ArmFault, RigError
@@ -59,3 +60,15 @@ def test_a_device_that_comes_back_between_polls_has_lost_a_little() -> None:
     run(make_rig(), short_plan(), plain)
     lost = len(plain.all("events t_us")) - len(sound.all("events t_us"))
     assert 0 < lost < 0.1 * len(plain.all("events t_us"))
+
+
+@pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera"])
+def test_a_clock_that_begins_again_does_not_stop_a_trial(device: str) -> None:
+    rig = make_rig(faults=[{"kind": "clock_restart", "device": device, "at_s": 0.2}])
+    sink, plain = Memory(), Memory()
+    hit, sound = run(rig, short_plan(), sink), run(make_rig(), short_plan(), plain)
+    assert hit.truth["per_papilla_ns"] == sound.truth["per_papilla_ns"]
+    stamps = {"arm": "arm pulses", "event_camera": "event pulses", "frame_camera": "frame times"}
+    for name, stream in stamps.items():
+        assert np.any(np.diff(sink.all(stream)) < 0) == (name == device)
+        assert len(sink.all(stream)) == len(plain.all(stream))

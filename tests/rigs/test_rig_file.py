@@ -24,6 +24,14 @@ def _set(*path: str, to: Any) -> Change:
     return change
 
 
+def _both(*changes: Change) -> Change:
+    def change(data: dict[str, Any]) -> None:
+        for each in changes:
+            each(data)
+
+    return change
+
+
 CASES: dict[str, tuple[Change, str, str]] = {
     "unknown key": (_set("frame_camera", "scael", to=3), "frame_camera.scael", "unknown key"),
     "unknown driver": (_set("driver", to="abacus"), "driver", "'mock'"),
@@ -44,11 +52,61 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "mock.event_camera.noise_hz",
         "greater than or equal to 0",
     ),
+    "scans that are too few": (
+        _set("mock", to={"event_camera": {"readout_hz": 5}}),
+        "mock.event_camera.readout_hz",
+        "must be 0 (no scans), or 1000 to 10000",
+    ),
     "scale that is not drawn": (
         _set("frame_camera", "scale_px_per_mm", to=12),
         "frame_camera.scale_px_per_mm",
         "must be mock.frame_camera.px_per_mm = 20",
     ),
+    "a clock that drifts more than promised": (
+        _set("mock", to={"clocks": {"arm_ppm": 4000}}),
+        "mock.clocks.arm_ppm",
+        "must be at most timing.arm_controller.drift_ppm = 200",
+    ),
+    "a clock better promised than it is": (
+        _set("timing", to={"sync_box": {"drift_ppm": 5}}),
+        "mock.clocks.sync_box_ppm",
+        "must be at most timing.sync_box.drift_ppm = 5",
+    ),
+    "stamps that scatter more than promised": (
+        _set("mock", to={"clocks": {"pulse_jitter_us": 30}}),
+        "mock.clocks.pulse_jitter_us",
+        "must be at most timing.event_camera.jitter_us = 20",
+    ),
+    "edges that scatter more than promised": (
+        _both(
+            _set("timing", to={"frames": "exposure line"}),
+            _set("mock", to={"clocks": {"exposure_jitter_us": 30}}),
+        ),
+        "mock.clocks.exposure_jitter_us",
+        "must be at most timing.sync_box.jitter_us = 20",
+    ),
+    "frames that come too late": (
+        _both(
+            _set("timing", to={"frames": "host arrival"}),
+            _set("mock", to={"frame_camera": {"arrival_jitter_us": 46_001}}),
+        ),
+        "mock.frame_camera.arrival_jitter_us",
+        "must be at most 46000: with latency_us, timing.frame_delay.longest_us = 50000",
+    ),
+    "poses that come too soon": (
+        _set(
+            "timing",
+            to={"arm": "host time", "pose_delay": {"shortest_us": 1500, "longest_us": 9000}},
+        ),
+        "mock.arm.latency_us",
+        "must be at least timing.pose_delay.shortest_us = 1500",
+    ),
+    "answers that take less than questions": (
+        _set("mock", to={"clocks": {"read_longest_us": 100}}),
+        "mock.clocks.read_longest_us",
+        "must be at least read_shortest_us = 200",
+    ),
+    "a code that is none": (_set("timing", to={"code": "morse"}), "timing.code", "'irregular'"),
     "infinite scale": (
         _set("frame_camera", "scale_px_per_mm", to=float("inf")),
         "frame_camera.scale_px_per_mm",
@@ -69,6 +127,19 @@ def test_the_message_names_key_and_cure(case: str, tmp_path: Path) -> None:
     assert caught.value.key.startswith(key)
     assert str(path) in caught.value.message
     assert says in caught.value.message
+
+
+def test_what_a_rig_does_not_use_is_not_held_against_it(tmp_path: Path) -> None:
+    data = yaml.safe_load(MOCK)
+    data["mock"] = {
+        "clocks": {"exposure_jitter_us": 900, "arm_ppm": 19_000},
+        "frame_camera": {"arrival_jitter_us": 900_000},
+        "arm": {"latency_us": 100_000},
+    }
+    data["timing"] = {"arm_controller": {"drift_ppm": 20_000}}
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    assert load_rig_file(path)[0].mock.clocks.arm_ppm == 19_000
 
 
 def test_a_region_larger_than_the_sensor_is_refused(tmp_path: Path) -> None:

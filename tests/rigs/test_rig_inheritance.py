@@ -132,20 +132,25 @@ def test_what_cannot_be_extended_is_said(text: str, says: str, base: Path) -> No
 def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mock").mkdir()
-    for name in ("mock", "mock_noisy", "mock-noisy", "rehearsal"):
+    for name in ("mock", "mock_noisy", "mock-noisy", "mock-weak", "rehearsal"):
         assert rig_path(Path(name)) == shipped_rigs()[name.replace("-", "_")]
     assert rig_path(Path("mock.yaml")) == Path("mock.yaml")
     assert rig_path(Path("some/mock")) == Path("some/mock")
     (tmp_path / "mine").write_text(MOCK)
     assert load_rig_file(Path("mine"))[0].name == "mock"
-    with pytest.raises(InputError, match=r"rehersal: .* ships: mock, mock_noisy, rehearsal"):
+    with pytest.raises(
+        InputError, match=r"rehersal: .* ships: mock, mock_noisy, mock_weak, rehearsal"
+    ):
         rig_path(Path("rehersal"))
 
 
 def test_what_ships_is_the_mock_rig_but_for_one_thing_each() -> None:
-    mock, noisy, rehearsal = (
-        load_rig_file(Path(name))[0] for name in ("mock", "mock-noisy", "rehearsal")
+    mock, noisy, weak, rehearsal = (
+        load_rig_file(Path(name))[0] for name in ("mock", "mock-noisy", "mock-weak", "rehearsal")
     )
+    told = weak.timing
+    assert (told.code, told.frames, told.arm) == ("irregular", "device time stamps", "host time")
+    assert weak.model_copy(update={"name": "mock", "timing": mock.timing}) == mock
     assert noisy.mock.event_camera.noise_hz == pytest.approx(10 * mock.mock.event_camera.noise_hz)
     same = noisy.mock.event_camera.model_copy(update={"noise_hz": 0.01})
     assert noisy.mock.model_copy(update={"event_camera": same}) == mock.mock

@@ -144,6 +144,56 @@ def test_a_clock_jumps_on_one_device(device: str, seconds: float, sound: Trial) 
             assert change == pytest.approx(sorted(expected), abs=1000)  # a cut to microseconds
 
 
+@pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera"])
+def test_a_clock_begins_again_at_0(device: str, sound: Trial) -> None:
+    devices = with_faults(
+        {"kind": "clock_restart", "device": device, "at_s": 1.0},
+        {"kind": "clock_jump", "device": device, "at_s": 1.5, "seconds": 2.0},
+    )
+    hit = slide(devices, seed=11)
+    stamps = {
+        "arm": (sound.arm_pulses, hit.arm_pulses),
+        "event_camera": (sound.event_pulses, hit.event_pulses),
+        "frame_camera": times(sound, hit, "frames"),
+    }
+    for name, (before, after) in stamps.items():
+        if name != device:
+            assert np.array_equal(before, after)
+            continue
+        back = int(np.flatnonzero(np.diff(after) < 0)[0]) + 1
+        assert np.array_equal(after[:back], before[:back])
+        assert 0 <= after[back] < 170_000_000
+        shift = before[back:] - after[back:]
+        fell, jumped = shift[0], shift[-1]
+        assert fell > 1e9
+        assert fell - jumped == pytest.approx(2_000_000_000, abs=1000)
+        assert set((shift == fell).tolist()) == {True, False}
+    if device == "arm":
+        assert np.array_equal(hit.poses["host_ns"], sound.poses["host_ns"])
+        assert hit.poses["t_ns"][-1] < 10e9 < sound.poses["t_ns"][-1]
+    if device == "event_camera":  # until the trial's end they carry the highest stamp
+        held = hit.events["t_us"]
+        assert len(held) == len(sound.events["t_us"])
+        assert np.all(np.diff(held) >= 0)
+        assert held[-1] - held[0] == pytest.approx(1e6, abs=200_000)
+
+
+def test_the_true_time_of_a_clock_that_began_again() -> None:
+    devices = with_faults(
+        {"kind": "clock_drift", "device": "arm", "at_s": 0.2, "ppm": 900},
+        {"kind": "clock_restart", "device": "arm", "at_s": 1.0},
+    )
+    devices.arm.connect()
+    devices.begin_trial(3)
+    devices.clock.wait(0.5)
+    devices.sync.start(100.0, 1)
+    clock = devices.world.clocks.arm
+    assert clock.to_reference(1_500_000_000) == 0
+    assert clock.to_reference(1_499_999_999) > 10**12
+    for true_ns in (600_000_000, 1_499_999_000, 1_500_000_000, 1_700_000_000):
+        assert clock.to_device(clock.to_reference(true_ns)) == pytest.approx(true_ns, abs=1)
+
+
 def times(a: Trial, b: Trial, stream: str) -> tuple[np.ndarray, np.ndarray]:
     return getattr(a, stream)["t_ns"], getattr(b, stream)["t_ns"]
 

@@ -28,6 +28,9 @@ MOMENTS: list[dict[str, Any]] = [
     {"kind": "clock_drift", "device": "sync_box", "ppm": -500},
     {"kind": "clock_jump", "device": "event_camera", "seconds": -0.25},
     {"kind": "clock_jump", "device": "sync_box", "seconds": 0.5},
+    {"kind": "clock_restart", "device": "arm"},
+    {"kind": "clock_restart", "device": "event_camera"},
+    {"kind": "clock_restart", "device": "frame_camera"},
     {"kind": "pulses_lost", "count": 4, "device": "sync_box"},
     {"kind": "pulses_duplicated", "count": 4, "device": "arm", "seconds": 0.0137},
     {"kind": "pulses_late", "count": 4, "device": "event_camera", "seconds": 0.031},
@@ -141,10 +144,11 @@ def calls(devices: MockDevices, device: str) -> list[Any]:
         ],
         "frame_camera": [
             devices.frames.start, devices.frames.read, devices.frames.stop, devices.frames.close,
-            lambda: devices.frames.set_region(64, 64),
+            lambda: devices.frames.set_region(64, 64), devices.frames.read_clock,
         ],
         "sync_box": [
-            devices.sync.read_pulses, devices.sync.stop, devices.sync.close,
+            devices.sync.read_pulses, devices.sync.read_exposures, devices.sync.read_clock,
+            devices.sync.stop, devices.sync.close,
             lambda: devices.sync.start(100.0, 1),
         ],
     }[device]  # fmt: skip
@@ -240,6 +244,7 @@ def test_faults_belong_to_their_trial() -> None:
         ({"kind": "frames_lost", "cuont": 3}, "mock.faults[1].cuont", "did you mean 'count'"),
         ({"kind": "pulses_late", "device": "frame_camera"}, "mock.faults[1].device", "'sync_box'"),
         ({"kind": "clock_drift", "device": "arm"}, "mock.faults[1].ppm", "is missing"),
+        ({"kind": "clock_restart", "device": "sync_box"}, "mock.faults[1].device", "'arm'"),
         ({"kind": "event_gap", "seconds": 0}, "mock.faults[1].seconds", "greater than 0"),
         ({"kind": "papilla_torn", "papilla": 19}, "mock.faults[1].papilla", "from 0 (the centre)"),
         ({"kind": "marker_occluded"}, "mock.faults[1]", "needs either a papilla"),
