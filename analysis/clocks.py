@@ -292,6 +292,7 @@ def fit_numbered(
     max_drift_ppm: float = 10_000.0,
     resolution_ns: float = 1_000.0,
     rounding: Rounding = "down",
+    reference_resolution_ns: float = 0.0,
 ) -> ClockFit:
     """The map from a device's clock to the reference, for instants that the device counts.
 
@@ -304,6 +305,7 @@ def fit_numbered(
         numbers: (m,) int64 the device's own count of them, rising; what was lost is left out.
         reference_ns: (n,) int64 the stamps of all of them on the reference clock, ns, in order.
         jitter_ns, max_drift_ppm, resolution_ns, rounding: as in `fit_clock`.
+        reference_resolution_ns: the unit to which the reference's stamps are cut, downwards.
 
     Raises:
         ClockRefused: with its `reason`.
@@ -326,11 +328,13 @@ def fit_numbered(
     _, i, j = np.intersect1d(numbers, counted, return_indices=True)
     device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
     shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
-    x, y = _differences(device, device_0) + shift, _differences(reference, reference_0)
+    x = _differences(device, device_0) + shift
+    y = _differences(reference, reference_0) + 0.5 * reference_resolution_ns
     if x.size != device.size or y.size != reference.size:
         raise ClockRefused("residuals", "stamps of another age among the exposures")
     match = Match(i.astype(np.int64), j.astype(np.int64), 0.0)
     px, py = x[match.device], y[match.reference]
-    line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
+    unit = max(resolution_ns, reference_resolution_ns)
+    line = fit_line(px, py - px, unit, BEND_PPM_S * 1e-15)
     _gate_line(line, jitter_ns, max_drift_ppm)
     return _fit(match, line, x, y, device_0, reference_0)

@@ -285,12 +285,18 @@ class Rig:
         self.arm.read_poses()
         self.arm.read_pulses()
         self.events.start()
-        if with_frames:
+        by_itself = with_frames and self.timing.frames == "exposure line"
+        if with_frames and not by_itself:
             self.frames.start()
         self.sync.start(rate_hz, seed % 65535 + 1, self.timing.code)
+        if by_itself:
+            # the box must stamp every exposure, the first one too
+            self.frames.start()
 
     def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
         """Stop the pulses, and read what the cameras still hold before they stop."""
+        if with_frames and self.timing.frames == "exposure line":
+            self.frames.stop()
         self.sync.stop()
         self._wait(TAIL_S, sink)
         self.events.stop()

@@ -30,12 +30,14 @@ def short() -> dict[str, Any]:
     return data
 
 
-def session(folder: Path, data: dict[str, Any], **mock: Any) -> tuple[Session, Campaign]:
-    """A connected session on a mock rig with other mock settings."""
+def session(
+    folder: Path, data: dict[str, Any], timing: dict[str, Any] | None = None, **mock: Any
+) -> tuple[Session, Campaign]:
+    """A connected session on a mock rig with other mock settings, and other timing."""
     folder.mkdir(exist_ok=True)
     rig_data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
     text = json.dumps(
-        {**rig_data, "mock": {**rig_data["mock"], **mock}},
+        {**rig_data, "mock": {**rig_data["mock"], **mock}, "timing": timing or {}},
         default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
     )
     (folder / "rig.yaml").write_text(text)
