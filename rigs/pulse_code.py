@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from protocols.timing import Code
+from protocols.timing import MARKER_TICKS, Code
 
 SEEDS = (1 << 16) - 1
 """Seeds are 1 to this, whatever the code."""
@@ -28,8 +28,6 @@ TAPS = (16, 14, 13, 11)
 """Of the Fibonacci register x^16 + x^14 + x^13 + x^11 + 1, which is primitive."""
 SHORTEST_TICKS, LONGEST_TICKS = 2, 9
 """Intervals of the code `irregular`."""
-MARKER_TICKS = 16
-"""From the first pulse of the code `regular` to its second."""
 REGULAR_TICKS = 2
 """Between all later pulses of the code `regular`."""
 
@@ -67,18 +65,6 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
     if n < 0:
         raise ValueError(f"n = {n}: must not be negative")
     return {"lfsr": _lfsr, "irregular": _irregular, "regular": _regular}[code](seed, n)
-
-
-def start_marker_ns(code: Code, rate_hz: float) -> float | None:
-    """The silence after the first pulse that marks a train's start, ns of the box's clock.
-
-    Args:
-        rate_hz: ticks a second.
-
-    Returns:
-        None for a code that any part of a train is known by.
-    """
-    return MARKER_TICKS * 1e9 / rate_hz if code == "regular" else None
 
 
 def _lfsr(seed: int, n: int) -> U8:

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.timing import Code
-from rigs.pulse_code import MARKER_TICKS, PERIOD, SEEDS, code_bits, start_marker_ns
+from protocols.timing import MARKER_TICKS, Code
+from rigs.pulse_code import PERIOD, SEEDS, code_bits
 
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 HOUR = 360_000
@@ -116,6 +116,3 @@ def test_regular_has_one_marker_at_its_start() -> None:
     gaps = intervals(code_bits(9, HOUR, "regular"))
     assert gaps[0] == MARKER_TICKS
     assert np.all(gaps[1:] == 2)
-    assert start_marker_ns("regular", 100.0) == 160e6
-    assert start_marker_ns("lfsr", 100.0) is None
-    assert start_marker_ns("irregular", 100.0) is None
