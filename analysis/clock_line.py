@@ -52,8 +52,8 @@ class ClockLine:
         inside: (n,) whether a pulse lies on the line, within 5 sigma.
         sigma: scatter of the pulses on the line, ns.
         uncertainty: largest error of the line from the first to the last knot, 95 %, ns.
-        slope_change: largest change of the slope from one piece to the next, and
-        slope_change_allowed: what chance and the limit allow there; ns / ns.
+        sudden: how far the line may be off next to where its slope changes faster than a clock
+            bends, as it does when the clock jumps, ns.
         straightened: whether what is left over looks like chance.
     """
 
@@ -63,8 +63,7 @@ class ClockLine:
     inside: Bools
     sigma: float
     uncertainty: float
-    slope_change: float
-    slope_change_allowed: float
+    sudden: float
     straightened: bool
 
     @property
@@ -186,7 +185,7 @@ def _judged(
     largest = np.abs(_draws(n) @ root.T).max(axis=1)
     band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
     band *= float(special.stdtrit(max(1, inner.size - n), 0.975)) / 1.959964
-    change, allowed, sag = 0.0, bend_per_ns, 0.0
+    sag, sudden = 0.0, 0.0
     if n > 2:
         run = np.diff(knots)
         # slopes' changes as a linear function of the values
@@ -196,20 +195,15 @@ def _judged(
         to_change[here, here + 1] = -1 / run[:-1] - 1 / run[1:]
         changes = np.abs(to_change @ values)
         chance = np.sqrt(np.einsum("ij,jk,ik->i", to_change, covariance, to_change))
-        spans = 0.5 * (run[:-1] + run[1:])
-        worst = int((changes - 5 * chance - bend_per_ns * spans).argmax())
-        change = float(changes[worst])
-        allowed = float(5 * chance[worst] + bend_per_ns * spans[worst])
+        spans, longest = 0.5 * (run[:-1] + run[1:]), np.maximum(run[:-1], run[1:])
         # a parabola sags by an eighth of the slope's change over a piece; what changes faster than
         # clocks bend may be a jump, of which half is wrong next to it
         smooth = np.minimum(changes, bend_per_ns * spans)
-        sudden = np.maximum(changes - chance - smooth, 0.0)
-        sag = float(((smooth / 8 + sudden / 2) * np.maximum(run[:-1], run[1:])).max())
-    return ClockLine(
-        knots, values, residuals, inside, sigma,
-        1.0 + band + sag + _left_over(inner, sigma) + _locked(inner, resolution),
-        change, allowed, straight,
-    )  # fmt: skip
+        faster = np.maximum(changes - chance - smooth, 0.0) * longest / 2
+        sag = float((smooth * longest / 8 + faster).max())
+        sudden = float(faster.max())
+    uncertainty = 1.0 + band + sag + _left_over(inner, sigma) + _locked(inner, resolution)
+    return ClockLine(knots, values, residuals, inside, sigma, uncertainty, sudden, straight)
 
 
 def _left_over(residuals: Floats, sigma: float) -> float:

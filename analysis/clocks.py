@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
 BEND_PPM_S = 2.0
-"""By how much a drift may change in a second; a crystal that warms up by 10 K in a minute makes
-0.4."""
+"""By how much a clock's drift may change in a second without being taken for a jump; a crystal that
+warms up by 10 K in a minute makes 0.4."""
 
 
 class ClockRefused(ValueError):
@@ -268,12 +268,11 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
             f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
             f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
         )
-    if line.slope_change > line.slope_change_allowed:
+    if line.sudden > 3 * jitter_ns:
         raise ClockRefused(
             "residuals",
-            f"the drift changes by {line.slope_change * 1e6:.1f} ppm within "
-            f"{float(np.diff(line.knots).mean()) / 1e9:.1f} s (at most "
-            f"{line.slope_change_allowed * 1e6:.1f}): a clock jumped",
+            f"the drift changes so fast that the line may be wrong by {line.sudden / 1e3:.1f} us "
+            f"there (at most {3 * jitter_ns / 1e3:.1f}): a clock jumped",
         )
     if abs(steepest) > max_drift_ppm:
         raise ClockRefused(

@@ -233,7 +233,10 @@ def test_a_clock_that_warms_up_gets_a_bent_line(ppm: float) -> None:
 def test_a_clock_that_bends_like_no_crystal_is_refused() -> None:
     made = trains(np.random.default_rng(13), 60)
     along = (made.device - made.device[0]) / 60e9
-    assert refused(made.device + (along**2 * 2e7).astype(np.int64), made.reference) == "residuals"
+    bent = made.device + (along**2 * 2e7).astype(np.int64)
+    assert refused(bent, made.reference, max_drift_ppm=400) == "drift"
+    shaken = made.device + (2e6 * np.sin(2 * np.pi * 60 * along)).astype(np.int64)
+    assert refused(shaken, made.reference) == "residuals"
 
 
 def test_a_clock_that_jumps_in_the_middle_is_refused() -> None:
