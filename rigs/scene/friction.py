@@ -81,13 +81,30 @@ def friction_field(knots):  # type: ignore[no-untyped-def]
     return field
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def knot_at(path_mm):  # type: ignore[no-untyped-def]
+    """The last knot before a place on the path, counted on without end, as a float."""
+    return np.floor(path_mm * (1.0 / KNOT_MM))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def grip_between(path_mm, knot, c0, c1, c2, c3):  # type: ignore[no-untyped-def]
+    """Coefficient on a path behind a knot whose cubic is c0 to c3, and its slope, 1/mm."""
+    s = path_mm * (1.0 / KNOT_MM) - knot
+    grip = c0 + s * (c1 + s * (c2 + s * c3))
+    return grip, (c1 + s * (2.0 * c2 + 3.0 * s * c3)) * (1.0 / KNOT_MM)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def grip_at(field, i, path_mm):  # type: ignore[no-untyped-def]
     """Coefficient of tip `i` after it slid `path_mm`, and its slope along the path, 1/mm."""
-    along = path_mm * (1.0 / KNOT_MM)
-    knot = int(along)
-    s = along - knot
-    knot &= field.shape[1] - 1  # a power of two
-    c1, c2, c3 = field[i, knot, 1], field[i, knot, 2], field[i, knot, 3]
-    grip = field[i, knot, 0] + s * (c1 + s * (c2 + s * c3))
-    return grip, (c1 + s * (2.0 * c2 + 3.0 * s * c3)) * (1.0 / KNOT_MM)
+    knot = knot_at(path_mm)
+    c0, c1, c2, c3 = cubic_at(field, i, knot)
+    return grip_between(path_mm, knot, c0, c1, c2, c3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def cubic_at(field, i, knot):  # type: ignore[no-untyped-def]
+    """Coefficients c0 to c3 of tip `i` behind a knot."""
+    k = int(knot) & (field.shape[1] - 1)  # a power of two
+    return field[i, k, 0], field[i, k, 1], field[i, k, 2], field[i, k, 3]

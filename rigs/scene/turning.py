@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rigs.scene.smooth import decayed, logarithm
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
@@ -25,41 +27,34 @@ def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
     return min(max(share, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     """Direction of a sliding tip's force after the drive d: the tractrix.
 
     `before`, `after`: the cone's radius at both ends. Returns a unit vector.
     """
     size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
-    if drive == 0.0:
-        return fx / size, fy / size
-    ux, uy = dx / drive, dy / drive
-    if size == 0.0:
-        return ux, uy
-    along, across = (fx * ux + fy * uy) / size, (ux * fy - uy * fx) / size
-    if abs(across) < 1e-300 or after <= 0.0:
-        return (fx / size, fy / size) if after > 0.0 else (ux, uy)
+    ux, uy = (dx / drive, dy / drive) if drive > 0.0 else (fx / size, fy / size)
+    from_x, from_y = (fx / size, fy / size) if size > 0.0 else (ux, uy)
+    along, across = from_x * ux + from_y * uy, ux * from_y - uy * from_x
     ratio = after / before - 1.0
-    if abs(ratio) < 1e-3:  # the series of ratio / log(1 + ratio)
-        mean = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
-    else:
-        mean = (after - before) / np.log1p(ratio)
+    # the series of ratio / log(1 + ratio); else its logarithm, with what 1 + ratio rounds away
+    series = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
+    whole = 1.0 + ratio
+    log = logarithm(whole) + (ratio - (whole - 1.0)) / whole
+    mean = series if abs(ratio) < 1e-3 else (after - before) / log
     # along < 0 beyond a right angle: 1 + along cancels there
-    half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
-    way = drive / mean
-    if way < 0.01:  # the series of exp(-way)
-        half *= 1.0 - way * (
-            1.0 - way * (0.5 - way * (1.0 / 6.0 - way * (1.0 / 24.0 - way / 120.0)))
-        )
-    else:
-        half *= np.exp(-way)
+    high, low = (across, 1.0 + along) if along > 0.0 else (1.0 - along, across)
+    half = high / low * decayed(drive / mean)
     square = half * half
-    cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
-    return cosine * ux - sine * uy, sine * ux + cosine * uy
+    scale = 1.0 / (1.0 + square)
+    cosine, sine = (1.0 - square) * scale, 2.0 * half * scale
+    x, y = cosine * ux - sine * uy, sine * ux + cosine * uy
+    x, y = (from_x, from_y) if drive == 0.0 or abs(across) < 1e-300 else (x, y)
+    return (x, y) if after > 0.0 and before > 0.0 else (ux, uy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def unit(x, y):  # type: ignore[no-untyped-def]
     """The direction of a vector; x for none."""
     size = np.sqrt(x * x + y * y)

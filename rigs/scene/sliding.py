@@ -1,0 +1,112 @@
+"""The bend of a tip that slides: what its slip leaves of the stretch, with friction by the slip.
+
+One Newton step, shared by the tip that is computed alone and by those computed side by side, so
+that both give the same bits. No branches, for the latter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from rigs.scene.column import CLOSE, column
+from rigs.scene.friction import grip_between, knot_at
+from rigs.scene.smooth import logarithm
+from rigs.scene.turning import unit
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped-def]
+    """A coefficient of friction and its slope over the slip, raised by the speed of sliding.
+
+    The speed at the end of the step is `quick` (1/s) times the slip plus `lag` (mm/s).
+    """
+    speed = quick * slip + lag
+    speed = speed if speed > 0.0 else 0.0
+    share = 1.0 / law.weak_mm_s
+    whole = 1.0 + speed * share
+    more = 1.0 + law.strengthening * logarithm(whole)
+    rate = law.strengthening * share * quick / whole if speed > 0.0 else 0.0
+    return grip * more, slope * more + grip * rate
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def slide_step(  # type: ignore[no-untyped-def]
+    bent, low, high, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
+    pressed, pressing, bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag,
+    law,
+):  # fmt: skip
+    """One guarded Newton step towards the bend whose slip leaves the force on the friction cone.
+
+    Args:
+        bent, low, high: the bend, mm, and its bracket.
+        towards_x, towards_y: direction of the stretch; it follows from the friction.
+        new_x, new_y: of the base from where the tip stood, mm.
+        unit_x, unit_y: direction of the force on the cone.
+        rest_x, rest_y, soft: what relaxation and damping take of it, N, and per stretch, N/mm.
+        pressed, pressing, bending, shortening, compliance: as in `column`.
+        path, knot, c0, c1, c2, c3: way slid before, mm, and the friction behind a knot.
+        quick, lag: as in `strengthened`.
+
+    Returns:
+        bent, low, high, towards x and y; stretch, limit and normal force at the new bend; whether
+        that is it; and the knot before the end of the path. If that is not the knot given,
+        friction was wrong, and so is everything else.
+    """
+    spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
+    stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
+    slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
+    slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
+    straight = slip_x * towards_x + slip_y * towards_y
+    straight = 1.0 if straight >= slip * (1.0 - 1e-9) else straight / slip
+    grip, grip_slope = grip_between(path + slip, knot, c0, c1, c2, c3)
+    grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
+    limit = grip * normal
+    limit_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
+    pull_x, pull_y = limit * unit_x + rest_x, limit * unit_y + rest_y
+    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
+    towards_x, towards_y = (
+        (pull_x / pull, pull_y / pull) if pull > 0.0 else (towards_x, towards_y)
+    )  # fmt: skip
+    miss = spring + soft * stretch - pull
+    steepness = slope + soft * stretch_slope - limit_slope
+    low, high = (low, bent) if miss > 0.0 else (bent, high)
+    after = bent - miss / steepness
+    after = after if steepness > 0.0 and low <= after <= high else 0.5 * (low + high)
+    change = after - bent
+    # the next change would be of the order of the square of this one: rounding
+    return (
+        after, low, high, towards_x, towards_y,
+        stretch + stretch_slope * change, limit + limit_slope * change,
+        normal + normal_slope * change, abs(change) <= CLOSE * after, knot_at(path + slip),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def slid(stretch, limit, new_x, new_y, unit_x, unit_y, rest_x, rest_y):  # type: ignore[no-untyped-def]
+    """The stretch as a vector, and the slip that it leaves, mm."""
+    # a direction that lags behind by a hair would make the way longer, step by step
+    towards_x, towards_y = unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
+    x, y = stretch * towards_x, stretch * towards_y
+    return x, y, np.sqrt((new_x - x) * (new_x - x) + (new_y - y) * (new_y - y))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def foreseen(slid_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
+    """Speed at the end of a step from the slip in it and the mean speeds of the steps before.
+
+    A line through two of them, a parabola through three if all took as long.
+
+    Returns:
+        quick and lag of `strengthened`, and the slip, mm, if the tip slid on as it did
+        (negative: not known).
+    """
+    known = earlier_s > 0.0
+    even = earlier_s == slid_s and earlier >= 0.0
+    ahead = slid_s / (slid_s + earlier_s)
+    weight, lag = (
+        (11.0 / 6.0, earlier / 3.0 - 7.0 / 6.0 * speed) if even else (1.0 + ahead, -ahead * speed)
+    )  # fmt: skip
+    weight, lag = (weight, lag) if known else (1.0, 0.0)
+    slides = (2.0 * speed - earlier) * slid_s if known and even else -1.0
+    return weight / slid_s, lag, slides
