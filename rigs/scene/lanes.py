@@ -47,8 +47,6 @@ from rigs.scene.rows import (
     TABLE,
     TO_X,
     TO_Y,
-    TOWARDS_X,
-    TOWARDS_Y,
     UNIT_X,
     UNIT_Y,
     WANTED,
@@ -88,7 +86,7 @@ from rigs.scene.springs import (
     STUCK,
 )
 from rigs.scene.tip import ROUNDING, tip_step
-from rigs.scene.turning import turned, unit
+from rigs.scene.turning import turned
 
 _ALONE = 3.0
 """Mode of a tip that must be computed alone."""
@@ -116,13 +114,13 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
             break
     slide, alone = _decide(w, law, decay, gain)
     if slide > 0:
-        _aim(w, law, decay, h)
+        stale = _aim(w, law, decay, h)
         for _ in range(ITERATIONS):
-            seek, stale = _seek(w, law)
             if stale > 0:
                 for j in range(count):
                     if w[SEEKS, j] > 0.0 and w[WANTED, j] != w[KNOT, j]:
                         take_knot(w, field, first + j, j, w[WANTED, j])
+            seek, stale = _seek(w, law)
             if seek == 0:
                 break
         if _arrive(w) > 0:
@@ -233,36 +231,40 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
-    """Directions in which sliding tips pull, and where the search for their bends begins."""
-    exact = law.exact_turns
+    """Directions of sliding tips' forces, and first guesses; how many need another knot."""
+    if law.exact_turns:
+        for j in range(LANES):
+            from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
+            w[UNIT_X, j], w[UNIT_Y, j] = turned(
+                from_x, from_y, w[END_FORCE_X, j] - from_x, w[END_FORCE_Y, j] - from_y,
+                w[BEFORE, j], w[LIMIT, j],
+            )  # fmt: skip
+    else:
+        for j in range(LANES):
+            trial_x, trial_y = w[END_FORCE_X, j], w[END_FORCE_Y, j]
+            size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
+            w[UNIT_X, j], w[UNIT_Y, j] = trial_x / size, trial_y / size
+    stale, per_s = 0, 1.0 / h
     for j in range(LANES):
-        trial_x, trial_y = w[END_FORCE_X, j], w[END_FORCE_Y, j]
-        from_x, from_y, before = w[FORCE_X, j], w[FORCE_Y, j], w[BEFORE, j]
-        unit_x, unit_y = turned(
-            from_x, from_y, trial_x - from_x, trial_y - from_y, before, w[LIMIT, j]
-        )
-        size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
-        unit_x, unit_y = (unit_x, unit_y) if exact else (trial_x / size, trial_y / size)
-        place_x, place_y, soft = w[PLACE_X, j], w[PLACE_Y, j], w[SOFT, j]
-        old_x, old_y = w[BASE_X, j] - place_x, w[BASE_Y, j] - place_y
-        rest_x = soft * old_x - w[BRANCH_X, j] * decay
-        rest_y = soft * old_y - w[BRANCH_Y, j] * decay
-        towards_x, towards_y = unit(before * unit_x + rest_x, before * unit_y + rest_y)
-        w[UNIT_X, j], w[UNIT_Y, j] = unit_x, unit_y
-        w[REST_X, j], w[REST_Y, j] = rest_x, rest_y
-        w[TOWARDS_X, j], w[TOWARDS_Y, j] = towards_x, towards_y
-    for j in range(LANES):
-        quick, lag, slides = foreseen(h, w[SLID_S, j], w[SPEED, j], w[EARLIER, j])
+        quick, lag, slides = foreseen(h, per_s, w[SLID_S, j], w[SPEED, j], w[EARLIER, j])
         new_x, new_y = w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j]
         old_x, old_y = w[BASE_X, j] - w[PLACE_X, j], w[BASE_Y, j] - w[PLACE_Y, j]
-        moved = (new_x - old_x) * w[TOWARDS_X, j] + (new_y - old_y) * w[TOWARDS_Y, j]
+        w[REST_X, j] = w[SOFT, j] * old_x - w[BRANCH_X, j] * decay
+        w[REST_Y, j] = w[SOFT, j] * old_y - w[BRANCH_Y, j] * decay
+        moved = (new_x - old_x) * w[UNIT_X, j] + (new_y - old_y) * w[UNIT_Y, j]
         change = (moved - slides) / (1.0 + w[TABLE + COMPLIANCE, j] * w[TABLE + BENDING, j])
         guess = w[BENT, j] + (change if slides >= 0.0 else 0.0)
         high = w[END_BENT, j]
         bent = min(max(guess, 0.0), high)
         w[END_BENT, j] = bent if w[SEEKS, j] > 0.0 else high
         w[LOW, j], w[HIGH, j] = 0.0, high
+        from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
+        w[LIMIT, j] = np.sqrt(from_x * from_x + from_y * from_y)
         w[QUICK, j], w[LAG, j] = quick, lag
+        wanted = knot_at(w[PATH, j] + max(slides, 0.0))
+        w[WANTED, j] = wanted
+        stale += 1 if w[SEEKS, j] > 0.0 and wanted != w[KNOT, j] else 0
+    return stale
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -271,8 +273,8 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
     seek, stale = 0, 0
     for j in range(LANES):
         seeks = w[SEEKS, j] > 0.0
-        bent, low, high, towards_x, towards_y, stretch, limit, normal, found, wanted = slide_step(
-            w[END_BENT, j], w[LOW, j], w[HIGH, j], w[TOWARDS_X, j], w[TOWARDS_Y, j],
+        bent, low, high, force, stretch, normal, found, wanted = slide_step(
+            w[END_BENT, j], w[LOW, j], w[HIGH, j], w[LIMIT, j],
             w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j], w[UNIT_X, j], w[UNIT_Y, j],
             w[REST_X, j], w[REST_Y, j], w[SOFT, j], w[PRESSED, j], w[TABLE + ALONG, j],
             w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[TABLE + COMPLIANCE, j], w[PATH, j],
@@ -283,10 +285,8 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
         still = seeks and not (right and found)
         w[END_BENT, j] = bent if moves else w[END_BENT, j]
         w[LOW, j], w[HIGH, j] = low if moves else w[LOW, j], high if moves else w[HIGH, j]
-        w[TOWARDS_X, j] = towards_x if moves else w[TOWARDS_X, j]
-        w[TOWARDS_Y, j] = towards_y if moves else w[TOWARDS_Y, j]
         w[STRETCH, j] = stretch if moves else w[STRETCH, j]
-        w[LIMIT, j] = limit if moves else w[LIMIT, j]
+        w[LIMIT, j] = force if moves else w[LIMIT, j]
         w[END_NORMAL, j] = normal if moves else w[END_NORMAL, j]
         w[WANTED, j] = wanted
         w[SEEKS, j] = 1.0 if still else 0.0

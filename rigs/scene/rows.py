@@ -30,10 +30,10 @@ TABLE = STATES
     # what becomes of the tip (`rigs.scene.tip.tip_step`)
     END_MODE, END_X, END_Y, END_FORCE_X, END_FORCE_Y, END_NORMAL, END_BENT, SLIP, SHARE, GAIN,
     # of a tip that slides: `rigs.scene.sliding.slide_step`
-    LOW, HIGH, SEEKS, STRETCH, LIMIT, BEFORE, UNIT_X, UNIT_Y, TOWARDS_X, TOWARDS_Y,
-    REST_X, REST_Y, QUICK, LAG, END_GRIP,
-) = range(STATES + CONSTANTS, STATES + CONSTANTS + 36)  # fmt: skip
-ROWS = STATES + CONSTANTS + 36
+    LOW, HIGH, SEEKS, STRETCH, LIMIT, BEFORE, UNIT_X, UNIT_Y, REST_X, REST_Y,
+    QUICK, LAG,
+) = range(STATES + CONSTANTS, STATES + CONSTANTS + 33)  # fmt: skip
+ROWS = STATES + CONSTANTS + 33
 
 _AWAY_MM = 1e6
 

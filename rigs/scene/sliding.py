@@ -32,70 +32,84 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def slide_step(  # type: ignore[no-untyped-def]
-    bent, low, high, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
+    bent, low, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
     pressed, pressing, bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag,
     law,
 ):  # fmt: skip
     """One guarded Newton step towards the bend whose slip leaves the force on the friction cone.
 
+    The force is sought with the bend: it turns the stretch, by what relaxes and damps, and so
+    decides on the slip, which decides on the friction.
+
     Args:
         bent, low, high: the bend, mm, and its bracket.
-        towards_x, towards_y: direction of the stretch; it follows from the friction.
+        force: tangential, N.
         new_x, new_y: of the base from where the tip stood, mm.
-        unit_x, unit_y: direction of the force on the cone.
+        unit_x, unit_y: direction of the force.
         rest_x, rest_y, soft: what relaxation and damping take of it, N, and per stretch, N/mm.
         pressed, pressing, bending, shortening, compliance: as in `column`.
         path, knot, c0, c1, c2, c3: way slid before, mm, and the friction behind a knot.
         quick, lag: as in `strengthened`.
 
     Returns:
-        bent, low, high, towards x and y; stretch, limit and normal force at the new bend; whether
-        that is it; and the knot before the end of the path. If that is not the knot given,
-        friction was wrong, and so is everything else.
+        bent, low, high, force; stretch and normal force at the new bend; whether that is it; and
+        the knot before the end of the path. If that is not the knot given, friction was wrong,
+        and so is everything else.
     """
     spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
     stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
+    pull_x, pull_y = force * unit_x + rest_x, force * unit_y + rest_y
+    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
+    per_pull = 1.0 / pull if pull > 0.0 else 0.0
+    towards_x = pull_x * per_pull if pull > 0.0 else unit_x
+    towards_y = pull_y * per_pull if pull > 0.0 else unit_y
+    ahead = towards_x * unit_x + towards_y * unit_y
+    # how the stretch turns with the force, rad/N
+    turns = (towards_x * unit_y - towards_y * unit_x) * per_pull
     slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
     slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
-    straight = slip_x * towards_x + slip_y * towards_y
-    straight = 1.0 if straight >= slip * (1.0 - 1e-9) else straight / slip
+    per_slip = 1.0 / slip if slip > 0.0 else 0.0
+    straight = (slip_x * towards_x + slip_y * towards_y) * per_slip
+    askew = (slip_y * towards_x - slip_x * towards_y) * per_slip
     grip, grip_slope = grip_between(path + slip, knot, c0, c1, c2, c3)
     grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
-    limit = grip * normal
-    limit_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
-    pull_x, pull_y = limit * unit_x + rest_x, limit * unit_y + rest_y
-    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
-    towards_x, towards_y = (
-        (pull_x / pull, pull_y / pull) if pull > 0.0 else (towards_x, towards_y)
-    )  # fmt: skip
-    miss = spring + soft * stretch - pull
-    steepness = slope + soft * stretch_slope - limit_slope
-    low, high = (low, bent) if miss > 0.0 else (bent, high)
+    # force = grip normal, to first order in the changes of force and bend
+    off = grip * normal - force
+    force_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
+    own = 1.0 + normal * grip_slope * stretch * askew * turns
+    per_own = 1.0 / own if own > 0.1 else 1.0
+    miss = spring + soft * stretch - pull - ahead * per_own * off
+    steepness = slope + soft * stretch_slope - ahead * per_own * force_slope
+    # the sign tells on which side the bend is only if the direction is known
+    known = abs(turns * off) <= CLOSE
+    low, high = bent if known and miss <= 0.0 else low, bent if known and miss > 0.0 else high
     after = bent - miss / steepness
     after = after if steepness > 0.0 and low <= after <= high else 0.5 * (low + high)
     change = after - bent
-    # the next change would be of the order of the square of this one: rounding
+    more = (off + force_slope * change) * per_own
+    # the next changes would be of the order of the squares of these: rounding
+    found = abs(change) <= CLOSE * after and abs(turns * more) <= CLOSE
     return (
-        after, low, high, towards_x, towards_y,
-        stretch + stretch_slope * change, limit + limit_slope * change,
-        normal + normal_slope * change, abs(change) <= CLOSE * after, knot_at(path + slip),
+        after, low, high, max(force + more, 0.0), stretch + stretch_slope * change,
+        normal + normal_slope * change, found, knot_at(path + slip),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slid(stretch, limit, new_x, new_y, unit_x, unit_y, rest_x, rest_y):  # type: ignore[no-untyped-def]
+def slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y):  # type: ignore[no-untyped-def]
     """The stretch as a vector, and the slip that it leaves, mm."""
     # a direction that lags behind by a hair would make the way longer, step by step
-    towards_x, towards_y = unit(limit * unit_x + rest_x, limit * unit_y + rest_y)
+    towards_x, towards_y = unit(force * unit_x + rest_x, force * unit_y + rest_y)
     x, y = stretch * towards_x, stretch * towards_y
     return x, y, np.sqrt((new_x - x) * (new_x - x) + (new_y - y) * (new_y - y))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def foreseen(slid_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
+def foreseen(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
     """Speed at the end of a step from the slip in it and the mean speeds of the steps before.
 
-    A line through two of them, a parabola through three if all took as long.
+    A line through two of them, a parabola through three if all took as long. `per_s` is
+    1 / `slid_s`.
 
     Returns:
         quick and lag of `strengthened`, and the slip, mm, if the tip slid on as it did
@@ -109,4 +123,4 @@ def foreseen(slid_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
     )  # fmt: skip
     weight, lag = (weight, lag) if known else (1.0, 0.0)
     slides = (2.0 * speed - earlier) * slid_s if known and even else -1.0
-    return weight / slid_s, lag, slides
+    return weight * per_s, lag, slides

@@ -62,7 +62,7 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
-from rigs.scene.turning import leaves_at, turned, unit
+from rigs.scene.turning import leaves_at, turned
 
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
@@ -208,32 +208,31 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
     # left by a bend decides on the coefficient of friction, and so on F
     rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
-    towards_x, towards_y = unit(before * unit_x + rest_x, before * unit_y + rest_y)
     slid_s = left * (1.0 - touched) * h
     quick, lag, slides = 0.0, 0.0, -1.0
     if slid_s > 0.0:
         earlier_s = w[SLID_S, j] if keeps_on else 0.0
-        quick, lag, slides = foreseen(slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
-    moved = (new_x - old_x) * towards_x + (new_y - old_y) * towards_y
+        quick, lag, slides = foreseen(slid_s, 1.0 / slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
+    moved = (new_x - old_x) * unit_x + (new_y - old_y) * unit_y
     guess = w[BENT, j]
     guess += (moved - slides) / (1.0 + compliance * bending) if slides >= 0.0 else 0.0
     low, high = 0.0, bent
     bent = min(max(guess, 0.0), high)
-    limit, stretch = 0.0, 0.0
+    force, stretch = np.sqrt(from_x * from_x + from_y * from_y), 0.0
     for _ in range(ITERATIONS):
         step = slide_step(
-            bent, low, high, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y,
-            soft, pressed, along, bending, shortening, compliance, path, knot, c0, c1, c2, c3,
+            bent, low, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
+            pressed, along, bending, shortening, compliance, path, knot, c0, c1, c2, c3,
             quick, lag, law,
         )  # fmt: skip
-        if step[9] != knot:
-            knot = step[9]
+        if step[7] != knot:
+            knot = step[7]
             c0, c1, c2, c3 = cubic_at(field, i, knot)
             continue
-        bent, low, high, towards_x, towards_y, stretch, limit, normal, found, _ = step
+        bent, low, high, force, stretch, normal, found, _ = step
         if found:
             break
-    x, y, slip = slid(stretch, limit, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
+    x, y, slip = slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
     # the force lies on the cone of the way that is told, to the last bit
     knot = knot_at(path + slip)
     c0, c1, c2, c3 = cubic_at(field, i, knot)

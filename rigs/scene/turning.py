@@ -34,23 +34,25 @@ def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     `before`, `after`: the cone's radius at both ends. Returns a unit vector.
     """
     size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
-    ux, uy = (dx / drive, dy / drive) if drive > 0.0 else (fx / size, fy / size)
-    from_x, from_y = (fx / size, fy / size) if size > 0.0 else (ux, uy)
+    per_size, per_drive = 1.0 / size, 1.0 / drive
+    ux, uy = (dx * per_drive, dy * per_drive) if drive > 0.0 else (fx * per_size, fy * per_size)
+    from_x, from_y = (fx * per_size, fy * per_size) if size > 0.0 else (ux, uy)
     along, across = from_x * ux + from_y * uy, ux * from_y - uy * from_x
+    # the way over the logarithmic mean of the radii; near 1 the series of ratio / log(1 + ratio),
+    # else the logarithm, with what 1 + ratio rounds away
     ratio = after / before - 1.0
-    # the series of ratio / log(1 + ratio); else its logarithm, with what 1 + ratio rounds away
     series = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
     whole = 1.0 + ratio
-    log = logarithm(whole) + (ratio - (whole - 1.0)) / whole
-    mean = series if abs(ratio) < 1e-3 else (after - before) / log
-    # along < 0 beyond a right angle: 1 + along cancels there
+    log = logarithm(whole) + (ratio - (whole - 1.0))
+    even = abs(ratio) < 1e-3
+    way = (drive if even else drive * log) / (series if even else after - before)
+    # tan(theta / 2) as a quotient; along < 0 beyond a right angle: 1 + along cancels there
     high, low = (across, 1.0 + along) if along > 0.0 else (1.0 - along, across)
-    half = high / low * decayed(drive / mean)
-    square = half * half
-    scale = 1.0 / (1.0 + square)
-    cosine, sine = (1.0 - square) * scale, 2.0 * half * scale
+    high *= decayed(way)
+    scale = 1.0 / (low * low + high * high)
+    cosine, sine = (low * low - high * high) * scale, 2.0 * high * low * scale
     x, y = cosine * ux - sine * uy, sine * ux + cosine * uy
-    x, y = (from_x, from_y) if drive == 0.0 or abs(across) < 1e-300 else (x, y)
+    x, y = (from_x, from_y) if drive == 0.0 or across == 0.0 else (x, y)
     return (x, y) if after > 0.0 and before > 0.0 else (ux, uy)
 
 
