@@ -53,7 +53,7 @@ from rigs.scene.rows import (
     block_of,
     take_knot,
 )
-from rigs.scene.sliding import foreseen, slid, slide_step, strengthened
+from rigs.scene.sliding import PASSES, foreseen, slid, slide_step, strengthened
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -115,7 +115,7 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
     slide, alone = _decide(w, law, decay, gain)
     if slide > 0:
         stale = _aim(w, law, decay, h)
-        for _ in range(ITERATIONS):
+        for _ in range(PASSES):
             if stale > 0:
                 for j in range(count):
                     if w[SEEKS, j] > 0.0 and w[WANTED, j] != w[KNOT, j]:
@@ -123,6 +123,7 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
             seek, stale = _seek(w, law)
             if seek == 0:
                 break
+        alone += seek
         if _arrive(w) > 0:
             for j in range(count):
                 if w[END_MODE, j] == SLIDING and w[WANTED, j] != w[KNOT, j]:
@@ -273,8 +274,8 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
     seek, stale = 0, 0
     for j in range(LANES):
         seeks = w[SEEKS, j] > 0.0
-        bent, low, high, force, stretch, normal, found, wanted = slide_step(
-            w[END_BENT, j], w[LOW, j], w[HIGH, j], w[LIMIT, j],
+        bent, force, stretch, normal, found, wanted = slide_step(
+            w[END_BENT, j], w[HIGH, j], w[LIMIT, j],
             w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j], w[UNIT_X, j], w[UNIT_Y, j],
             w[REST_X, j], w[REST_Y, j], w[SOFT, j], w[PRESSED, j], w[TABLE + ALONG, j],
             w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[TABLE + COMPLIANCE, j], w[PATH, j],
@@ -284,7 +285,6 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
         moves = seeks and right
         still = seeks and not (right and found)
         w[END_BENT, j] = bent if moves else w[END_BENT, j]
-        w[LOW, j], w[HIGH, j] = low if moves else w[LOW, j], high if moves else w[HIGH, j]
         w[STRETCH, j] = stretch if moves else w[STRETCH, j]
         w[LIMIT, j] = force if moves else w[LIMIT, j]
         w[END_NORMAL, j] = normal if moves else w[END_NORMAL, j]
@@ -300,7 +300,10 @@ def _arrive(w):  # type: ignore[no-untyped-def]
     """Places and slips of the tips that slid; how many need another knot."""
     stale = 0
     for j in range(LANES):
-        slides = w[END_MODE, j] == SLIDING
+        # what was not found is done alone
+        end = _ALONE if w[SEEKS, j] > 0.0 else w[END_MODE, j]
+        slides = end == SLIDING
+        w[END_MODE, j] = end
         to_x, to_y = w[TO_X, j], w[TO_Y, j]
         x, y, slip = slid(
             w[STRETCH, j], w[LIMIT, j], to_x - w[PLACE_X, j], to_y - w[PLACE_Y, j],

@@ -1,7 +1,8 @@
 """The bend of a tip that slides: what its slip leaves of the stretch, with friction by the slip.
 
 One Newton step, shared by the tip that is computed alone and by those computed side by side, so
-that both give the same bits. No branches, for the latter.
+that both give the same bits. No branches, for the latter. Where it does not get there, because
+friction has a kink at rest, `slid_surely` does, slowly.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import CLOSE, column
-from rigs.scene.friction import grip_between, knot_at
+from rigs.scene.column import CLOSE, ITERATIONS, column
+from rigs.scene.friction import grip_at, grip_between, knot_at
 from rigs.scene.smooth import logarithm
 from rigs.scene.turning import unit
+
+PASSES = 8
+"""Newton steps that are tried; two or three do in all but a few cases in a million."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -32,17 +36,17 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def slide_step(  # type: ignore[no-untyped-def]
-    bent, low, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
+    bent, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
     pressed, pressing, bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag,
     law,
 ):  # fmt: skip
-    """One guarded Newton step towards the bend whose slip leaves the force on the friction cone.
+    """One Newton step towards the bend whose slip leaves the force on the friction cone.
 
     The force is sought with the bend: it turns the stretch, by what relaxes and damps, and so
     decides on the slip, which decides on the friction.
 
     Args:
-        bent, low, high: the bend, mm, and its bracket.
+        bent, high: the bend, and the most that it can be, mm.
         force: tangential, N.
         new_x, new_y: of the base from where the tip stood, mm.
         unit_x, unit_y: direction of the force.
@@ -52,7 +56,7 @@ def slide_step(  # type: ignore[no-untyped-def]
         quick, lag: as in `strengthened`.
 
     Returns:
-        bent, low, high, force; stretch and normal force at the new bend; whether that is it; and
+        bent, force; stretch and normal force at the new bend; whether that is it; and
         the knot before the end of the path. If that is not the knot given, friction was wrong,
         and so is everything else.
     """
@@ -80,19 +84,64 @@ def slide_step(  # type: ignore[no-untyped-def]
     per_own = 1.0 / own if own > 0.1 else 1.0
     miss = spring + soft * stretch - pull - ahead * per_own * off
     steepness = slope + soft * stretch_slope - ahead * per_own * force_slope
-    # the sign tells on which side the bend is only if the direction is known
-    known = abs(turns * off) <= CLOSE
-    low, high = bent if known and miss <= 0.0 else low, bent if known and miss > 0.0 else high
     after = bent - miss / steepness
-    after = after if steepness > 0.0 and low <= after <= high else 0.5 * (low + high)
+    inside = steepness > 0.0 and 0.0 <= after <= high
+    after = after if inside else 0.5 * (bent + (0.0 if miss > 0.0 else high))
     change = after - bent
     more = (off + force_slope * change) * per_own
     # the next changes would be of the order of the squares of these: rounding
     found = abs(change) <= CLOSE * after and abs(turns * more) <= CLOSE
     return (
-        after, low, high, max(force + more, 0.0), stretch + stretch_slope * change,
+        after, max(force + more, 0.0), stretch + stretch_slope * change,
         normal + normal_slope * change, found, knot_at(path + slip),
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _miss(  # type: ignore[no-untyped-def]
+    bent, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed,
+    pressing, bending, shortening, compliance, field, i, path, quick, lag, law,
+):  # fmt: skip
+    """What the spring pulls more than friction holds, N; force, N; stretch, mm; normal force."""
+    spring, normal, _, _ = column(bent, bending, shortening, pressed, pressing)
+    stretch = bent + compliance * spring
+    slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
+    slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
+    grip, _ = grip_at(field, i, path + slip)
+    grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
+    force = grip * normal
+    pull_x, pull_y = force * unit_x + rest_x, force * unit_y + rest_y
+    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
+    return spring + soft * stretch - pull, force, stretch, normal
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def slid_surely(  # type: ignore[no-untyped-def]
+    high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, pressing, bending,
+    shortening, compliance, field, i, path, quick, lag, law,
+):  # fmt: skip
+    """What `slide_step` looks for, by bisection for one direction of the stretch after another.
+
+    Returns:
+        bend, force, stretch, normal force.
+    """
+    bent, stretch, normal = high, 0.0, 0.0
+    for _ in range(ITERATIONS):
+        towards_x, towards_y = unit(force * unit_x + rest_x, force * unit_y + rest_y)
+        left, right, before = 0.0, high, force
+        while True:
+            bent = 0.5 * (left + right)
+            miss, force, stretch, normal = _miss(
+                bent, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
+                pressed, pressing, bending, shortening, compliance, field, i, path, quick, lag,
+                law,
+            )  # fmt: skip
+            if bent in (left, right):
+                break
+            left, right = (left, bent) if miss > 0.0 else (bent, right)
+        if abs(force - before) <= 1e-15 * force:
+            break
+    return bent, force, stretch, normal
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

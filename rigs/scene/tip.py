@@ -34,7 +34,7 @@ from rigs.scene.rows import (
     TO_X,
     TO_Y,
 )
-from rigs.scene.sliding import foreseen, slid, slide_step, strengthened
+from rigs.scene.sliding import PASSES, foreseen, slid, slid_surely, slide_step, strengthened
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -216,22 +216,26 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     moved = (new_x - old_x) * unit_x + (new_y - old_y) * unit_y
     guess = w[BENT, j]
     guess += (moved - slides) / (1.0 + compliance * bending) if slides >= 0.0 else 0.0
-    low, high = 0.0, bent
+    high = bent
     bent = min(max(guess, 0.0), high)
-    force, stretch = np.sqrt(from_x * from_x + from_y * from_y), 0.0
-    for _ in range(ITERATIONS):
+    first, found = np.sqrt(from_x * from_x + from_y * from_y), False
+    force, stretch, tried = first, 0.0, 0
+    while not found and tried < PASSES:
         step = slide_step(
-            bent, low, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
-            pressed, along, bending, shortening, compliance, path, knot, c0, c1, c2, c3,
-            quick, lag, law,
+            bent, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
+            bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag, law,
         )  # fmt: skip
-        if step[7] != knot:
-            knot = step[7]
+        if step[5] == knot:
+            bent, force, stretch, normal, found, _ = step
+            tried += 1
+        else:
+            knot = step[5]
             c0, c1, c2, c3 = cubic_at(field, i, knot)
-            continue
-        bent, low, high, force, stretch, normal, found, _ = step
-        if found:
-            break
+    if not found:
+        bent, force, stretch, normal = slid_surely(
+            high, first, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
+            bending, shortening, compliance, field, i, path, quick, lag, law,
+        )  # fmt: skip
     x, y, slip = slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
     # the force lies on the cone of the way that is told, to the last bit
     knot = knot_at(path + slip)
