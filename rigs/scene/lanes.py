@@ -30,7 +30,19 @@ from rigs.scene.rows import (
     END_Y,
     GAIN,
     HIGH,
+    GRIP,
+    GRIP_SLOPE,
     KNOT,
+    MISS,
+    MISS_SLOPE,
+    NEW_NORMAL,
+    NORMAL_SLOPE,
+    NEW_STRETCH,
+    STRETCH_SLOPE,
+    AHEAD,
+    TURNS,
+    STRAIGHT,
+    ASKEW,
     LAG,
     LANES,
     LIMIT,
@@ -53,7 +65,7 @@ from rigs.scene.rows import (
     block_of,
     take_knot,
 )
-from rigs.scene.sliding import PASSES, foreseen, slid, slide_step, strengthened
+from rigs.scene.sliding import PASSES, foreseen, slid, slide_step, strengthened, stretched
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -114,13 +126,13 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
             break
     slide, alone = _decide(w, law, decay, gain)
     if slide > 0:
-        stale = _aim(w, law, decay, h)
+        _aim(w, law, decay, h)
         for _ in range(PASSES):
-            if stale > 0:
+            if _stretch(w) > 0:
                 for j in range(count):
                     if w[SEEKS, j] > 0.0 and w[WANTED, j] != w[KNOT, j]:
                         take_knot(w, field, first + j, j, w[WANTED, j])
-            seek, stale = _seek(w, law)
+            seek = _seek(w, law)
             if seek == 0:
                 break
         alone += seek
@@ -232,7 +244,7 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
-    """Directions of sliding tips' forces, and first guesses; how many need another knot."""
+    """Directions of sliding tips' forces, and first guesses of their bends."""
     if law.exact_turns:
         for j in range(LANES):
             from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
@@ -245,7 +257,7 @@ def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
             trial_x, trial_y = w[END_FORCE_X, j], w[END_FORCE_Y, j]
             size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
             w[UNIT_X, j], w[UNIT_Y, j] = trial_x / size, trial_y / size
-    stale, per_s = 0, 1.0 / h
+    per_s = 1.0 / h
     for j in range(LANES):
         quick, lag, slides = foreseen(h, per_s, w[SLID_S, j], w[SPEED, j], w[EARLIER, j])
         new_x, new_y = w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j]
@@ -253,7 +265,11 @@ def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
         w[REST_X, j] = w[SOFT, j] * old_x - w[BRANCH_X, j] * decay
         w[REST_Y, j] = w[SOFT, j] * old_y - w[BRANCH_Y, j] * decay
         moved = (new_x - old_x) * w[UNIT_X, j] + (new_y - old_y) * w[UNIT_Y, j]
-        change = (moved - slides) / (1.0 + w[TABLE + COMPLIANCE, j] * w[TABLE + BENDING, j])
+        _, _, slope, _ = column(
+            w[BENT, j], w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[PRESSED, j],
+            w[TABLE + ALONG, j],
+        )  # fmt: skip
+        change = (moved - slides) / (1.0 + w[TABLE + COMPLIANCE, j] * slope)
         guess = w[BENT, j] + (change if slides >= 0.0 else 0.0)
         high = w[END_BENT, j]
         bent = min(max(guess, 0.0), high)
@@ -262,37 +278,56 @@ def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
         from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
         w[LIMIT, j] = np.sqrt(from_x * from_x + from_y * from_y)
         w[QUICK, j], w[LAG, j] = quick, lag
-        wanted = knot_at(w[PATH, j] + max(slides, 0.0))
-        w[WANTED, j] = wanted
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _stretch(w):  # type: ignore[no-untyped-def]
+    """The first part of a step of every sliding tip; how many need another knot."""
+    stale = 0
+    for j in range(LANES):
+        (
+            w[MISS, j], w[MISS_SLOPE, j], w[NEW_NORMAL, j], w[NORMAL_SLOPE, j],
+            w[NEW_STRETCH, j], w[STRETCH_SLOPE, j], w[AHEAD, j], w[TURNS, j], slip,
+            w[STRAIGHT, j], w[ASKEW, j],
+        ) = stretched(
+            w[END_BENT, j], w[LIMIT, j], w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j],
+            w[UNIT_X, j], w[UNIT_Y, j], w[REST_X, j], w[REST_Y, j], w[SOFT, j], w[PRESSED, j],
+            w[TABLE + ALONG, j], w[TABLE + BENDING, j], w[TABLE + SHORTER, j],
+            w[TABLE + COMPLIANCE, j],
+        )  # fmt: skip
+        wanted = knot_at(w[PATH, j] + slip)
+        w[SLIP, j], w[WANTED, j] = slip, wanted
         stale += 1 if w[SEEKS, j] > 0.0 and wanted != w[KNOT, j] else 0
     return stale
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _seek(w, law):  # type: ignore[no-untyped-def]
-    """A step of every sliding tip towards its bend; how many have not found it, or their knot."""
-    seek, stale = 0, 0
+    """The rest of that step; how many tips have not found their bend."""
+    seek = 0
+    for j in range(LANES):
+        slip = w[SLIP, j]
+        grip, grip_slope = grip_between(
+            w[PATH, j] + slip, w[KNOT, j], w[C0, j], w[C1, j], w[C2, j], w[C3, j]
+        )
+        w[GRIP, j], w[GRIP_SLOPE, j] = strengthened(
+            grip, grip_slope, slip, w[QUICK, j], w[LAG, j], law
+        )
     for j in range(LANES):
         seeks = w[SEEKS, j] > 0.0
-        bent, force, stretch, normal, found, wanted = slide_step(
-            w[END_BENT, j], w[HIGH, j], w[LIMIT, j],
-            w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j], w[UNIT_X, j], w[UNIT_Y, j],
-            w[REST_X, j], w[REST_Y, j], w[SOFT, j], w[PRESSED, j], w[TABLE + ALONG, j],
-            w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[TABLE + COMPLIANCE, j], w[PATH, j],
-            w[KNOT, j], w[C0, j], w[C1, j], w[C2, j], w[C3, j], w[QUICK, j], w[LAG, j], law,
+        bent, force, stretch, normal, found = slide_step(
+            w[END_BENT, j], w[HIGH, j], w[LIMIT, j], w[MISS, j], w[MISS_SLOPE, j],
+            w[NEW_NORMAL, j], w[NORMAL_SLOPE, j], w[NEW_STRETCH, j], w[STRETCH_SLOPE, j],
+            w[AHEAD, j], w[TURNS, j], w[STRAIGHT, j], w[ASKEW, j], w[GRIP, j], w[GRIP_SLOPE, j],
         )  # fmt: skip
-        right = wanted == w[KNOT, j]
-        moves = seeks and right
-        still = seeks and not (right and found)
-        w[END_BENT, j] = bent if moves else w[END_BENT, j]
-        w[STRETCH, j] = stretch if moves else w[STRETCH, j]
-        w[LIMIT, j] = force if moves else w[LIMIT, j]
-        w[END_NORMAL, j] = normal if moves else w[END_NORMAL, j]
-        w[WANTED, j] = wanted
+        w[END_BENT, j] = bent if seeks else w[END_BENT, j]
+        w[STRETCH, j] = stretch if seeks else w[STRETCH, j]
+        w[LIMIT, j] = force if seeks else w[LIMIT, j]
+        w[END_NORMAL, j] = normal if seeks else w[END_NORMAL, j]
+        still = seeks and not found
         w[SEEKS, j] = 1.0 if still else 0.0
         seek += 1 if still else 0
-        stale += 1 if seeks and not right else 0
-    return seek, stale
+    return seek
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

@@ -1,7 +1,7 @@
 """The bend of a tip that slides: what its slip leaves of the stretch, with friction by the slip.
 
-One Newton step, shared by the tip that is computed alone and by those computed side by side, so
-that both give the same bits. No branches, for the latter. Where it does not get there, because
+One Newton step in three parts, shared by the tip that is computed alone and by those computed
+side by side, so that both give the same bits. No branches, for the latter. Where it does not get there, because
 friction has a kink at rest, `slid_surely` does, slowly.
 """
 
@@ -35,55 +35,72 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slide_step(  # type: ignore[no-untyped-def]
-    bent, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
-    pressed, pressing, bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag,
-    law,
+def stretched(  # type: ignore[no-untyped-def]
+    bent, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, pressing, bending,
+    shortening, compliance,
 ):  # fmt: skip
-    """One Newton step towards the bend whose slip leaves the force on the friction cone.
+    """What a bend and a force mean for each other, and the slip that they leave.
 
-    The force is sought with the bend: it turns the stretch, by what relaxes and damps, and so
-    decides on the slip, which decides on the friction.
+    The force turns the stretch, by what relaxes and damps, and so decides on the slip, which
+    decides on the friction, that is the force.
 
     Args:
-        bent, high: the bend, and the most that it can be, mm.
+        bent: the bend, mm.
         force: tangential, N.
         new_x, new_y: of the base from where the tip stood, mm.
         unit_x, unit_y: direction of the force.
         rest_x, rest_y, soft: what relaxation and damping take of it, N, and per stretch, N/mm.
         pressed, pressing, bending, shortening, compliance: as in `column`.
-        path, knot, c0, c1, c2, c3: way slid before, mm, and the friction behind a knot.
-        quick, lag: as in `strengthened`.
 
     Returns:
-        bent, force; stretch and normal force at the new bend; whether that is it; and
-        the knot before the end of the path. If that is not the knot given, friction was wrong,
-        and so is everything else.
+        what the spring pulls more than the force does, N, and its slope over the bend; normal
+        force and its slope; stretch, mm, and its slope; share of the force along the stretch;
+        how the stretch turns with the force, rad/N; slip, mm, and its shares along and across the
+        stretch.
     """
     spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
     stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
     pull_x, pull_y = force * unit_x + rest_x, force * unit_y + rest_y
     pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
-    per_pull = 1.0 / pull if pull > 0.0 else 0.0
-    towards_x = pull_x * per_pull if pull > 0.0 else unit_x
-    towards_y = pull_y * per_pull if pull > 0.0 else unit_y
+    pulls = pull > 0.0
+    per_pull = 1.0 / pull if pulls else 0.0
+    towards_x = pull_x * per_pull if pulls else unit_x
+    towards_y = pull_y * per_pull if pulls else unit_y
     ahead = towards_x * unit_x + towards_y * unit_y
-    # how the stretch turns with the force, rad/N
     turns = (towards_x * unit_y - towards_y * unit_x) * per_pull
     slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
     slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
     per_slip = 1.0 / slip if slip > 0.0 else 0.0
     straight = (slip_x * towards_x + slip_y * towards_y) * per_slip
     askew = (slip_y * towards_x - slip_x * towards_y) * per_slip
-    grip, grip_slope = grip_between(path + slip, knot, c0, c1, c2, c3)
-    grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
+    return (
+        spring + soft * stretch - pull, slope + soft * stretch_slope, normal, normal_slope,
+        stretch, stretch_slope, ahead, turns, slip, straight, askew,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def slide_step(  # type: ignore[no-untyped-def]
+    bent, high, force, miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead,
+    turns, straight, askew, grip, grip_slope,
+):  # fmt: skip
+    """One Newton step towards the bend whose slip leaves the force on the friction cone.
+
+    Args:
+        high: the most that the bend can be, mm.
+        miss to askew: from `stretched`.
+        grip, grip_slope: friction at the end of the slip, and its slope over it, 1/mm.
+
+    Returns:
+        bend, force, stretch and normal force after it, and whether that is it.
+    """
     # force = grip normal, to first order in the changes of force and bend
     off = grip * normal - force
     force_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
     own = 1.0 + normal * grip_slope * stretch * askew * turns
     per_own = 1.0 / own if own > 0.1 else 1.0
-    miss = spring + soft * stretch - pull - ahead * per_own * off
-    steepness = slope + soft * stretch_slope - ahead * per_own * force_slope
+    miss -= ahead * per_own * off
+    steepness = miss_slope - ahead * per_own * force_slope
     after = bent - miss / steepness
     inside = steepness > 0.0 and 0.0 <= after <= high
     after = after if inside else 0.5 * (bent + (0.0 if miss > 0.0 else high))
@@ -93,7 +110,7 @@ def slide_step(  # type: ignore[no-untyped-def]
     found = abs(change) <= CLOSE * after and abs(turns * more) <= CLOSE
     return (
         after, max(force + more, 0.0), stretch + stretch_slope * change,
-        normal + normal_slope * change, found, knot_at(path + slip),
+        normal + normal_slope * change, found,
     )  # fmt: skip
 
 

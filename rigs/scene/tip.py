@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from rigs.scene.column import ITERATIONS, bend_for, column, relaxing
-from rigs.scene.friction import cubic_at, grip_between, knot_at
+from rigs.scene.friction import grip_at
 from rigs.scene.rows import (
     DEEP,
     END_BENT,
@@ -34,7 +34,7 @@ from rigs.scene.rows import (
     TO_X,
     TO_Y,
 )
-from rigs.scene.sliding import PASSES, foreseen, slid, slid_surely, slide_step, strengthened
+from rigs.scene.sliding import PASSES, foreseen, slid, slid_surely, slide_step, strengthened, stretched
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -176,9 +176,7 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
     trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
     path = w[PATH, j]
-    knot = knot_at(path)
-    c0, c1, c2, c3 = cubic_at(field, i, knot)
-    grip, _ = grip_between(path, knot, c0, c1, c2, c3)
+    grip, _ = grip_at(field, i, path)
     from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
     drive_x, drive_y = trial_x - from_x, trial_y - from_y
     static, before = 1.0 + law.static_excess, grip * w[NORMAL, j]
@@ -215,22 +213,27 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
         quick, lag, slides = foreseen(slid_s, 1.0 / slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
     moved = (new_x - old_x) * unit_x + (new_y - old_y) * unit_y
     guess = w[BENT, j]
-    guess += (moved - slides) / (1.0 + compliance * bending) if slides >= 0.0 else 0.0
+    _, _, slope, _ = column(guess, bending, shortening, pressed, along)
+    guess += (moved - slides) / (1.0 + compliance * slope) if slides >= 0.0 else 0.0
     high = bent
     bent = min(max(guess, 0.0), high)
     first, found = np.sqrt(from_x * from_x + from_y * from_y), False
     force, stretch, tried = first, 0.0, 0
     while not found and tried < PASSES:
-        step = slide_step(
-            bent, high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
-            bending, shortening, compliance, path, knot, c0, c1, c2, c3, quick, lag, law,
+        (
+            miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead, turns, slip,
+            straight, askew,
+        ) = stretched(
+            bent, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
+            bending, shortening, compliance,
         )  # fmt: skip
-        if step[5] == knot:
-            bent, force, stretch, normal, found, _ = step
-            tried += 1
-        else:
-            knot = step[5]
-            c0, c1, c2, c3 = cubic_at(field, i, knot)
+        grip, grip_slope = grip_at(field, i, path + slip)
+        grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
+        bent, force, stretch, normal, found = slide_step(
+            bent, high, force, miss, miss_slope, normal, normal_slope, stretch, stretch_slope,
+            ahead, turns, straight, askew, grip, grip_slope,
+        )  # fmt: skip
+        tried += 1
     if not found:
         bent, force, stretch, normal = slid_surely(
             high, first, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
@@ -238,9 +241,7 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
         )  # fmt: skip
     x, y, slip = slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
     # the force lies on the cone of the way that is told, to the last bit
-    knot = knot_at(path + slip)
-    c0, c1, c2, c3 = cubic_at(field, i, knot)
-    grip, _ = grip_between(path + slip, knot, c0, c1, c2, c3)
+    grip, _ = grip_at(field, i, path + slip)
     grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
     limit = grip * normal
     _end(
