@@ -43,6 +43,9 @@ from rigs.scene.rows import (
     TURNS,
     STRAIGHT,
     ASKEW,
+    TOP,
+    BOTTOM,
+    WAY,
     LAG,
     LANES,
     LIMIT,
@@ -98,7 +101,7 @@ from rigs.scene.springs import (
     STUCK,
 )
 from rigs.scene.tip import ROUNDING, tip_step
-from rigs.scene.turning import turned
+from rigs.scene.turning import dragged, turned
 
 _ALONE = 3.0
 """Mode of a tip that must be computed alone."""
@@ -248,10 +251,14 @@ def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
     if law.exact_turns:
         for j in range(LANES):
             from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
-            w[UNIT_X, j], w[UNIT_Y, j] = turned(
+            w[UNIT_X, j], w[UNIT_Y, j], w[TOP, j], w[BOTTOM, j], w[WAY, j] = dragged(
                 from_x, from_y, w[END_FORCE_X, j] - from_x, w[END_FORCE_Y, j] - from_y,
                 w[BEFORE, j], w[LIMIT, j],
             )  # fmt: skip
+        for j in range(LANES):
+            w[UNIT_X, j], w[UNIT_Y, j] = turned(
+                w[UNIT_X, j], w[UNIT_Y, j], w[TOP, j], w[BOTTOM, j], w[WAY, j]
+            )
     else:
         for j in range(LANES):
             trial_x, trial_y = w[END_FORCE_X, j], w[END_FORCE_Y, j]

@@ -62,7 +62,7 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
-from rigs.scene.turning import leaves_at, turned
+from rigs.scene.turning import dragged, leaves_at, turned
 
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
@@ -198,9 +198,10 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
         before += share * (grip * normal - before)
         share = touched + (1.0 - touched) * share
     if law.exact_turns:
-        unit_x, unit_y = turned(
+        ux, uy, top, bottom, way = dragged(
             from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
         )
+        unit_x, unit_y = turned(ux, uy, top, bottom, way)
     else:
         unit_x, unit_y = trial_x / size, trial_y / size
     # with the force F n on the cone, the spring's share of it points along F n + rest; the slip

@@ -28,10 +28,15 @@ def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
-    """Direction of a sliding tip's force after the drive d: the tractrix.
+def dragged(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+    """How a sliding tip's force is dragged by the drive d, for `turned`.
 
-    `before`, `after`: the cone's radius at both ends. Returns a unit vector.
+    `before`, `after`: the cone's radius at both ends.
+
+    Returns:
+        direction of the drive; tan(theta / 2) as a quotient's numerator and denominator, theta
+        being the angle from the drive to the force; and the way over the radius (negative: the
+        force points along the drive at once).
     """
     size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
     per_size, per_drive = 1.0 / size, 1.0 / drive
@@ -46,14 +51,22 @@ def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
     log = logarithm(whole) + (ratio - (whole - 1.0))
     even = abs(ratio) < 1e-3
     way = (drive if even else drive * log) / (series if even else after - before)
-    # tan(theta / 2) as a quotient; along < 0 beyond a right angle: 1 + along cancels there
+    way = way if after > 0.0 and before > 0.0 else -1.0
+    # along < 0 beyond a right angle: 1 + along cancels there
     high, low = (across, 1.0 + along) if along > 0.0 else (1.0 - along, across)
-    high *= decayed(way)
+    return ux, uy, high, low, way
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def turned(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
+    """Direction of a sliding tip's force after the drive: the tractrix. A unit vector."""
+    # straight against the drive it stays so
+    high *= decayed(max(way, 0.0)) if low != 0.0 else 1.0
+    high = high if way >= 0.0 else 0.0
     scale = 1.0 / (low * low + high * high)
     cosine, sine = (low * low - high * high) * scale, 2.0 * high * low * scale
     x, y = cosine * ux - sine * uy, sine * ux + cosine * uy
-    x, y = (from_x, from_y) if drive == 0.0 or across == 0.0 else (x, y)
-    return (x, y) if after > 0.0 and before > 0.0 else (ux, uy)
+    return (x, y) if way >= 0.0 else (ux, uy)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
