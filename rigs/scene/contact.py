@@ -14,7 +14,7 @@ from numba import njit
 
 from rigs.scene.column import relaxing
 from rigs.scene.lanes import respond, settle
-from rigs.scene.rows import LANES, gather, spread
+from rigs.scene.rows import LANES, block_of, gather, spread
 from rigs.scene.springs import (
     FORCE_X,
     FORCE_Y,
@@ -47,16 +47,17 @@ def move_tips(lanes, n, field, law, sensor, plate_y, start_s, h, decay, gain):  
 @njit(cache=True, nogil=True, error_model="numpy")
 def record(lanes, n, plate_y, track, load):  # type: ignore[no-untyped-def]
     """Write the state into a row of `track` (see `track_width`) and of `load` if that has room."""
-    for i in range(n):
-        w, j = lanes[i // LANES], i % LANES
-        track[2 * i], track[2 * i + 1] = w[PLACE_X * LANES + j], w[PLACE_Y * LANES + j]
-        track[2 * n + i], track[3 * n + i] = w[PATH * LANES + j], w[SLIPPED * LANES + j]
+    for k in range(lanes.shape[0]):
+        w, first = block_of(lanes[k]), k * LANES
+        for j in range(min(n - first, LANES)):
+            i = first + j
+            track[2 * i], track[2 * i + 1] = w[PLACE_X, j], w[PLACE_Y, j]
+            track[2 * n + i], track[3 * n + i] = w[PATH, j], w[SLIPPED, j]
+        if load.shape[0] == 3 * n:
+            for j in range(min(n - first, LANES)):
+                i = 3 * (first + j)
+                load[i], load[i + 1], load[i + 2] = w[FORCE_X, j], w[FORCE_Y, j], w[NORMAL, j]
     track[4 * n] = plate_y
-    if load.shape[0] == 3 * n:
-        for i in range(n):
-            w, j = lanes[i // LANES], i % LANES
-            load[3 * i], load[3 * i + 1] = w[FORCE_X * LANES + j], w[FORCE_Y * LANES + j]
-            load[3 * i + 2] = w[NORMAL * LANES + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -16,7 +16,9 @@ from rigs.scene.smooth import logarithm
 from rigs.scene.turning import unit
 
 PASSES = 8
-"""Newton steps that are tried; two or three do in all but a few cases in a million."""
+"""Newton steps that many tips try side by side; two do while rows are close."""
+TRIES = 24
+"""Newton steps that one tip tries."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -137,7 +139,7 @@ def slid_surely(  # type: ignore[no-untyped-def]
     high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, pressing, bending,
     shortening, compliance, field, i, path, quick, lag, law,
 ):  # fmt: skip
-    """What `slide_step` looks for, by bisection for one direction of the stretch after another.
+    """What `slide_step` looks for, by regula falsi for one direction of the stretch after another.
 
     Returns:
         bend, force, stretch, normal force.
@@ -145,18 +147,28 @@ def slid_surely(  # type: ignore[no-untyped-def]
     bent, stretch, normal = high, 0.0, 0.0
     for _ in range(ITERATIONS):
         towards_x, towards_y = unit(force * unit_x + rest_x, force * unit_y + rest_y)
-        left, right, before = 0.0, high, force
-        while True:
-            bent = 0.5 * (left + right)
+        before = force
+        left, right, below, above, side = 0.0, high, 0.0, 0.0, 0
+        for _ in range(ITERATIONS):
+            known = below < 0.0 < above
+            bent = (left * above - right * below) / (above - below) if known else bent
+            bent = bent if left < bent < right else 0.5 * (left + right)
             miss, force, stretch, normal = _miss(
                 bent, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
                 pressed, pressing, bending, shortening, compliance, field, i, path, quick, lag,
                 law,
             )  # fmt: skip
-            if bent in (left, right):
+            if miss > 0.0:
+                right, above = bent, miss
+                below = 0.5 * below if side == 1 else below
+                side = 1
+            else:
+                left, below = bent, miss
+                above = 0.5 * above if side == -1 else above
+                side = -1
+            if abs(miss) <= 1e-15 * force or right - left <= 1e-15 * high:
                 break
-            left, right = (left, bent) if miss > 0.0 else (bent, right)
-        if abs(force - before) <= 1e-15 * force:
+        if abs(force - before) <= 1e-14 * force:
             break
     return bent, force, stretch, normal
 

@@ -34,7 +34,7 @@ from rigs.scene.rows import (
     TO_X,
     TO_Y,
 )
-from rigs.scene.sliding import PASSES, foreseen, slid, slid_surely, slide_step, strengthened, stretched
+from rigs.scene.sliding import TRIES, foreseen, slid, slid_surely, slide_step, strengthened, stretched
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -220,7 +220,7 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     bent = min(max(guess, 0.0), high)
     first, found = np.sqrt(from_x * from_x + from_y * from_y), False
     force, stretch, tried = first, 0.0, 0
-    while not found and tried < PASSES:
+    while not found and tried < TRIES:
         (
             miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead, turns, slip,
             straight, askew,
