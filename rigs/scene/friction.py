@@ -8,6 +8,8 @@ contact solver's Newton steps have a true slope.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -40,25 +42,40 @@ def friction_knots(
     if variation == 0.0:
         return np.ascontiguousarray(mean.astype(np.float64))
     white = generator(seed, "friction").standard_normal((len(skin), KNOTS))
+    knots: F64 = _smoothed(white, _kernel(correlation_mm), mean[:, 0], variation)
+    return knots
+
+
+@lru_cache(maxsize=16)
+def _kernel(correlation_mm: float) -> F64:
+    """Weights that make white noise correlated, (2 reach + 1,)."""
     reach = min(int(3.0 * correlation_mm / KNOT_MM), KNOTS // 2 - 1)
     away = np.arange(-reach, reach + 1) * KNOT_MM
-    kernel = np.exp(-2.0 * (away / correlation_mm) ** 2)
+    kernel: F64 = np.exp(-2.0 * (away / correlation_mm) ** 2)
     kernel /= np.sqrt(np.sum(kernel**2))
-    smooth = _smoothed(np.concatenate([white[:, -reach:], white, white[:, :reach]], axis=1), kernel)
-    return np.maximum(mean * (1.0 + variation * smooth), LEAST_SHARE * mean)
+    kernel.flags.writeable = False
+    return kernel
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smoothed(padded, kernel):  # type: ignore[no-untyped-def]
-    """Rows folded with a kernel, term by term in a fixed order: the same bits everywhere."""
-    rows, length = padded.shape[0], padded.shape[1] - kernel.shape[0] + 1
-    result = np.zeros((rows, length))
+def _smoothed(white, kernel, mean, variation):  # type: ignore[no-untyped-def]
+    """Rows round which noise is folded with a kernel; term by term: the same bits everywhere."""
+    rows, count = white.shape
+    reach = kernel.shape[0] // 2
+    padded, smooth = np.empty(count + 2 * reach), np.empty(count)
+    knots = np.empty((rows, count))
     for i in range(rows):
+        padded[:reach], padded[reach + count :] = white[i, count - reach :], white[i, :reach]
+        padded[reach : reach + count] = white[i]
+        smooth[:] = 0.0
         for shift in range(kernel.shape[0]):
             weight = kernel[shift]
-            for k in range(length):
-                result[i, k] += weight * padded[i, k + shift]
-    return result
+            for k in range(count):
+                smooth[k] += weight * padded[k + shift]
+        for k in range(count):
+            rough = mean[i] * (1.0 + variation * smooth[k])
+            knots[i, k] = max(rough, LEAST_SHARE * mean[i])
+    return knots
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
