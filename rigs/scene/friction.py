@@ -85,12 +85,13 @@ def friction_field(knots):  # type: ignore[no-untyped-def]
     Between knot k and the next the coefficient is c0 + s (c1 + s (c2 + s c3)), s from 0 to 1.
     """
     rows, count = knots.shape
+    last = count - 1  # count is a power of two
     field = np.empty((rows, count, 4))
     for i in range(rows):
         for k in range(count):
-            here, after = knots[i, k], knots[i, (k + 1) % count]
-            slope = 0.5 * (after - knots[i, k - 1])
-            slope_after = 0.5 * (knots[i, (k + 2) % count] - here)
+            here, after = knots[i, k], knots[i, (k + 1) & last]
+            slope = 0.5 * (after - knots[i, (k - 1) & last])
+            slope_after = 0.5 * (knots[i, (k + 2) & last] - here)
             rise = after - here
             field[i, k, 0], field[i, k, 1] = here, slope
             field[i, k, 2] = 3.0 * rise - 2.0 * slope - slope_after

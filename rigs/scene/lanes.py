@@ -12,9 +12,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import ITERATIONS, bend_step, column, first_bend, relaxing
+from rigs.scene.column import ITERATIONS, bend_step, column, first_bend
 from rigs.scene.friction import grip_between, knot_at
 from rigs.scene.rows import (
+    ALONE,
     BEFORE,
     C0,
     C1,
@@ -30,30 +31,11 @@ from rigs.scene.rows import (
     END_Y,
     GAIN,
     HIGH,
-    GRIP,
-    GRIP_SLOPE,
     KNOT,
-    MISS,
-    MISS_SLOPE,
-    NEW_NORMAL,
-    NORMAL_SLOPE,
-    NEW_STRETCH,
-    STRETCH_SLOPE,
-    AHEAD,
-    TURNS,
-    STRAIGHT,
-    ASKEW,
-    TOP,
-    BOTTOM,
-    WAY,
-    LAG,
     LANES,
     LIMIT,
     LOW,
     PRESSED,
-    QUICK,
-    REST_X,
-    REST_Y,
     SEEKS,
     SHARE,
     SLIP,
@@ -62,13 +44,11 @@ from rigs.scene.rows import (
     TABLE,
     TO_X,
     TO_Y,
-    UNIT_X,
-    UNIT_Y,
     WANTED,
     block_of,
     take_knot,
 )
-from rigs.scene.sliding import PASSES, foreseen, slid, slide_step, strengthened, stretched
+from rigs.scene.sliding_lanes import slide_on
 from rigs.scene.springs import (
     ACROSS,
     ALONG,
@@ -101,10 +81,6 @@ from rigs.scene.springs import (
     STUCK,
 )
 from rigs.scene.tip import ROUNDING, tip_step
-from rigs.scene.turning import dragged, turned
-
-_ALONE = 3.0
-"""Mode of a tip that must be computed alone."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -129,24 +105,10 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
             break
     slide, alone = _decide(w, law, decay, gain)
     if slide > 0:
-        _aim(w, law, decay, h)
-        for _ in range(PASSES):
-            if _stretch(w) > 0:
-                for j in range(count):
-                    if w[SEEKS, j] > 0.0 and w[WANTED, j] != w[KNOT, j]:
-                        take_knot(w, field, first + j, j, w[WANTED, j])
-            seek = _seek(w, law)
-            if seek == 0:
-                break
-        alone += seek
-        if _arrive(w) > 0:
-            for j in range(count):
-                if w[END_MODE, j] == SLIDING and w[WANTED, j] != w[KNOT, j]:
-                    take_knot(w, field, first + j, j, w[WANTED, j])
-        _pull(w, law)
+        alone += slide_on(w, field, law, first, count, h, decay)
     if alone > 0:
         for j in range(count):
-            if w[END_MODE, j] == _ALONE:
+            if w[END_MODE, j] == ALONE:
                 tip_step(w, field, law, first + j, j, h, decay, gain)
 
 
@@ -154,15 +116,15 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
 def _approach(w, law, x, y, depth, slope_x, slope_y, plate_y, decay, gain, h):  # type: ignore[no-untyped-def]
     """Bases at the end of the step, and first guesses; how many tips need another knot."""
     stale = 0
-    branch, soft = law.maxwell * gain, law.maxwell * gain + law.damping_s / h
+    soft = law.maxwell * gain + law.damping_s / h
     for j in range(LANES):
         lx, ly = w[TABLE + LAYOUT_X, j], w[TABLE + LAYOUT_Y, j]
         to_x, to_y = x + lx, y + ly - plate_y
         deep = depth + slope_x * lx + slope_y * ly - w[TABLE + GAP, j]
         along, was = w[TABLE + ALONG, j], w[INDENTATION, j]
         was = was if was > 0.0 else 0.0
-        pressed = along * deep + w[NORMAL_BRANCH, j] * decay + law.maxwell * along * gain * (
-            deep - was
+        pressed = (
+            along * deep + w[NORMAL_BRANCH, j] * decay + law.maxwell * along * gain * (deep - was)
         )
         new_x, new_y = to_x - w[PLACE_X, j], to_y - w[PLACE_Y, j]
         stretch = np.sqrt(new_x * new_x + new_y * new_y)
@@ -229,7 +191,7 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
         free = (mode != FREE and not touches) or deep <= 0.0
         sticks = touches and size <= limit * ROUNDING
         slides = touches and keeps_on and not sticks
-        end = SLIDING if slides else _ALONE
+        end = SLIDING if slides else ALONE
         end = STUCK if sticks else end
         end = FREE if free else end
         w[END_MODE, j] = end
@@ -241,137 +203,8 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
         w[LIMIT, j], w[BEFORE, j] = grip * normal, before
         w[SEEKS, j] = 1.0 if slides else 0.0
         slide += 1 if slides else 0
-        alone += 1 if end == _ALONE else 0
+        alone += 1 if end == ALONE else 0
     return slide, alone
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _aim(w, law, decay, h):  # type: ignore[no-untyped-def]
-    """Directions of sliding tips' forces, and first guesses of their bends."""
-    if law.exact_turns:
-        for j in range(LANES):
-            from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
-            w[UNIT_X, j], w[UNIT_Y, j], w[TOP, j], w[BOTTOM, j], w[WAY, j] = dragged(
-                from_x, from_y, w[END_FORCE_X, j] - from_x, w[END_FORCE_Y, j] - from_y,
-                w[BEFORE, j], w[LIMIT, j],
-            )  # fmt: skip
-        for j in range(LANES):
-            w[UNIT_X, j], w[UNIT_Y, j] = turned(
-                w[UNIT_X, j], w[UNIT_Y, j], w[TOP, j], w[BOTTOM, j], w[WAY, j]
-            )
-    else:
-        for j in range(LANES):
-            trial_x, trial_y = w[END_FORCE_X, j], w[END_FORCE_Y, j]
-            size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
-            w[UNIT_X, j], w[UNIT_Y, j] = trial_x / size, trial_y / size
-    per_s = 1.0 / h
-    for j in range(LANES):
-        quick, lag, slides = foreseen(h, per_s, w[SLID_S, j], w[SPEED, j], w[EARLIER, j])
-        new_x, new_y = w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j]
-        old_x, old_y = w[BASE_X, j] - w[PLACE_X, j], w[BASE_Y, j] - w[PLACE_Y, j]
-        w[REST_X, j] = w[SOFT, j] * old_x - w[BRANCH_X, j] * decay
-        w[REST_Y, j] = w[SOFT, j] * old_y - w[BRANCH_Y, j] * decay
-        moved = (new_x - old_x) * w[UNIT_X, j] + (new_y - old_y) * w[UNIT_Y, j]
-        _, _, slope, _ = column(
-            w[BENT, j], w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[PRESSED, j],
-            w[TABLE + ALONG, j],
-        )  # fmt: skip
-        change = (moved - slides) / (1.0 + w[TABLE + COMPLIANCE, j] * slope)
-        guess = w[BENT, j] + (change if slides >= 0.0 else 0.0)
-        high = w[END_BENT, j]
-        bent = min(max(guess, 0.0), high)
-        w[END_BENT, j] = bent if w[SEEKS, j] > 0.0 else high
-        w[LOW, j], w[HIGH, j] = 0.0, high
-        from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
-        w[LIMIT, j] = np.sqrt(from_x * from_x + from_y * from_y)
-        w[QUICK, j], w[LAG, j] = quick, lag
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _stretch(w):  # type: ignore[no-untyped-def]
-    """The first part of a step of every sliding tip; how many need another knot."""
-    stale = 0
-    for j in range(LANES):
-        (
-            w[MISS, j], w[MISS_SLOPE, j], w[NEW_NORMAL, j], w[NORMAL_SLOPE, j],
-            w[NEW_STRETCH, j], w[STRETCH_SLOPE, j], w[AHEAD, j], w[TURNS, j], slip,
-            w[STRAIGHT, j], w[ASKEW, j],
-        ) = stretched(
-            w[END_BENT, j], w[LIMIT, j], w[TO_X, j] - w[PLACE_X, j], w[TO_Y, j] - w[PLACE_Y, j],
-            w[UNIT_X, j], w[UNIT_Y, j], w[REST_X, j], w[REST_Y, j], w[SOFT, j], w[PRESSED, j],
-            w[TABLE + ALONG, j], w[TABLE + BENDING, j], w[TABLE + SHORTER, j],
-            w[TABLE + COMPLIANCE, j],
-        )  # fmt: skip
-        wanted = knot_at(w[PATH, j] + slip)
-        w[SLIP, j], w[WANTED, j] = slip, wanted
-        stale += 1 if w[SEEKS, j] > 0.0 and wanted != w[KNOT, j] else 0
-    return stale
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _seek(w, law):  # type: ignore[no-untyped-def]
-    """The rest of that step; how many tips have not found their bend."""
-    seek = 0
-    for j in range(LANES):
-        slip = w[SLIP, j]
-        grip, grip_slope = grip_between(
-            w[PATH, j] + slip, w[KNOT, j], w[C0, j], w[C1, j], w[C2, j], w[C3, j]
-        )
-        w[GRIP, j], w[GRIP_SLOPE, j] = strengthened(
-            grip, grip_slope, slip, w[QUICK, j], w[LAG, j], law
-        )
-    for j in range(LANES):
-        seeks = w[SEEKS, j] > 0.0
-        bent, force, stretch, normal, found = slide_step(
-            w[END_BENT, j], w[HIGH, j], w[LIMIT, j], w[MISS, j], w[MISS_SLOPE, j],
-            w[NEW_NORMAL, j], w[NORMAL_SLOPE, j], w[NEW_STRETCH, j], w[STRETCH_SLOPE, j],
-            w[AHEAD, j], w[TURNS, j], w[STRAIGHT, j], w[ASKEW, j], w[GRIP, j], w[GRIP_SLOPE, j],
-        )  # fmt: skip
-        w[END_BENT, j] = bent if seeks else w[END_BENT, j]
-        w[STRETCH, j] = stretch if seeks else w[STRETCH, j]
-        w[LIMIT, j] = force if seeks else w[LIMIT, j]
-        w[END_NORMAL, j] = normal if seeks else w[END_NORMAL, j]
-        still = seeks and not found
-        w[SEEKS, j] = 1.0 if still else 0.0
-        seek += 1 if still else 0
-    return seek
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _arrive(w):  # type: ignore[no-untyped-def]
-    """Places and slips of the tips that slid; how many need another knot."""
-    stale = 0
-    for j in range(LANES):
-        # what was not found is done alone
-        end = _ALONE if w[SEEKS, j] > 0.0 else w[END_MODE, j]
-        slides = end == SLIDING
-        w[END_MODE, j] = end
-        to_x, to_y = w[TO_X, j], w[TO_Y, j]
-        x, y, slip = slid(
-            w[STRETCH, j], w[LIMIT, j], to_x - w[PLACE_X, j], to_y - w[PLACE_Y, j],
-            w[UNIT_X, j], w[UNIT_Y, j], w[REST_X, j], w[REST_Y, j],
-        )  # fmt: skip
-        wanted = knot_at(w[PATH, j] + slip)
-        w[END_X, j] = to_x - x if slides else w[END_X, j]
-        w[END_Y, j] = to_y - y if slides else w[END_Y, j]
-        w[SLIP, j] = slip if slides else 0.0
-        w[WANTED, j] = wanted
-        stale += 1 if slides and wanted != w[KNOT, j] else 0
-    return stale
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _pull(w, law):  # type: ignore[no-untyped-def]
-    """Forces of the tips that slid: on the cone of the way that is told, to the last bit."""
-    for j in range(LANES):
-        slides, slip = w[END_MODE, j] == SLIDING, w[SLIP, j]
-        grip, _ = grip_between(
-            w[PATH, j] + slip, w[KNOT, j], w[C0, j], w[C1, j], w[C2, j], w[C3, j]
-        )
-        grip, _ = strengthened(grip, 0.0, slip, w[QUICK, j], w[LAG, j], law)
-        limit = grip * w[END_NORMAL, j]
-        w[END_FORCE_X, j] = limit * w[UNIT_X, j] if slides else w[END_FORCE_X, j]
-        w[END_FORCE_Y, j] = limit * w[UNIT_Y, j] if slides else w[END_FORCE_Y, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

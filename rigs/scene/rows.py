@@ -29,19 +29,24 @@ TABLE = STATES
     KNOT, C0, C1, C2, C3, WANTED,
     # what becomes of the tip (`rigs.scene.tip.tip_step`)
     END_MODE, END_X, END_Y, END_FORCE_X, END_FORCE_Y, END_NORMAL, END_BENT, SLIP, SHARE, GAIN,
-    # of a tip that slides: `rigs.scene.sliding.slide_step`
+    # of a tip that seeks its bend (`rigs.scene.sliding`)
     LOW, HIGH, SEEKS, STRETCH, LIMIT, BEFORE, UNIT_X, UNIT_Y, REST_X, REST_Y,
-    QUICK, LAG, MISS, MISS_SLOPE, NEW_NORMAL, NORMAL_SLOPE, NEW_STRETCH, STRETCH_SLOPE, AHEAD, TURNS,
-    STRAIGHT, ASKEW, GRIP, GRIP_SLOPE, TOP, BOTTOM, WAY,
+    QUICK, LAG, MISS, MISS_SLOPE, NEW_NORMAL, NORMAL_SLOPE, NEW_STRETCH, STRETCH_SLOPE,
+    AHEAD, TURNS, STRAIGHT, ASKEW, GRIP, GRIP_SLOPE, TOP, BOTTOM, WAY,
 ) = range(STATES + CONSTANTS, STATES + CONSTANTS + 48)  # fmt: skip
 ROWS = STATES + CONSTANTS + 48
 
+ALONE = 3.0
+"""END_MODE of a tip that must be computed alone."""
 _AWAY_MM = 1e6
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def block_of(typing, flat):  # type: ignore[no-untyped-def]
-    """A block as (ROWS, LANES), whose shape the compiler knows: a reshaped array would hide it."""
+    """A block as (ROWS, LANES), whose shape the compiler knows: a reshaped array would hide it.
+
+    A view that does not keep the block alive, and so costs nothing.
+    """
     kind = types.Array(types.float64, 2, "C")
 
     def build(context, builder, signature, arguments):  # type: ignore[no-untyped-def]

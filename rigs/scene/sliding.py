@@ -1,8 +1,9 @@
 """The bend of a tip that slides: what its slip leaves of the stretch, with friction by the slip.
 
-One Newton step in three parts, shared by the tip that is computed alone and by those computed
-side by side, so that both give the same bits. No branches, for the latter. Where it does not get there, because
-friction has a kink at rest, `slid_surely` does, slowly.
+One Newton step in three parts, shared by the tip that is computed alone (`rigs.scene.tip`) and by
+those computed side by side (`rigs.scene.sliding_lanes`), so that both give the same bits. No
+branches, for the latter. Where it does not get there, because friction has a kink at rest,
+`slid_surely` does, slowly.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from rigs.scene.column import CLOSE, ITERATIONS, column
-from rigs.scene.friction import grip_at, grip_between, knot_at
+from rigs.scene.friction import grip_at
 from rigs.scene.smooth import logarithm
 from rigs.scene.turning import unit
 

@@ -34,7 +34,15 @@ from rigs.scene.rows import (
     TO_X,
     TO_Y,
 )
-from rigs.scene.sliding import TRIES, foreseen, slid, slid_surely, slide_step, strengthened, stretched
+from rigs.scene.sliding import (
+    TRIES,
+    foreseen,
+    slid,
+    slid_surely,
+    slide_step,
+    strengthened,
+    stretched,
+)
 from rigs.scene.springs import (
     ACROSS,
     ALONG,

@@ -1,5 +1,7 @@
 """Tips that are computed side by side against the same tips one at a time."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -135,7 +137,7 @@ def test_the_scenes_of_that_test_have_every_kind_of_step() -> None:
     springs = make_springs(
         ideal_skin(), friction_knots(ideal_skin(), MU, 0.3, 0.5, 1), **SWITCHES
     )  # fmt: skip
-    way = np.concatenate([line(a, b, 400) for a, b in zip(corners, corners[1:], strict=False)])
+    way = np.concatenate([line(a, b, 400) for a, b in itertools.pairwise(corners)])
     alone, together = both(springs, way, np.zeros(len(way)), 2e-3)
     assert np.array_equal(alone, together, equal_nan=True)
     modes = together[:, :, 14]
