@@ -17,7 +17,7 @@ from protocols.program import PlateAction
 from rigs.mock.faults import NEVER
 from rigs.mock.history import History
 from rigs.mock.settings import MockSettings
-from rigs.scene.contact import advance, record
+from rigs.scene.contact import advance
 from rigs.scene.friction import friction_knots
 from rigs.scene.plate import advance_free
 from rigs.scene.skin import Skin
@@ -174,10 +174,10 @@ class Physics:
     def keep_loads(self, now_ns: int) -> History:
         """Keep the forces of every row from the present on, until `loads` is let go."""
         self._catch_up(now_ns)
-        n = len(self.tips.state)
-        self.loads = History(3 * n)
+        tips = self.tips
+        self.loads = History(3 * len(tips.state))
         row = self.loads.grow(np.array([self.track.end_ns], np.int64))[0]
-        record(self.tips.state, 0.0, np.empty(track_width(n)), row)
+        row[:] = np.column_stack([tips.force, tips.normal]).ravel()
         return self.loads
 
     def tips_at(self, t_ns: I64) -> tuple[F64, F64]:

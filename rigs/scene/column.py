@@ -12,12 +12,12 @@ import numpy as np
 from numba import njit
 
 _LEAST_STIFFNESS = 0.05
-_ITERATIONS = 60
+ITERATIONS = 60
 CLOSE = 1e-7
 """A change of the bend, over the bend, after which Newton's next one would be rounding."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-untyped-def]
     """Tangential and normal force of a bent column, and their slopes over the bend.
 
@@ -35,28 +35,41 @@ def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-unt
     return stiffness * bent, normal, slope, normal_slope
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def first_bend(stretch, guess, bending, shortening, compliance):  # type: ignore[no-untyped-def]
+    """Where the search for a bend begins: its solution, if the papilla is not shortened."""
+    straight = stretch / (1.0 + compliance * bending)
+    return straight if shortening == 0.0 else min(guess, stretch)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def bend_step(bent, low, high, stretch, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+    """One guarded Newton step towards the bend at a stretch.
+
+    Returns:
+        the bend, the bracket round it, and whether that is it.
+    """
+    force, _, slope, _ = column(bent, bending, shortening, pressed, pressing)
+    miss = bent + compliance * force - stretch
+    found = abs(miss) <= 1e-14 * stretch
+    low, high = (low, bent) if miss > 0.0 else (bent, high)
+    after = bent - miss / (1.0 + compliance * slope)
+    after = after if low <= after <= high else 0.5 * (low + high)
+    near = abs(after - bent) <= CLOSE * stretch
+    return (bent if found else after), low, high, found or near
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
     """The bend of a papilla whose tip is `stretch` mm from under its base."""
-    if shortening == 0.0:
-        return stretch / (1.0 + compliance * bending)
     low, high = 0.0, stretch
-    bent = min(guess, stretch)
-    for _ in range(_ITERATIONS):
-        force, _, slope, _ = column(bent, bending, shortening, pressed, pressing)
-        miss = bent + compliance * force - stretch
-        if abs(miss) <= 1e-14 * stretch:
-            return bent
-        if miss > 0.0:
-            high = bent
-        else:
-            low = bent
-        change = -miss / (1.0 + compliance * slope)
-        if not low <= bent + change <= high:
-            change = 0.5 * (low + high) - bent
-        bent += change
-        if abs(change) <= CLOSE * stretch:
-            return bent
+    bent = first_bend(stretch, guess, bending, shortening, compliance)
+    for _ in range(ITERATIONS):
+        bent, low, high, found = bend_step(
+            bent, low, high, stretch, bending, shortening, compliance, pressed, pressing
+        )
+        if found:
+            break
     return bent
 
 

@@ -12,45 +12,33 @@ import numpy as np
 from numba import njit
 
 from rigs.scene.column import relaxing
-from rigs.scene.contact import move_tips, record, tip_step
-from rigs.scene.springs import FREE, GAP, LAYOUT_X, LAYOUT_Y
+from rigs.scene.contact import move_tips, record
+from rigs.scene.lanes import respond
+from rigs.scene.rows import END_FORCE_Y, LANES, block_of, gather, spread
 
 _ITERATIONS = 200
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pull(table, field, law, state, sensor, plate_y, h, decay, gain):  # type: ignore[no-untyped-def]
+def _pull(lanes, n, field, law, sensor, plate_y, h, decay, gain):  # type: ignore[no-untyped-def]
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N."""
     total = 0.0
-    for i in range(state.shape[0]):
-        lx, ly = table[i, LAYOUT_X], table[i, LAYOUT_Y]
-        deep = sensor[2] + sensor[3] * lx + sensor[4] * ly - table[i, GAP]
-        if deep <= 0.0:
-            continue
-        step = tip_step(
-            table,
-            field,
-            law,
-            state,
-            i,
-            sensor[0] + lx,
-            sensor[1] + ly - plate_y,
-            deep,
-            h,
-            decay,
-            gain,
-        )
-        if step[0] != FREE:
-            total += step[4]
+    for k in range(lanes.shape[0]):
+        first = k * LANES
+        count = min(n - first, LANES)
+        respond(lanes[k], field, law, first, count, sensor, plate_y, h, decay, gain)
+        w = block_of(lanes[k])
+        for j in range(count):
+            total += w[END_FORCE_Y, j]
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(table, field, law, state, sensor, motion, h, decay, gain, mass, weight, stiction):  # type: ignore[no-untyped-def]
+def _solve(lanes, n, field, law, sensor, motion, h, decay, gain, mass, weight, stiction):  # type: ignore[no-untyped-def]
     """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N."""
     inertia = mass * 1e-3 / h  # N per mm/s
     plate_y, speed = motion[0], motion[1]
-    rest = _pull(table, field, law, state, sensor, plate_y, h, decay, gain)
+    rest = _pull(lanes, n, field, law, sensor, plate_y, h, decay, gain)
     push = rest - weight + inertia * speed
     if abs(push) <= stiction:
         return 0.0
@@ -62,7 +50,7 @@ def _solve(table, field, law, state, sensor, motion, h, decay, gain, mass, weigh
     v = speed if min(zero, far) < speed < max(zero, far) else far
     for _ in range(_ITERATIONS):
         f = inertia * (v - speed) + weight + drag
-        f -= _pull(table, field, law, state, sensor, plate_y + v * h, h, decay, gain)
+        f -= _pull(lanes, n, field, law, sensor, plate_y + v * h, h, decay, gain)
         if f == 0.0:
             return v
         if (f > 0.0) == (f_zero > 0.0):
@@ -101,6 +89,7 @@ def advance_free(  # type: ignore[no-untyped-def]
     Returns:
         steps taken; less than m when the plate came to rest on its stop in the last of them.
     """
+    n, lanes = state.shape[0], spread(table, field, state)
     step_ns, h, decay, gain = np.int64(0), 0.0, 1.0, 1.0
     for k in range(sensor.shape[0]):
         if t_ns[k + 1] - t_ns[k] != step_ns:
@@ -108,15 +97,17 @@ def advance_free(  # type: ignore[no-untyped-def]
             h = step_ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
         speed = _solve(
-            table, field, law, state, sensor[k], motion, h, decay, gain, mass, weight[k], stiction
+            lanes, n, field, law, sensor[k], motion, h, decay, gain, mass, weight[k], stiction
         )
         height = motion[0] + speed * h
         landed = height <= stop
         if landed:
             height, speed = stop, 0.0
-        move_tips(table, field, law, state, sensor[k], height, t_ns[k] * 1e-9, h, decay, gain)
+        move_tips(lanes, n, field, law, sensor[k], height, t_ns[k] * 1e-9, h, decay, gain)
         motion[0], motion[1] = height, speed
-        record(state, height, track[k], load[k])
+        record(lanes, n, height, track[k], load[k])
         if landed:
+            gather(lanes, state)
             return k + 1
+    gather(lanes, state)
     return sensor.shape[0]

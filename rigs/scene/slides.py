@@ -6,6 +6,7 @@ exact at any step; its length only says how often forces are told.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,19 +62,19 @@ def run_slide(
     """Press straight in, hold still, slide; every motion at constant speed."""
     steps = max(round(length_mm / step_mm), 1)
     press_s, slide_s = depth_mm / press_mm_s, length_mm / speed_mm_s
-    seconds = np.concatenate([
-        np.linspace(0.0, press_s, PRESS_STEPS + 1),
-        press_s + settled_s * np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS,
-        press_s + settled_s + slide_s * np.arange(1, steps + 1) / steps,
-    ])  # fmt: skip
-    t_ns = np.rint(seconds * 1e9).astype(np.int64)
     first = PRESS_STEPS + HOLD_STEPS
+    share = np.arange(1, steps + 1) / steps
+    seconds = np.empty(first + steps + 1)
+    seconds[: PRESS_STEPS + 1] = np.arange(PRESS_STEPS + 1) * (press_s / PRESS_STEPS)
+    hold = settled_s * np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS
+    seconds[PRESS_STEPS + 1 : first + 1] = press_s + hold
+    seconds[first + 1 :] = press_s + settled_s + slide_s * share
+    t_ns = np.rint(seconds * 1e9).astype(np.int64)
     sensor = np.zeros((first + steps, 5))
     sensor[:, 2] = depth_mm
     sensor[:PRESS_STEPS, 2] = depth_mm * np.arange(1, PRESS_STEPS + 1) / PRESS_STEPS
-    angle = np.radians(direction_deg)
-    way = length_mm * np.arange(1, steps + 1) / steps
-    sensor[first:, 0], sensor[first:, 1] = way * np.cos(angle), way * np.sin(angle)
+    angle, way = math.radians(direction_deg), length_mm * share
+    sensor[first:, 0], sensor[first:, 1] = way * math.cos(angle), way * math.sin(angle)
     n = len(springs.table)
     track, loads = np.empty((len(sensor), track_width(n))), np.empty((len(sensor), 3 * n))
     advance(

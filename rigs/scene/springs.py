@@ -177,11 +177,12 @@ def make_springs(
     if level not in LEVELS:
         raise ValueError(f"level = {level}: must be one of {LEVELS}")
     rich = level == 3
-    shorter = SHORTENING / skin.height_mm if level >= 2 else np.zeros(len(skin))
-    columns = [
-        *skin.layout_mm.T, skin.gap_mm, skin.normal_n_per_mm, skin.bending_n_per_mm,
-        skin.compliance_mm_per_n, skin.tangential_n_per_mm, shorter,
-    ]  # fmt: skip
+    shorter = SHORTENING / skin.height_mm if level >= 2 else 0.0
+    table = np.empty((len(skin), 8))
+    table[:, LAYOUT_X : LAYOUT_Y + 1] = skin.layout_mm
+    table[:, GAP], table[:, ALONG] = skin.gap_mm, skin.normal_n_per_mm
+    table[:, BENDING], table[:, COMPLIANCE] = skin.bending_n_per_mm, skin.compliance_mm_per_n
+    table[:, ACROSS], table[:, SHORTER] = skin.tangential_n_per_mm, shorter
     law = Law(
         static_excess=float(static_excess) if rich else 0.0,
         strengthening=float(strengthening) if rich else 0.0,
@@ -191,7 +192,7 @@ def make_springs(
         damping_s=float(damping_s),
         exact_turns=exact_turns,
     )
-    return Springs(np.ascontiguousarray(np.stack(columns, axis=1)), friction_field(knots), law)
+    return Springs(table, friction_field(knots), law)
 
 
 def track_width(n: int) -> int:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rigs.scene.smooth import decayed, logarithm
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
@@ -25,41 +27,49 @@ def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
     return min(max(share, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def turned(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
-    """Direction of a sliding tip's force after the drive d: the tractrix.
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def dragged(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+    """How a sliding tip's force is dragged by the drive d, for `turned`.
 
-    `before`, `after`: the cone's radius at both ends. Returns a unit vector.
+    `before`, `after`: the cone's radius at both ends.
+
+    Returns:
+        direction of the drive; tan(theta / 2) as a quotient's numerator and denominator, theta
+        being the angle from the drive to the force; and the way over the radius (negative: the
+        force points along the drive at once).
     """
     size, drive = np.sqrt(fx * fx + fy * fy), np.sqrt(dx * dx + dy * dy)
-    if drive == 0.0:
-        return fx / size, fy / size
-    ux, uy = dx / drive, dy / drive
-    if size == 0.0:
-        return ux, uy
-    along, across = (fx * ux + fy * uy) / size, (ux * fy - uy * fx) / size
-    if abs(across) < 1e-300 or after <= 0.0:
-        return (fx / size, fy / size) if after > 0.0 else (ux, uy)
+    per_size, per_drive = 1.0 / size, 1.0 / drive
+    ux, uy = (dx * per_drive, dy * per_drive) if drive > 0.0 else (fx * per_size, fy * per_size)
+    from_x, from_y = (fx * per_size, fy * per_size) if size > 0.0 else (ux, uy)
+    along, across = from_x * ux + from_y * uy, ux * from_y - uy * from_x
+    # the way over the logarithmic mean of the radii; near 1 the series of ratio / log(1 + ratio),
+    # else the logarithm, with what 1 + ratio rounds away
     ratio = after / before - 1.0
-    if abs(ratio) < 1e-3:  # the series of ratio / log(1 + ratio)
-        mean = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
-    else:
-        mean = (after - before) / np.log1p(ratio)
+    series = before * (1.0 + ratio * (0.5 - ratio * (1.0 / 12.0 - ratio * (1.0 / 24.0))))
+    whole = 1.0 + ratio
+    log = logarithm(whole) + (ratio - (whole - 1.0))
+    even = abs(ratio) < 1e-3
+    way = (drive if even else drive * log) / (series if even else after - before)
+    way = way if after > 0.0 and before > 0.0 else -1.0
     # along < 0 beyond a right angle: 1 + along cancels there
-    half = across / (1.0 + along) if along > 0.0 else (1.0 - along) / across
-    way = drive / mean
-    if way < 0.01:  # the series of exp(-way)
-        half *= 1.0 - way * (
-            1.0 - way * (0.5 - way * (1.0 / 6.0 - way * (1.0 / 24.0 - way / 120.0)))
-        )
-    else:
-        half *= np.exp(-way)
-    square = half * half
-    cosine, sine = (1.0 - square) / (1.0 + square), 2.0 * half / (1.0 + square)
-    return cosine * ux - sine * uy, sine * ux + cosine * uy
+    high, low = (across, 1.0 + along) if along > 0.0 else (1.0 - along, across)
+    return ux, uy, high, low, way
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def turned(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
+    """Direction of a sliding tip's force after the drive: the tractrix. A unit vector."""
+    # straight against the drive it stays so
+    high *= decayed(max(way, 0.0)) if low != 0.0 else 1.0
+    high = high if way >= 0.0 else 0.0
+    scale = 1.0 / (low * low + high * high)
+    cosine, sine = (low * low - high * high) * scale, 2.0 * high * low * scale
+    x, y = cosine * ux - sine * uy, sine * ux + cosine * uy
+    return (x, y) if way >= 0.0 else (ux, uy)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def unit(x, y):  # type: ignore[no-untyped-def]
     """The direction of a vector; x for none."""
     size = np.sqrt(x * x + y * y)

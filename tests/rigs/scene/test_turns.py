@@ -106,6 +106,24 @@ def test_projection_is_of_first_order_on_a_turn() -> None:
     assert orders == pytest.approx([1.0, 1.0], abs=0.1)
 
 
+def test_a_hair_of_a_difference_stays_one_where_the_direction_turned() -> None:
+    # a search for the slip that stops too early feeds back through the speed of the next step
+    skin = ideal_skin()
+    springs = make_springs(
+        skin, friction_knots(skin, MU, 0.05, 0.5, 1), static_excess=0.03, strengthening=0.01,
+        relaxation_share=0.2,
+    )  # fmt: skip
+    forces, paths = [], []
+    for hair in (0.0, 1e-12):
+        tips = pressed(springs)
+        run(springs, tips, line((0, 0, 2.8), (8 + hair, 0, 2.8), 4000), h=2e-3)
+        _, load = run(springs, tips, line((8 + hair, 0, 2.8), (12, 5, 2.8), 3000), h=2e-3)
+        forces.append(load[:, :, :2])
+        paths.append(tips.path.copy())
+    assert forces[0] == pytest.approx(forces[1], abs=1e-10)
+    assert paths[0] == pytest.approx(paths[1], abs=1e-10)
+
+
 def rich_springs(level: int) -> Springs:
     return springs_of(
         ideal_skin(), level, relaxation_share=0.2, static_excess=0.03, strengthening=0.01

@@ -1,0 +1,259 @@
+"""What becomes of one tip in one step, whatever happens to it: touching, sticking, slipping.
+
+A spring in series with a Coulomb slider is the least that shows incipient slip: tips with little
+normal force let go first, so slip runs from the outer layer to the centre by itself. The update
+is a return mapping (Simo and Hughes, Computational Inelasticity, 1998, ch. 1): assume that the
+tip sticks; if its force left the friction cone, find the slip that puts it back onto the cone.
+That is stable at any step and stiffness, does not creep, and is exact on straight paths.
+
+Columns are in `rigs.scene.column`, turns in `rigs.scene.turning`, the slip in
+`rigs.scene.sliding`. This is the law in full; `rigs.scene.lanes` has its two frequent cases for
+many tips at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from rigs.scene.column import ITERATIONS, bend_for, column, relaxing
+from rigs.scene.friction import grip_at
+from rigs.scene.rows import (
+    DEEP,
+    END_BENT,
+    END_FORCE_X,
+    END_FORCE_Y,
+    END_MODE,
+    END_NORMAL,
+    END_X,
+    END_Y,
+    GAIN,
+    SHARE,
+    SLIP,
+    TABLE,
+    TO_X,
+    TO_Y,
+)
+from rigs.scene.sliding import (
+    TRIES,
+    foreseen,
+    slid,
+    slid_surely,
+    slide_step,
+    strengthened,
+    stretched,
+)
+from rigs.scene.springs import (
+    ACROSS,
+    ALONG,
+    BASE_X,
+    BASE_Y,
+    BENDING,
+    BENT,
+    BRANCH_X,
+    BRANCH_Y,
+    COMPLIANCE,
+    EARLIER,
+    FORCE_X,
+    FORCE_Y,
+    FREE,
+    INDENTATION,
+    MODE,
+    NORMAL,
+    NORMAL_BRANCH,
+    PATH,
+    PLACE_X,
+    PLACE_Y,
+    SHORTER,
+    SLID_S,
+    SLIDING,
+    SPEED,
+    STUCK,
+)
+from rigs.scene.turning import dragged, leaves_at, turned
+
+ROUNDING = 1.0 + 1e-13
+"""A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _excess(share, w, law, j, limit, new_x, new_y, h):  # type: ignore[no-untyped-def]
+    """Force less `limit` times normal force of a tip that has stuck up to a share of a step, N."""
+    decay, gain = relaxing(max(share * h, 1e-12), law.relaxation_s)
+    old_x = w[BASE_X, j] - w[PLACE_X, j]
+    old_y = w[BASE_Y, j] - w[PLACE_Y, j]
+    move_x, move_y = share * (new_x - old_x), share * (new_y - old_y)
+    x, y = old_x + move_x, old_y + move_y
+    along, was = w[TABLE + ALONG, j], w[INDENTATION, j]
+    bending, shortening = w[TABLE + BENDING, j], w[TABLE + SHORTER, j]
+    sunk = share * (w[DEEP, j] - was)
+    pressed = (
+        along * (was + sunk) + w[NORMAL_BRANCH, j] * decay + law.maxwell * along * gain * sunk
+    )  # fmt: skip
+    stretch = np.sqrt(x * x + y * y)
+    bent = bend_for(
+        stretch, w[BENT, j], bending, shortening, w[TABLE + COMPLIANCE, j], pressed, along
+    )
+    force, normal, _, _ = column(bent, bending, shortening, pressed, along)
+    secant = force / stretch if stretch > 0.0 else 0.0
+    # what damps is proportional to the speed, and that is constant
+    soft = w[TABLE + ACROSS, j] * (law.maxwell * gain + law.damping_s / max(share * h, 1e-12))
+    fx = secant * x + w[BRANCH_X, j] * decay + soft * move_x
+    fy = secant * y + w[BRANCH_Y, j] * decay + soft * move_y
+    return np.sqrt(fx * fx + fy * fy) - limit * normal
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lets_go_at(guess, w, law, j, limit, new_x, new_y, h):  # type: ignore[no-untyped-def]
+    """Share of a step at which a stuck tip's force meets its cone: a root of the law itself.
+
+    While a tip sticks its force is a known function of time, relaxation included, so that the
+    slip is located exactly in steps of any length (regula falsi, Illinois).
+    """
+    low, high = 0.0, 1.0
+    below = _excess(low, w, law, j, limit, new_x, new_y, h)
+    above = _excess(high, w, law, j, limit, new_x, new_y, h)
+    if below >= 0.0 or above <= 0.0:
+        return guess
+    share, side = guess, 0
+    for _ in range(ITERATIONS):
+        if not low < share < high:
+            share = 0.5 * (low + high)
+        miss = _excess(share, w, law, j, limit, new_x, new_y, h)
+        if miss > 0.0:
+            high, above = share, miss
+            below = 0.5 * below if side == 1 else below
+            side = 1
+        else:
+            low, below = share, miss
+            above = 0.5 * above if side == -1 else above
+            side = -1
+        if high - low < 1e-12 or abs(miss) < 1e-16:
+            break
+        share = (low * above - high * below) / (above - below)
+    return share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _end(w, j, mode, x, y, force_x, force_y, normal, bent, slip, share, gain):  # type: ignore[no-untyped-def]
+    w[END_MODE, j], w[END_X, j], w[END_Y, j] = mode, x, y
+    w[END_FORCE_X, j], w[END_FORCE_Y, j], w[END_NORMAL, j] = force_x, force_y, normal
+    w[END_BENT, j], w[SLIP, j], w[SHARE, j], w[GAIN, j] = bent, slip, share, gain
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-def]
+    """Where tip `i` in lane `j` is after its base moved linearly within `h` seconds.
+
+    `decay` and `gain` are the relaxing branch's exact factors for linear motion over `h`. What
+    is read: the state, TO_X, TO_Y and DEEP. What is written: END_MODE to GAIN, that is mode,
+    place, force, normal force, bend, slip (mm), the share of the step at which the tip went
+    from stick to slip (negative if it did not), and the gain since it touched.
+    """
+    base_x, base_y, deep = w[TO_X, j], w[TO_Y, j], w[DEEP, j]
+    along, bending = w[TABLE + ALONG, j], w[TABLE + BENDING, j]
+    shortening, compliance = w[TABLE + SHORTER, j], w[TABLE + COMPLIANCE, j]
+    maxwell = law.maxwell
+    was, touched = w[INDENTATION, j], 0.0
+    if w[MODE, j] == FREE and deep > 0.0:
+        touched = was / (was - deep) if was < 0.0 else 1.0
+        if was < 0.0:
+            gain = relaxing((1.0 - touched) * h, law.relaxation_s)[1]
+    pressed = (
+        along * deep + w[NORMAL_BRANCH, j] * decay
+        + maxwell * along * gain * (deep - (was if was > 0.0 else 0.0))
+    )  # fmt: skip
+    if deep <= 0.0 or pressed <= 0.0:
+        # clear of the plate, or the skin comes back more slowly than the sensor
+        _end(w, j, FREE, base_x, base_y, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, gain)
+        return
+    mode, place_x, place_y = w[MODE, j], w[PLACE_X, j], w[PLACE_Y, j]
+    old_x, old_y = w[BASE_X, j] - place_x, w[BASE_Y, j] - place_y
+    if mode == FREE:
+        # the tip stands under its base when it touches, on the way there in this step
+        place_x = w[BASE_X, j] + touched * (base_x - w[BASE_X, j]) if was < 0.0 else base_x
+        place_y = w[BASE_Y, j] + touched * (base_y - w[BASE_Y, j]) if was < 0.0 else base_y
+        old_x, old_y = 0.0, 0.0
+    new_x, new_y = base_x - place_x, base_y - place_y
+    branch_x, branch_y = w[BRANCH_X, j] * decay, w[BRANCH_Y, j] * decay
+    soft = w[TABLE + ACROSS, j] * (maxwell * gain + law.damping_s / h)
+    stretch = np.sqrt(new_x * new_x + new_y * new_y)
+    bent = bend_for(stretch, w[BENT, j], bending, shortening, compliance, pressed, along)
+    force, normal, _, _ = column(bent, bending, shortening, pressed, along)
+    secant = force / stretch if stretch > 0.0 else 0.0
+    trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
+    trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
+    path = w[PATH, j]
+    grip, _ = grip_at(field, i, path)
+    from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
+    drive_x, drive_y = trial_x - from_x, trial_y - from_y
+    static, before = 1.0 + law.static_excess, grip * w[NORMAL, j]
+    # a sliding tip slides on if the drive takes its force outwards faster than the cone grows
+    outwards = from_x * drive_x + from_y * drive_y
+    keeps_on = mode == SLIDING and outwards >= before * (grip * normal - before)
+    limit = grip * normal * (1.0 if keeps_on else static)
+    size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
+    if size <= limit * ROUNDING:
+        _end(w, j, STUCK, place_x, place_y, trial_x, trial_y, normal, bent, 0.0, -1.0, gain)
+        return
+    share, left = -1.0, 1.0
+    if not keeps_on:
+        share = leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
+        if mode == STUCK and w[INDENTATION, j] > 0.0 and 0.0 < share < 1.0:
+            share = _lets_go_at(share, w, law, j, static * grip, new_x, new_y, h)
+        left = 1.0 - share
+        from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
+        before += share * (grip * normal - before)
+        share = touched + (1.0 - touched) * share
+    if law.exact_turns:
+        ux, uy, top, bottom, way = dragged(
+            from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
+        )
+        unit_x, unit_y = turned(ux, uy, top, bottom, way)
+    else:
+        unit_x, unit_y = trial_x / size, trial_y / size
+    # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
+    # left by a bend decides on the coefficient of friction, and so on F
+    rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
+    slid_s = left * (1.0 - touched) * h
+    quick, lag, slides = 0.0, 0.0, -1.0
+    if slid_s > 0.0:
+        earlier_s = w[SLID_S, j] if keeps_on else 0.0
+        quick, lag, slides = foreseen(slid_s, 1.0 / slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
+    moved = (new_x - old_x) * unit_x + (new_y - old_y) * unit_y
+    guess = w[BENT, j]
+    _, _, slope, _ = column(guess, bending, shortening, pressed, along)
+    guess += (moved - slides) / (1.0 + compliance * slope) if slides >= 0.0 else 0.0
+    high = bent
+    bent = min(max(guess, 0.0), high)
+    first, found = np.sqrt(from_x * from_x + from_y * from_y), False
+    force, stretch, tried = first, 0.0, 0
+    while not found and tried < TRIES:
+        (
+            miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead, turns, slip,
+            straight, askew,
+        ) = stretched(
+            bent, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
+            bending, shortening, compliance,
+        )  # fmt: skip
+        grip, grip_slope = grip_at(field, i, path + slip)
+        grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
+        bent, force, stretch, normal, found = slide_step(
+            bent, high, force, miss, miss_slope, normal, normal_slope, stretch, stretch_slope,
+            ahead, turns, straight, askew, grip, grip_slope,
+        )  # fmt: skip
+        tried += 1
+    if not found:
+        bent, force, stretch, normal = slid_surely(
+            high, first, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
+            bending, shortening, compliance, field, i, path, quick, lag, law,
+        )  # fmt: skip
+    x, y, slip = slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
+    # the force lies on the cone of the way that is told, to the last bit
+    grip, _ = grip_at(field, i, path + slip)
+    grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
+    limit = grip * normal
+    _end(
+        w, j, SLIDING, base_x - x, base_y - y, limit * unit_x, limit * unit_y, normal, bent, slip,
+        share, gain,
+    )  # fmt: skip

@@ -1,0 +1,172 @@
+"""Tips that are computed side by side against the same tips one at a time."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+
+from rigs.scene.column import relaxing
+from rigs.scene.friction import friction_knots
+from rigs.scene.lanes import respond, settle
+from rigs.scene.rows import DEEP, LANES, ROWS, TABLE, TO_X, TO_Y, block_of, gather, spread
+from rigs.scene.skin import SkinGeometry, make_skin
+from rigs.scene.springs import (
+    FREE,
+    GAP,
+    LAYOUT_X,
+    LAYOUT_Y,
+    SLIDING,
+    STUCK,
+    Springs,
+    make_springs,
+    new_tips,
+)
+from rigs.scene.tip import tip_step
+from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
+
+SWITCHES = {
+    "static_excess": 0.03,
+    "strengthening": 0.01,
+    "relaxation_share": 0.2,
+    "damping_s": 0.01,
+}
+
+
+@njit
+def steps_one_by_one(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
+    """The state after each row, (m, n, 18), if every tip takes every step alone."""
+    n, lanes = state.shape[0], spread(table, field, state)
+    decay, gain = relaxing(h, law.relaxation_s)
+    states = np.empty((sensor.shape[0], *state.shape))
+    for k in range(sensor.shape[0]):
+        at = sensor[k]
+        for b in range(lanes.shape[0]):
+            # places and depths of all lanes, idle ones included
+            respond(
+                lanes[b], field, law, b * LANES, 0, at, plate_y[k], h, decay, gain
+            )  # fmt: skip
+            w = block_of(lanes[b])
+            for j in range(min(n - b * LANES, LANES)):
+                lx, ly = w[TABLE + LAYOUT_X, j], w[TABLE + LAYOUT_Y, j]
+                w[TO_X, j], w[TO_Y, j] = at[0] + lx, at[1] + ly - plate_y[k]
+                w[DEEP, j] = at[2] + at[3] * lx + at[4] * ly - w[TABLE + GAP, j]
+                tip_step(w, field, law, b * LANES + j, j, h, decay, gain)
+            settle(lanes[b], law, k * h, h, decay)
+        gather(lanes, state)
+        states[k] = state
+    return states
+
+
+@njit
+def steps_side_by_side(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
+    """The same in lanes."""
+    n, lanes = state.shape[0], spread(table, field, state)
+    decay, gain = relaxing(h, law.relaxation_s)
+    states = np.empty((sensor.shape[0], *state.shape))
+    for k in range(sensor.shape[0]):
+        for b in range(lanes.shape[0]):
+            respond(
+                lanes[b], field, law, b * LANES, min(n - b * LANES, LANES), sensor[k],
+                plate_y[k], h, decay, gain,
+            )  # fmt: skip
+            settle(lanes[b], law, k * h, h, decay)
+        gather(lanes, state)
+        states[k] = state
+    return states
+
+
+def both(
+    springs: Springs, sensor: np.ndarray, plate_y: np.ndarray, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    full = np.zeros((len(sensor), 5))
+    full[:, : sensor.shape[1]] = sensor
+    arguments = springs.table, springs.friction, springs.law
+    n = len(springs.table)
+    return (
+        steps_one_by_one(*arguments, new_tips(n).state, full, plate_y, h),
+        steps_side_by_side(*arguments, new_tips(n).state, full, plate_y, h),
+    )
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    seed=st.integers(0, 500),
+    level=st.sampled_from([1, 2, 3]),
+    off=st.sampled_from([None, *SWITCHES]),
+    exact_turns=st.booleans(),
+    variation=st.sampled_from([0.0, 0.05, 0.3]),
+    # touching, letting go, turns back and sideways, lifting off, tilts, and the plate as well
+    waypoints=st.lists(
+        st.tuples(
+            st.floats(-8, 8), st.floats(-8, 8), st.floats(-0.3, 3.6),
+            st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-3, 3),
+        ),
+        min_size=2, max_size=6,
+    ),
+    steps=st.sampled_from([1, 7, 60, 400]),
+    h=st.sampled_from([1e-4, 2e-3, 0.1]),
+)  # fmt: skip
+def test_side_by_side_gives_the_bits_of_one_by_one(
+    seed: int,
+    level: int,
+    off: str | None,
+    exact_turns: bool,
+    variation: float,
+    waypoints: list[tuple[float, ...]],
+    steps: int,
+    h: float,
+) -> None:
+    skin = make_skin(SkinGeometry(height_scatter_mm=0.08, friction_scatter=0.05), seed)
+    options = {name: value for name, value in SWITCHES.items() if name != off}
+    springs = make_springs(
+        skin, friction_knots(skin, MU, variation, 0.5, seed), level, exact_turns=exact_turns,
+        **options,
+    )  # fmt: skip
+    corners = [(0.0,) * 6, *waypoints]
+    way = np.concatenate([line(a, b, steps) for a, b in zip(corners, waypoints, strict=False)])
+    alone, together = both(springs, way[:, :5], way[:, 5], h)
+    assert np.array_equal(alone, together, equal_nan=True)
+    assert np.all(np.isfinite(np.delete(together, np.s_[13], axis=2)))
+
+
+def test_the_scenes_of_that_test_have_every_kind_of_step() -> None:
+    corners = [(0, 0, -0.3), (0, 0, 3.2), (6, 0, 3.2), (6, 5, 2.0), (4, 1, 3.4), (4, 1, 0.2)]
+    springs = make_springs(
+        ideal_skin(), friction_knots(ideal_skin(), MU, 0.3, 0.5, 1), **SWITCHES
+    )  # fmt: skip
+    way = np.concatenate([line(a, b, 400) for a, b in itertools.pairwise(corners)])
+    alone, together = both(springs, way, np.zeros(len(way)), 2e-3)
+    assert np.array_equal(alone, together, equal_nan=True)
+    modes = together[:, :, 14]
+    kinds = {(a, b) for a, b in zip(modes[:-1].ravel(), modes[1:].ravel(), strict=True)}
+    assert kinds >= {
+        (FREE, FREE), (FREE, STUCK), (STUCK, STUCK), (STUCK, SLIDING), (SLIDING, SLIDING),
+        (SLIDING, STUCK), (SLIDING, FREE),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("counts", [(1,), (1, 6), (1, 6, 12, 18), (4, 6, 12, 18)])
+def test_any_number_of_tips_is_as_good(counts: tuple[int, ...]) -> None:
+    heights = tuple(10.1 - 0.6 * k for k in range(len(counts)))
+    skin = make_skin(SkinGeometry(ring_counts=counts, heights_mm=heights), 1)
+    springs = springs_of(skin, **SWITCHES)
+    way = np.concatenate([line((0, 0, 0), (0, 0, 3), 50), line((0, 0, 3), (5, 3, 3), 200)])
+    alone, together = both(springs, way, np.zeros(len(way)), 2e-3)
+    assert np.array_equal(alone, together, equal_nan=True)
+    tips = new_tips(len(skin))
+    run(springs, tips, way, h=2e-3)
+    assert np.array_equal(np.delete(tips.state, 13, 1), np.delete(together[-1], 13, 1))
+
+
+def test_the_block_is_what_the_kernels_take_it_for() -> None:
+    springs = springs_of(ideal_skin())
+    tips = new_tips(19)
+    tips.state[:, :] = np.arange(19 * 18).reshape(19, 18)
+    lanes = spread(springs.table, springs.friction, tips.state)
+    assert lanes.shape == (1, ROWS * LANES)
+    again = new_tips(19)
+    gather(lanes, again.state)
+    assert np.array_equal(again.state, tips.state)
