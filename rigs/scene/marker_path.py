@@ -42,8 +42,20 @@ def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def largest(bits, begin, end):  # type: ignore[no-untyped-def]
+    """The largest of numbers not below 0, given by their bits: integers have a vector maximum."""
+    most = np.int64(0)
+    for k in range(begin, end):
+        most = max(most, bits[k])
+    return most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
     """Whether marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
+    for c in range(3):
+        if path[i, c, begin] != path[i, c, stop]:
+            return False
     moves = 0
     for c in range(3):
         for k in range(begin, stop):
@@ -90,11 +102,22 @@ def nearest_row(k, first, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _slope(place, k, first, last, weights, w):  # type: ignore[no-untyped-def]
+    """Slope of a coordinate at row k of a block, by its weights in column w."""
+    # differences: of what stands still, the slope is 0 to the bit
+    here, low = place[k], nearest_row(k, first, last)
+    slope = 0.0
+    for j in range(min(last - first + 1, 4)):
+        slope += weights[j, w] * (place[low + j] - here)
+    return slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):  # type: ignore[no-untyped-def]
     """Marker i as cubics between the rows of one block.
 
     Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
-    is c0 + tau (c1 + s (c2 + s c3)), px; a row of `curve` has these of column, row and radius.
+    is c0 + tau (c1 + s (c2 + s c3)), px; a column of `curve` has these of column, row and radius.
 
     Args:
         path: column, row and radius of each marker, (n, 3, m).
@@ -102,59 +125,65 @@ def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):
         first, last: the block's first and last row.
         chord: join rows by straight lines.
         shift, inverse, weights: of `slope_weights`.
-        curve: (r, 12), written for steps `first` to `last` - 1; the places also at `last`.
+        curve: (12, r), written for steps `first` to `last` - 1; the places also at `last`.
     """
-    points = min(last - first + 1, 4)
+    n = last - first
+    w = first + shift
+    before, after, far = weights[0, w : w + n], weights[2, w : w + n], weights[3, w : w + n]
+    per_step = inverse[first:last]
     for c in range(3):
-        for k in range(first, last + 1):
-            curve[k, 4 * c] = path[i, c, row + k - first]
-        for k in range(first, last + 1):
-            # differences: of what stands still, the slope is 0 to the bit
-            here, low, w = curve[k, 4 * c], nearest_row(k, first, last), k + shift
-            slope = weights[0, w] * (curve[low, 4 * c] - here)
-            slope += weights[1, w] * (curve[low + 1, 4 * c] - here)
-            if points > 2:
-                slope += weights[2, w] * (curve[low + 2, 4 * c] - here)
-            if points > 3:
-                slope += weights[3, w] * (curve[low + 3, 4 * c] - here)
-            curve[k, 4 * c + 1] = slope
-        for k in range(first, last):
-            rate = (curve[k + 1, 4 * c] - curve[k, 4 * c]) * inverse[k]
-            if chord:
-                curve[k, 4 * c + 1], curve[k, 4 * c + 2], curve[k, 4 * c + 3] = rate, 0.0, 0.0
-            else:
-                slope, after = curve[k, 4 * c + 1], curve[k + 1, 4 * c + 1]
-                curve[k, 4 * c + 2] = 3.0 * rate - 2.0 * slope - after
-                curve[k, 4 * c + 3] = slope + after - 2.0 * rate
+        place = curve[4 * c, first : last + 1]
+        slope, bend, twist = (
+            curve[4 * c + 1, first:last], curve[4 * c + 2, first:last], curve[4 * c + 3, first:last]
+        )  # fmt: skip
+        place[:] = path[i, c, row : row + n + 1]
+        if chord:
+            for k in range(n):
+                slope[k], bend[k], twist[k] = (place[k + 1] - place[k]) * per_step[k], 0.0, 0.0
+            continue
+        slope[0] = _slope(place, 0, 0, n, weights, w)
+        for k in range(1, n - 1):
+            here = place[k]
+            slope[k] = (
+                before[k] * (place[k - 1] - here) + after[k] * (place[k + 1] - here)
+                + far[k] * (place[k + 2] - here)
+            )  # fmt: skip
+        if n > 1:
+            slope[n - 1] = _slope(place, n - 1, 0, n, weights, w + n - 1)
+        for k in range(n - 1):
+            rate, own, next_one = (place[k + 1] - place[k]) * per_step[k], slope[k], slope[k + 1]
+            bend[k] = 3.0 * rate - 2.0 * own - next_one
+            twist[k] = own + next_one - 2.0 * rate
+        rate, own = (place[n] - place[n - 1]) * per_step[n - 1], slope[n - 1]
+        final = _slope(place, n, 0, n, weights, w + n)
+        bend[n - 1], twist[n - 1] = 3.0 * rate - 2.0 * own - final, own + final - 2.0 * rate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-untyped-def]
-    """Bounds of a block's rates as a tree, and how far the marker goes in it.
+def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
+    """Bounds of a block's rates as a tree.
 
     A step's rates stay between the control points of the derivative as a Bezier curve. Node 1
-    holds for the whole block; below node j are 2 j and 2 j + 1; leaves begin at `size`.
+    holds for the whole block; below node j are 2 j and 2 j + 1; the
+    leaves are a power of two.
 
     Args:
-        first, last: the block's first and last row in `t`.
-        size: leaves, a power of two, not less than the steps.
+        first, last: the block's first and last row.
         base: where the tree's node 0 is.
         tree: (nodes, 7): lowest rates of column, row and radius, the highest ones, px/ns, and the
             fastest speed of the centre; written.
-
-    Returns:
-        the lengths of the ways of column, row and radius, at most and together, px.
     """
-    whole = 0.0
+    size = 1
+    while size < last - first:
+        size *= 2
     leaves = base + size - first
     for c in range(3):
         for k in range(first, last):
-            begin = curve[k, 4 * c + 1]
-            middle = begin + curve[k, 4 * c + 2]
-            end = middle + curve[k, 4 * c + 2] + 3.0 * curve[k, 4 * c + 3]
-            low, high = min(begin, min(middle, end)), max(begin, max(middle, end))
-            tree[leaves + k, c], tree[leaves + k, 3 + c] = low, high
-            whole += max(high, -low) * (t[k + 1] - t[k])
+            begin = curve[4 * c + 1, k]
+            middle = begin + curve[4 * c + 2, k]
+            end = middle + curve[4 * c + 2, k] + 3.0 * curve[4 * c + 3, k]
+            tree[leaves + k, c] = min(begin, min(middle, end))
+            tree[leaves + k, 3 + c] = max(begin, max(middle, end))
         for k in range(last, first + size):
             tree[leaves + k, c], tree[leaves + k, 3 + c] = np.inf, -np.inf
         for j in range(size - 1, 0, -1):
@@ -164,32 +193,71 @@ def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-unt
     for j in range(base + 1, base + 2 * size):
         x, y = max(tree[j, 3], -tree[j, 0]), max(tree[j, 4], -tree[j, 1])
         tree[j, 6] = np.sqrt(x * x + y * y)
-    return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def excursion(t, curve, first, last):  # type: ignore[no-untyped-def]
-    """How far a marker strays between two rows, px: (from its start, from the chord to its end).
+def off_chord(t, curve, first, last, spread):  # type: ignore[no-untyped-def]
+    """How far a marker strays at most from the chord between two rows, px; growth counts.
 
-    The control points of its cubics hold the path, and distances from a point or from a segment
-    are convex, so the farthest control point bounds them. Growth counts like a move.
+    The rows' distances from the chord, and how far a cubic is from the line between its rows: that
+    is h s (1 - s) (c2 + c3 (1 + s)).
+
+    Args:
+        spread: scratch, (4, at least the rows).
     """
-    x, y, r = curve[first, 0], curve[first, 4], curve[first, 8]
-    dx, dy, dr = curve[last, 0] - x, curve[last, 4] - y, curve[last, 8] - r
+    n = last - first
+    x, y, r = curve[0, first], curve[4, first], curve[8, first]
+    dx, dy, dr = curve[0, last] - x, curve[4, last] - y, curve[8, last] - r
     square = dx * dx + dy * dy + dr * dr
     scale = 1.0 / square if square > 0.0 else 0.0
-    far, far_r = dx * dx + dy * dy, abs(dr)
-    off, off_r = 0.0, 0.0
-    for k in range(first, last):
-        third = (t[k + 1] - t[k]) / 3.0
-        for j in range(3):
-            # the control points of step k: its first one, and the two between its ends
-            a, b = third * j, third * (j == 2)
-            px = curve[k, 0] + a * curve[k, 1] + b * curve[k, 2] - x
-            py = curve[k, 4] + a * curve[k, 5] + b * curve[k, 6] - y
-            pr = curve[k, 8] + a * curve[k, 9] + b * curve[k, 10] - r
-            far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
-            s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
-            ex, ey = px - s * dx, py - s * dy
-            off, off_r = max(off, ex * ex + ey * ey), max(off_r, abs(pr - s * dr))
-    return np.sqrt(far) + far_r, np.sqrt(off) + off_r
+    px, py, pr = curve[0, first:last], curve[4, first:last], curve[8, first:last]
+    bx, by, br = curve[2, first:last], curve[6, first:last], curve[10, first:last]
+    cx, cy, cr = curve[3, first:last], curve[7, first:last], curve[11, first:last]
+    begin, end = t[first:last], t[first + 1 : last + 1]
+    far, far_r, arch, arch_r = spread[0], spread[1], spread[2], spread[3]
+    for k in range(n):
+        gx, gy, gr = px[k] - x, py[k] - y, pr[k] - r
+        s = min(max((gx * dx + gy * dy + gr * dr) * scale, 0.0), 1.0)
+        gx, gy = gx - s * dx, gy - s * dy
+        far[k] = gx * gx + gy * gy
+        far_r[k] = abs(gr - s * dr)
+    for k in range(n):
+        quarter = 0.25 * (end[k] - begin[k])
+        ex, ey, er = bx[k] + cx[k], by[k] + cy[k], br[k] + cr[k]
+        ex, ey = max(abs(ex), abs(ex + cx[k])), max(abs(ey), abs(ey + cy[k]))
+        arch[k] = quarter * quarter * (ex * ex + ey * ey)
+        arch_r[k] = quarter * max(abs(er), abs(er + cr[k]))
+    bits = spread.view(np.int64)
+    for c in range(4):
+        bits[c, 0] = largest(bits[c], 0, n)
+    return np.sqrt(far[0]) + far_r[0] + np.sqrt(arch[0]) + arch_r[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def excursion(curve, first, blocks, stray):  # type: ignore[no-untyped-def]
+    """How far a marker strays in some blocks, px: (from its start, from the chord to its end).
+
+    Distances from a point or from a segment are convex, so that on a block's chord they are largest
+    at an end. Growth counts like a move.
+
+    Args:
+        first: first row of each block, and the last row of all.
+        stray: of each block, see `off_chord`.
+    """
+    begin, end = first[0], first[blocks]
+    x, y, r = curve[0, begin], curve[4, begin], curve[8, begin]
+    dx, dy, dr = curve[0, end] - x, curve[4, end] - y, curve[8, end] - r
+    square = dx * dx + dy * dy + dr * dr
+    scale = 1.0 / square if square > 0.0 else 0.0
+    far, off, before, before_off = 0.0, 0.0, 0.0, 0.0
+    for block in range(blocks):
+        k = first[block + 1]
+        px, py, pr = curve[0, k] - x, curve[4, k] - y, curve[8, k] - r
+        after = np.sqrt(px * px + py * py) + abs(pr)
+        s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
+        ex, ey = px - s * dx, py - s * dy
+        after_off = np.sqrt(ex * ex + ey * ey) + abs(pr - s * dr)
+        far = max(far, max(before, after) + stray[block])
+        off = max(off, max(before_off, after_off) + stray[block])
+        before, before_off = after, after_off
+    return far, off

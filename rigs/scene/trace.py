@@ -10,18 +10,21 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.crossings import events_of_pixels
 from rigs.scene.edges import CUT, widen
+from rigs.scene.lanes import PIXEL_FIELDS, STRIDE
 from rigs.scene.marker_path import (
-    bound_rates,
     excursion,
     fit_block,
     markers_in_image,
+    off_chord,
     slope_weights,
     stands_still,
 )
 from rigs.scene.noise import noise_events
+from rigs.scene.pieces import FIELDS, cut_block, farthest
+from rigs.scene.pixels import events_of_pixels
 from rigs.scene.readout import read_each, read_scans
+from rigs.scene.roots import FIRE_FIELDS, WAIT_FIELDS
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
 
 SPAN_NS = 96_000_000
@@ -84,9 +87,13 @@ def trace(  # type: ignore[no-untyped-def]
     """
     path = markers_in_image(loads, layout_mm, projection)
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
-    rows, inverse, curve = np.empty(total), np.empty(total), np.empty((total, 12))
-    weights, tree, stack = np.empty((4, 2 * total)), np.empty((4 * total, 7)), np.empty((160, 3))
-    first, stray = np.empty(total, np.int64), np.empty(total)
+    rows, inverse = np.empty(total), np.empty(total)
+    since, until = np.empty(total), np.empty(total)
+    curve, weights, spread = np.empty((12, total)), np.empty((4, 2 * total)), np.empty((4, total))
+    tree, stack, pieces = np.empty((4 * total, 7)), np.empty((160, 3)), np.empty((total, FIELDS))
+    first, stray, steps = np.empty(total, np.int64), np.empty(total), np.empty((total, 14))
+    tile, fire = np.empty(STRIDE * PIXEL_FIELDS), np.empty(STRIDE * FIRE_FIELDS)
+    wait = np.empty(STRIDE * WAIT_FIELDS)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
     # of the profile, at the rim: a pixel has no more events than its level goes up and down
@@ -116,14 +123,18 @@ def trace(  # type: ignore[no-untyped-def]
                 base_ns, leak_below, contrast, edge, path[:, :, begin + first[block]], events, n,
             )  # fmt: skip
         for block in range(blocks):
-            slope_weights(rows, first[block], first[block + 1], block, inverse, weights)
+            a, b = first[block], first[block + 1]
+            slope_weights(rows, a, b, block, inverse, weights)
+            for k in range(a, b):
+                since[k], until[k] = rows[k] - rows[a], rows[k + 1] - rows[a]
         for i in range(path.shape[0]):
             if stands_still(path, i, begin, stop):
                 continue
             for block in range(blocks):
                 a, b = first[block], first[block + 1]
                 fit_block(path, i, begin + a, a, b, block, chord, inverse, weights, curve)
-            strays, off_chord = excursion(rows, curve, 0, last)
+                stray[block] = off_chord(rows, curve, a, b, spread)
+            strays, bent = excursion(curve, first, blocks, stray)
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
             listed = reaches(i, column, row, radius, strays, origin)
             if not listed and strays <= REACH_PX:
@@ -132,7 +143,7 @@ def trace(  # type: ignore[no-untyped-def]
             if listed:
                 count = may_fire(
                     i, column, row, radius, end_x - column, end_y - row, end_r - radius,
-                    off_chord, origin, aim, place, hit, slots, pixels,
+                    bent, origin, aim, place, hit, slots, pixels,
                 )  # fmt: skip
             else:
                 origin[i, 3] = 0.0
@@ -144,26 +155,26 @@ def trace(  # type: ignore[no-untyped-def]
             if count == 0:
                 continue
             widen(i, column, row, radius + CUT * edge + strays, seen)
-            whole = 0.0
+            amount, whole = 0, 0.0
             for block in range(blocks):
                 a, b = first[block], first[block + 1]
-                size = 1
-                while size < b - a:
-                    size *= 2
-                whole += bound_rates(rows, curve, a, b, size, 4 * a, tree)
-                dx, dy = curve[b, 0] - curve[a, 0], curve[b, 4] - curve[a, 4]
-                square = dx * dx + dy * dy
-                nearest = radius - CUT * edge - 2.0 * strays
-                # a distance from a point that moves straight sags below a line by that much
-                sag = 0.125 * square / nearest if nearest > 0.0 else np.inf
-                stray[block] = excursion(rows, curve, a, b)[1] + sag
+                amount = cut_block(
+                    a, b, block, rows[a], stray[block], CUT * edge, since, until, curve, spread,
+                    pieces, amount,
+                )  # fmt: skip
+            for k in range(last):
+                steps[k, 0], steps[k, 1] = since[k], inverse[k]
+                for c in range(12):
+                    steps[k, 2 + c] = curve[c, k]
+            for k in range(amount):
+                whole += farthest(pieces[k])
             most = n + count * (int(steepest * whole / lowest) + 2)
             if most > capacity:
                 capacity = 2 * most
                 events, other = larger(events, capacity), np.empty(capacity, np.int64)
             n = events_of_pixels(
-                pixels, count, rows, inverse, curve, first, blocks, stray, tree, threshold,
-                contrast, edge, period_ns, stack, state, gaps, events, n,
+                pixels, count, pieces, amount, first, since, until, inverse, curve, steps, tree,
+                threshold, contrast, edge, period_ns, stack, tile, fire, wait, state, gaps, events, n,
             )  # fmt: skip
             if listed:
                 renew(i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim)
