@@ -42,12 +42,16 @@ def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def largest(bits, begin, end):  # type: ignore[no-untyped-def]
-    """The largest of numbers not below 0, given by their bits: integers have a vector maximum."""
-    most = np.int64(0)
-    for k in range(begin, end):
+def largest(values, row, n):  # type: ignore[no-untyped-def]
+    """The largest of the first n of a row of numbers that are not below 0.
+
+    Of their bits, as integers, for only these have a maximum that is done side by side.
+    """
+    bits, most = values.view(np.int64)[row], np.int64(0)
+    for k in range(n):
         most = max(most, bits[k])
-    return most
+    bits[0] = most
+    return values[row, 0]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -102,61 +106,83 @@ def nearest_row(k, first, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slope(place, k, first, last, weights, w):  # type: ignore[no-untyped-def]
-    """Slope of a coordinate at row k of a block, by its weights in column w."""
+def inner_weights(first, blocks, weights, inner):  # type: ignore[no-untyped-def]
+    """Weights of rows inside blocks, where a slope is taken through one row before and two after.
+
+    Args:
+        first: first row of each block, and the last row of all.
+        weights: of `slope_weights`.
+        inner: (3, r), what the three rows count, written; 0 at the two rows at each end of a block.
+    """
+    for block in range(blocks):
+        begin, end = first[block], first[block + 1]
+        for k in range(begin, end):
+            inside = begin < k < end - 1
+            inner[0, k] = weights[0, k + block] if inside else 0.0
+            inner[1, k] = weights[2, k + block] if inside else 0.0
+            inner[2, k] = weights[3, k + block] if inside else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slope(c, k, first, last, shift, weights, curve):  # type: ignore[no-untyped-def]
+    """Slope of coordinate c at row k of a block."""
     # differences: of what stands still, the slope is 0 to the bit
-    here, low = place[k], nearest_row(k, first, last)
-    slope = 0.0
+    here, low, slope = curve[4 * c, k], nearest_row(k, first, last), 0.0
     for j in range(min(last - first + 1, 4)):
-        slope += weights[j, w] * (place[low + j] - here)
+        slope += weights[j, k + shift] * (curve[4 * c, low + j] - here)
     return slope
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):  # type: ignore[no-untyped-def]
-    """Marker i as cubics between the rows of one block.
+def fit_blocks(path, i, row, first, blocks, chord, inverse, weights, inner, curve):  # type: ignore[no-untyped-def]
+    """Marker i as cubics between the rows of some blocks.
 
     Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
     is c0 + tau (c1 + s (c2 + s c3)), px; a column of `curve` has these of column, row and radius.
 
     Args:
         path: column, row and radius of each marker, (n, 3, m).
-        row: row of `path` that is the block's first.
-        first, last: the block's first and last row.
+        row: row of `path` that is the first of all.
+        first: first row of each block, and the last row of all.
         chord: join rows by straight lines.
-        shift, inverse, weights: of `slope_weights`.
-        curve: (12, r), written for steps `first` to `last` - 1; the places also at `last`.
+        inverse, weights, inner: of `slope_weights` and `inner_weights`.
+        curve: (12, r), written for every step; the places also at the last row.
     """
-    n = last - first
-    w = first + shift
-    before, after, far = weights[0, w : w + n], weights[2, w : w + n], weights[3, w : w + n]
-    per_step = inverse[first:last]
+    total = first[blocks]
     for c in range(3):
-        place = curve[4 * c, first : last + 1]
-        slope, bend, twist = (
-            curve[4 * c + 1, first:last], curve[4 * c + 2, first:last], curve[4 * c + 3, first:last]
-        )  # fmt: skip
-        place[:] = path[i, c, row : row + n + 1]
+        source, place = path[i, c, row:], curve[4 * c]
+        for k in range(total + 1):
+            place[k] = source[k]
         if chord:
-            for k in range(n):
-                slope[k], bend[k], twist[k] = (place[k + 1] - place[k]) * per_step[k], 0.0, 0.0
+            for k in range(total):
+                rate = (curve[4 * c, k + 1] - curve[4 * c, k]) * inverse[k]
+                curve[4 * c + 1, k], curve[4 * c + 2, k], curve[4 * c + 3, k] = rate, 0.0, 0.0
             continue
-        slope[0] = _slope(place, 0, 0, n, weights, w)
-        for k in range(1, n - 1):
-            here = place[k]
-            slope[k] = (
-                before[k] * (place[k - 1] - here) + after[k] * (place[k + 1] - here)
-                + far[k] * (place[k + 2] - here)
-            )  # fmt: skip
-        if n > 1:
-            slope[n - 1] = _slope(place, n - 1, 0, n, weights, w + n - 1)
-        for k in range(n - 1):
-            rate, own, next_one = (place[k + 1] - place[k]) * per_step[k], slope[k], slope[k + 1]
-            bend[k] = 3.0 * rate - 2.0 * own - next_one
-            twist[k] = own + next_one - 2.0 * rate
-        rate, own = (place[n] - place[n - 1]) * per_step[n - 1], slope[n - 1]
-        final = _slope(place, n, 0, n, weights, w + n)
-        bend[n - 1], twist[n - 1] = 3.0 * rate - 2.0 * own - final, own + final - 2.0 * rate
+        for k in range(total - 2):
+            here = curve[4 * c, k + 1]
+            curve[4 * c + 1, k + 1] = (
+                inner[0, k + 1] * (curve[4 * c, k] - here)
+                + inner[1, k + 1] * (curve[4 * c, k + 2] - here)
+                + inner[2, k + 1] * (curve[4 * c, k + 3] - here)
+            )
+        for block in range(blocks):
+            begin, end = first[block], first[block + 1]
+            curve[4 * c + 1, begin] = _slope(c, begin, begin, end, block, weights, curve)
+            if end - begin > 1:
+                curve[4 * c + 1, end - 1] = _slope(c, end - 1, begin, end, block, weights, curve)
+        for k in range(total - 1):
+            rate = (curve[4 * c, k + 1] - curve[4 * c, k]) * inverse[k]
+            slope, after = curve[4 * c + 1, k], curve[4 * c + 1, k + 1]
+            curve[4 * c + 2, k] = 3.0 * rate - 2.0 * slope - after
+            curve[4 * c + 3, k] = slope + after - 2.0 * rate
+        # a block's last slope looks at its own rows, not at those of the next block
+        for block in range(blocks):
+            begin, end = first[block], first[block + 1]
+            after = _slope(c, end, begin, end, block, weights, curve)
+            rate = (curve[4 * c, end] - curve[4 * c, end - 1]) * inverse[end - 1]
+            slope = curve[4 * c + 1, end - 1]
+            curve[4 * c + 2, end - 1] = 3.0 * rate - 2.0 * slope - after
+            curve[4 * c + 3, end - 1] = slope + after - 2.0 * rate
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -196,68 +222,31 @@ def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def off_chord(t, curve, first, last, spread):  # type: ignore[no-untyped-def]
-    """How far a marker strays at most from the chord between two rows, px; growth counts.
+def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
+    """How far a marker strays up to a row, px: (from its start, from the chord to its end).
 
-    The rows' distances from the chord, and how far a cubic is from the line between its rows: that
-    is h s (1 - s) (c2 + c3 (1 + s)).
+    At most: the rows' distances from the chord, and how far a cubic is from the line between its
+    rows, which is h s (1 - s) (c2 + c3 (1 + s)). Growth counts like a move.
 
     Args:
         spread: scratch, (4, at least the rows).
     """
-    n = last - first
-    x, y, r = curve[0, first], curve[4, first], curve[8, first]
+    x, y, r = curve[0, 0], curve[4, 0], curve[8, 0]
     dx, dy, dr = curve[0, last] - x, curve[4, last] - y, curve[8, last] - r
     square = dx * dx + dy * dy + dr * dr
     scale = 1.0 / square if square > 0.0 else 0.0
-    px, py, pr = curve[0, first:last], curve[4, first:last], curve[8, first:last]
-    bx, by, br = curve[2, first:last], curve[6, first:last], curve[10, first:last]
-    cx, cy, cr = curve[3, first:last], curve[7, first:last], curve[11, first:last]
-    begin, end = t[first:last], t[first + 1 : last + 1]
-    far, far_r, arch, arch_r = spread[0], spread[1], spread[2], spread[3]
-    for k in range(n):
-        gx, gy, gr = px[k] - x, py[k] - y, pr[k] - r
+    for k in range(last):
+        gx, gy, gr = curve[0, k] - x, curve[4, k] - y, curve[8, k] - r
         s = min(max((gx * dx + gy * dy + gr * dr) * scale, 0.0), 1.0)
         gx, gy = gx - s * dx, gy - s * dy
-        far[k] = gx * gx + gy * gy
-        far_r[k] = abs(gr - s * dr)
-    for k in range(n):
-        quarter = 0.25 * (end[k] - begin[k])
-        ex, ey, er = bx[k] + cx[k], by[k] + cy[k], br[k] + cr[k]
-        ex, ey = max(abs(ex), abs(ex + cx[k])), max(abs(ey), abs(ey + cy[k]))
-        arch[k] = quarter * quarter * (ex * ex + ey * ey)
-        arch_r[k] = quarter * max(abs(er), abs(er + cr[k]))
-    bits = spread.view(np.int64)
-    for c in range(4):
-        bits[c, 0] = largest(bits[c], 0, n)
-    return np.sqrt(far[0]) + far_r[0] + np.sqrt(arch[0]) + arch_r[0]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def excursion(curve, first, blocks, stray):  # type: ignore[no-untyped-def]
-    """How far a marker strays in some blocks, px: (from its start, from the chord to its end).
-
-    Distances from a point or from a segment are convex, so that on a block's chord they are largest
-    at an end. Growth counts like a move.
-
-    Args:
-        first: first row of each block, and the last row of all.
-        stray: of each block, see `off_chord`.
-    """
-    begin, end = first[0], first[blocks]
-    x, y, r = curve[0, begin], curve[4, begin], curve[8, begin]
-    dx, dy, dr = curve[0, end] - x, curve[4, end] - y, curve[8, end] - r
-    square = dx * dx + dy * dy + dr * dr
-    scale = 1.0 / square if square > 0.0 else 0.0
-    far, off, before, before_off = 0.0, 0.0, 0.0, 0.0
-    for block in range(blocks):
-        k = first[block + 1]
-        px, py, pr = curve[0, k] - x, curve[4, k] - y, curve[8, k] - r
-        after = np.sqrt(px * px + py * py) + abs(pr)
-        s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
-        ex, ey = px - s * dx, py - s * dy
-        after_off = np.sqrt(ex * ex + ey * ey) + abs(pr - s * dr)
-        far = max(far, max(before, after) + stray[block])
-        off = max(off, max(before_off, after_off) + stray[block])
-        before, before_off = after, after_off
-    return far, off
+        spread[0, k] = gx * gx + gy * gy
+        spread[1, k] = abs(gr - s * dr)
+    for k in range(last):
+        quarter = 0.25 * (t[k + 1] - t[k])
+        ex, ey, er = curve[2, k] + curve[3, k], curve[6, k] + curve[7, k], curve[10, k] + curve[11, k]
+        ex, ey = max(abs(ex), abs(ex + curve[3, k])), max(abs(ey), abs(ey + curve[7, k]))
+        spread[2, k] = quarter * quarter * (ex * ex + ey * ey)
+        spread[3, k] = quarter * max(abs(er), abs(er + curve[11, k]))
+    most = np.sqrt(largest(spread, 0, last)) + largest(spread, 1, last)
+    most += np.sqrt(largest(spread, 2, last)) + largest(spread, 3, last)
+    return np.sqrt(dx * dx + dy * dy) + abs(dr) + most, most

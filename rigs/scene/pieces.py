@@ -59,14 +59,11 @@ def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: igno
         r += br[k]
         most = max(most, abs(r))
         growth[k] = max(most, abs(r + (br[k] + 3.0 * cr[k])))
-    bits = spread.view(np.int64)
-    top, grown = bits[2], bits[3]
-    top[0], grown[0] = largest(bits[0], 0, n), largest(bits[1], 0, n)
-    return np.sqrt(spread[2, 0]), spread[3, 0]
+    return np.sqrt(largest(spread, 0, n)), largest(spread, 1, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cut_block(first, last, block, zero, stray, reach, since, until, curve, spread, pieces, n):  # type: ignore[no-untyped-def]
+def cut_block(first, last, block, zero, reach, since, until, curve, spread, pieces, n):  # type: ignore[no-untyped-def]
     """Cut a block into pieces in which the marker does not move far.
 
     What is done follows from the block's own rows alone.
@@ -74,7 +71,6 @@ def cut_block(first, last, block, zero, stray, reach, since, until, curve, sprea
     Args:
         first, last: the block's first and last row.
         zero: when it begins, ns after the first row of all.
-        stray: how far the marker strays from the block's chord at most, px.
         reach: how far from the rim the edge ends, px.
         since, until: when each step begins and ends, ns after the begin of its block.
         spread: scratch, see `deviation`.
@@ -109,8 +105,6 @@ def cut_block(first, last, block, zero, stray, reach, since, until, curve, sprea
         # nearer than the edge at both ends of a chord nearer in between
         chord = (mean_x * mean_x + mean_y * mean_y) * (end - begin) ** 2
         bow = 0.5 * (apart + grows) * (end - begin)
-        if parts == 1:
-            bow = min(bow, stray)
         left = min(curve[8, k0], curve[8, k1]) - bow - reach - 0.5 * np.sqrt(chord)
         piece[STRAY] = bow + (0.125 * chord / left if left > 0.0 else np.inf)
         piece[NODE] = parts + (k0 - first) // (size // parts)

@@ -14,9 +14,9 @@ from rigs.scene.edges import CUT, widen
 from rigs.scene.lanes import PIXEL_FIELDS, STRIDE
 from rigs.scene.marker_path import (
     excursion,
-    fit_block,
+    fit_blocks,
+    inner_weights,
     markers_in_image,
-    off_chord,
     slope_weights,
     stands_still,
 )
@@ -91,7 +91,7 @@ def trace(  # type: ignore[no-untyped-def]
     since, until = np.empty(total), np.empty(total)
     curve, weights, spread = np.empty((12, total)), np.empty((4, 2 * total)), np.empty((4, total))
     tree, stack, pieces = np.empty((4 * total, 7)), np.empty((160, 3)), np.empty((total, FIELDS))
-    first, stray, steps = np.empty(total, np.int64), np.empty(total), np.empty((total, 14))
+    first, inner, steps = np.empty(total, np.int64), np.empty((3, total)), np.empty((total, 14))
     tile, fire = np.empty(STRIDE * PIXEL_FIELDS), np.empty(STRIDE * FIRE_FIELDS)
     wait = np.empty(STRIDE * WAIT_FIELDS)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
@@ -127,14 +127,12 @@ def trace(  # type: ignore[no-untyped-def]
             slope_weights(rows, a, b, block, inverse, weights)
             for k in range(a, b):
                 since[k], until[k] = rows[k] - rows[a], rows[k + 1] - rows[a]
+        inner_weights(first, blocks, weights, inner)
         for i in range(path.shape[0]):
             if stands_still(path, i, begin, stop):
                 continue
-            for block in range(blocks):
-                a, b = first[block], first[block + 1]
-                fit_block(path, i, begin + a, a, b, block, chord, inverse, weights, curve)
-                stray[block] = off_chord(rows, curve, a, b, spread)
-            strays, bent = excursion(curve, first, blocks, stray)
+            fit_blocks(path, i, begin, first, blocks, chord, inverse, weights, inner, curve)
+            strays, off_chord = excursion(rows, curve, last, spread)
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
             listed = reaches(i, column, row, radius, strays, origin)
             if not listed and strays <= REACH_PX:
@@ -143,7 +141,7 @@ def trace(  # type: ignore[no-untyped-def]
             if listed:
                 count = may_fire(
                     i, column, row, radius, end_x - column, end_y - row, end_r - radius,
-                    bent, origin, aim, place, hit, slots, pixels,
+                    off_chord, origin, aim, place, hit, slots, pixels,
                 )  # fmt: skip
             else:
                 origin[i, 3] = 0.0
@@ -159,8 +157,7 @@ def trace(  # type: ignore[no-untyped-def]
             for block in range(blocks):
                 a, b = first[block], first[block + 1]
                 amount = cut_block(
-                    a, b, block, rows[a], stray[block], CUT * edge, since, until, curve, spread,
-                    pieces, amount,
+                    a, b, block, rows[a], CUT * edge, since, until, curve, spread, pieces, amount
                 )  # fmt: skip
             for k in range(last):
                 steps[k, 0], steps[k, 1] = since[k], inverse[k]
