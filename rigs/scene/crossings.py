@@ -150,8 +150,8 @@ def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, c
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_piece(  # type: ignore[no-untyped-def]
-    x, y, on, off, last_one, level, step, ga, piece, base, begin, final, since, until, inverse, curve,
-    tree, contrast, edge, head, stack, out, n,
+    x, y, on, off, last_one, level, step, ga, piece, base, begin, final, since, until, inverse,
+    curve, tree, contrast, edge, head, stack, out, n,
 ):  # fmt: skip
     """Events of one pixel on a piece of a block, however its distance goes.
 

@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 
 from rigs.scene import pieces as of
-from rigs.scene.edges import CUT, FAR, TAIL
 
 LANES = 256
 STRIDE = LANES + 8

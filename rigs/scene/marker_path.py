@@ -243,7 +243,8 @@ def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
         spread[1, k] = abs(gr - s * dr)
     for k in range(last):
         quarter = 0.25 * (t[k + 1] - t[k])
-        ex, ey, er = curve[2, k] + curve[3, k], curve[6, k] + curve[7, k], curve[10, k] + curve[11, k]
+        ex, ey = curve[2, k] + curve[3, k], curve[6, k] + curve[7, k]
+        er = curve[10, k] + curve[11, k]
         ex, ey = max(abs(ex), abs(ex + curve[3, k])), max(abs(ey), abs(ey + curve[7, k]))
         spread[2, k] = quarter * quarter * (ex * ex + ey * ey)
         spread[3, k] = quarter * max(abs(er), abs(er + curve[11, k]))

@@ -125,5 +125,5 @@ def cut_block(first, last, block, zero, reach, since, until, curve, spread, piec
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def farthest(piece):  # type: ignore[no-untyped-def]
-    """How long the ways of the centre and of the radius are on a piece, at most and together, px."""
+    """How long the ways of centre and radius are on a piece, at most and together, px."""
     return (piece[SPEED] + abs(piece[MR]) + piece[DEVIATION]) * (piece[END] - piece[BEGIN])

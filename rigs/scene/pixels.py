@@ -20,14 +20,14 @@ from rigs.scene.roots import begin_piece, fetch, finish, guess, move, next_thres
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, pieces, amount, first, since, until, inverse, curve, steps, tree, threshold,
+    pixels, count, pieces, first, since, until, inverse, curve, steps, tree, threshold,
     contrast, edge, origin, stack, tile, fire, wait, state, gaps, out, n,
 ):  # fmt: skip
     """Events of pixels over some blocks.
 
     Args:
         pixels: column << 12 | row, the first `count` of them.
-        pieces: of the blocks, in order, the first `amount` rows; see `pieces`.
+        pieces: of the blocks, in order, see `pieces`.
         first: first row of each block, and the last row of all, (blocks + 1,).
         since, until: when each step begins and ends, ns after the begin of its block.
         inverse, curve: see `marker_path.fit_block`.
@@ -43,7 +43,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
     Returns:
         how many events `out` holds now.
     """
-    reach = CUT * edge
+    reach, amount = CUT * edge, pieces.shape[0]
     waiting = 0
     active = np.empty(LANES + 1, np.int64)
     for index in range(amount):
@@ -90,7 +90,8 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                     tile[lanes.LAST + j], tile[lanes.LEVEL + j] = last, level
                     continue
                 falls = kind == COMES
-                fire[roots.X + firing], fire[roots.Y + firing] = tile[lanes.X + j], tile[lanes.Y + j]
+                fire[roots.X + firing] = tile[lanes.X + j]
+                fire[roots.Y + firing] = tile[lanes.Y + j]
                 fire[roots.BEGIN + firing] = tile[lanes.BEGIN + j]
                 fire[roots.END + firing] = tile[lanes.END + j]
                 fire[roots.TARGET + firing] = tile[(lanes.ON if falls else lanes.OFF) + j]

@@ -26,6 +26,7 @@ step begins, one over its length."""
 C = 12 * STRIDE
 """First of the step's twelve coefficients."""
 WAIT_FIELDS = 24
+STEP_FIELDS = 14
 BEGIN, END, LAST, LEVEL, RISE, LANE, SCALE_A, SCALE_B, NEXT, _SHARE, _POWER = (
     STRIDE * k for k in range(24, 35)
 )
@@ -124,6 +125,15 @@ def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
+    """What `fetch` needs of each step, side by side: `steps` (r, STEP_FIELDS), written."""
+    for k in range(n):
+        steps[k, 0], steps[k, 1] = since[k], inverse[k]
+        for c in range(12):
+            steps[k, 2 + c] = curve[c, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
     """Find the step in which each time lies, and fetch what is known of it."""
     for j in range(n):
@@ -133,7 +143,7 @@ def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
         while t < since[k]:
             k -= np.uint64(1)
         roots[STEP + j] = k
-        for c in range(14):
+        for c in range(STEP_FIELDS):
             roots[SINCE + STRIDE * c + j] = steps[k, c]
 
 
@@ -169,15 +179,14 @@ def refine(roots, n):  # type: ignore[no-untyped-def]
         low, high, fine = roots[LOW + j], roots[HIGH + j], roots[FINE + j]
         new = t + step * (1.0 + share)
         inside = (new - roots[SINCE + j]) * inverse
-        # the next error is that of a cubic method while one step of the path holds both times
-        good = (abs(step) <= fine) | (
-            (abs(step) <= 20.0 * fine) & (share * share * abs(step) <= 3e-4 * fine)
-            & (inside >= 0.0) & (inside <= 1.0)
-        )  # fmt: skip
+        # the next error is that of a cubic method; a longer step must not leave the path's step
+        good = (share * share * abs(step) <= 3e-4 * fine) & (
+            (abs(step) <= fine) | ((abs(step) <= 20.0 * fine) & (inside >= 0.0) & (inside <= 1.0))
+        )
         new = new if new > low else low
         new = new if new < high else high
         roots[TIME + j] = new
-        roots[GOOD + j] = 1.0 if good & (abs(share) < 0.5) else 0.0
+        roots[GOOD + j] = 1.0 if good else 0.0
         roots[SINCE + j] = roots[HEAD + j] + np.floor(new) * _TICK
 
 
@@ -204,9 +213,9 @@ def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: i
             return count
     for j in range(n):
         t = solve(
-            wait[X + j], wait[Y + j], wait[TARGET + j], np.int64(wait[HEAD + j]) & 1 > 0, wait[LOW + j],
-            wait[HIGH + j], wait[TIME + j], np.int64(wait[STEP + j]), wait[FINE + j], since, until,
-            inverse, curve,
+            wait[X + j], wait[Y + j], wait[TARGET + j], np.int64(wait[HEAD + j]) & 1 > 0,
+            wait[LOW + j], wait[HIGH + j], wait[TIME + j], np.int64(wait[STEP + j]), wait[FINE + j],
+            since, until, inverse, curve,
         )  # fmt: skip
         out[count] = np.int64(wait[HEAD + j] + np.floor(t) * _TICK)
         count += 1

@@ -24,7 +24,7 @@ from rigs.scene.noise import noise_events
 from rigs.scene.pieces import FIELDS, cut_block, farthest
 from rigs.scene.pixels import events_of_pixels
 from rigs.scene.readout import read_each, read_scans
-from rigs.scene.roots import FIRE_FIELDS, WAIT_FIELDS
+from rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
 
 SPAN_NS = 96_000_000
@@ -91,13 +91,14 @@ def trace(  # type: ignore[no-untyped-def]
     since, until = np.empty(total), np.empty(total)
     curve, weights, spread = np.empty((12, total)), np.empty((4, 2 * total)), np.empty((4, total))
     tree, stack, pieces = np.empty((4 * total, 7)), np.empty((160, 3)), np.empty((total, FIELDS))
-    first, inner, steps = np.empty(total, np.int64), np.empty((3, total)), np.empty((total, 14))
+    first, behind = np.empty(total, np.int64), np.empty(total, np.int64)
+    inner, steps = np.empty((3, total)), np.empty((total, STEP_FIELDS))
     tile, fire = np.empty(STRIDE * PIXEL_FIELDS), np.empty(STRIDE * FIRE_FIELDS)
     wait = np.empty(STRIDE * WAIT_FIELDS)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
     # of the profile, at the rim: a pixel has no more events than its level goes up and down
-    steepest = 0.26 * contrast / edge
+    steepest, reach = 0.26 * contrast / edge, CUT * edge
     capacity = (1 << 13) + pending.shape[0] + noise_t.shape[0]
     events, other = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     room = 1 << 13
@@ -138,41 +139,51 @@ def trace(  # type: ignore[no-untyped-def]
             if not listed and strays <= REACH_PX:
                 listed = make_list(i, column, row, radius, state, edge, pixels, origin, aim, place)
             end_x, end_y, end_r = path[i, 0, stop], path[i, 1, stop], path[i, 2, stop]
+            count = 0
             if listed:
                 count = may_fire(
                     i, column, row, radius, end_x - column, end_y - row, end_r - radius,
                     off_chord, origin, aim, place, hit, slots, pixels,
                 )  # fmt: skip
+                if count == 0:
+                    continue
             else:
                 origin[i, 3] = 0.0
-                band = CUT * edge + strays
-                count = near_rim(column, row, radius, band, height, width, pixels)
-                if count > pixels.shape[0]:
-                    pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
-                    near_rim(column, row, radius, band, height, width, pixels)
-            if count == 0:
-                continue
-            widen(i, column, row, radius + CUT * edge + strays, seen)
-            amount, whole = 0, 0.0
+            widen(i, column, row, radius + reach + strays, seen)
+            amount = 0
             for block in range(blocks):
-                a, b = first[block], first[block + 1]
                 amount = cut_block(
-                    a, b, block, rows[a], CUT * edge, since, until, curve, spread, pieces, amount
+                    first[block], first[block + 1], block, rows[first[block]], reach, since,
+                    until, curve, spread, pieces, amount,
                 )  # fmt: skip
-            for k in range(last):
-                steps[k, 0], steps[k, 1] = since[k], inverse[k]
-                for c in range(12):
-                    steps[k, 2 + c] = curve[c, k]
-            for k in range(amount):
-                whole += farthest(pieces[k])
-            most = n + count * (int(steepest * whole / lowest) + 2)
-            if most > capacity:
-                capacity = 2 * most
-                events, other = larger(events, capacity), np.empty(capacity, np.int64)
-            n = events_of_pixels(
-                pixels, count, pieces, amount, first, since, until, inverse, curve, steps, tree,
-                threshold, contrast, edge, period_ns, stack, tile, fire, wait, state, gaps, events, n,
-            )  # fmt: skip
+                behind[block] = amount
+            pack_steps(last, since, inverse, curve, steps)
+            # pixels that are not from a list are those near the rim, block by block
+            piece = 0
+            for block in range(blocks):
+                end = amount if listed else behind[block]
+                whole = 0.0
+                for k in range(piece, end):
+                    whole += farthest(pieces[k])
+                if not listed:
+                    at = begin + first[block]
+                    x, y, r, band = path[i, 0, at], path[i, 1, at], path[i, 2, at], reach + whole
+                    count = near_rim(x, y, r, band, height, width, pixels)
+                    if count > pixels.shape[0]:
+                        pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
+                        near_rim(x, y, r, band, height, width, pixels)
+                most = n + count * (int(steepest * whole / lowest) + 2)
+                if most > capacity:
+                    capacity = 2 * most
+                    events, other = larger(events, capacity), np.empty(capacity, np.int64)
+                n = events_of_pixels(
+                    pixels, count, pieces[piece:end], first, since, until, inverse, curve, steps,
+                    tree, threshold, contrast, edge, period_ns, stack, tile, fire, wait, state,
+                    gaps, events, n,
+                )  # fmt: skip
+                piece = end
+                if listed:
+                    break
             if listed:
                 renew(i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim)
         if kept + n > room:
