@@ -1,4 +1,6 @@
-"""When the rim of a moving disc crosses one pixel's next thresholds: roots on a cubic path.
+"""When the rim of a moving disc crosses one pixel's next thresholds, however the disc moves.
+
+For pixels whose distance is not known to be monotone on a whole piece; `pixels` has the others.
 
 g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a piece
 of time on which g is proven to be monotone: its rate lies between bounds from the control points

@@ -20,9 +20,9 @@ X, Y, TARGET, TIME, LOW, HIGH, FINE, HEAD, STEP, GOOD, SINCE, INVERSE = (
     STRIDE * k for k in range(12)
 )
 """Of every root: column and row; the rim distance that is met; when, ns after the block's begin,
-and the limits of that; how long a step may be after which it is good; a packed event at the
-block's begin (52 bits, which a float64 holds); the path's step; whether the time is good; when the
-step begins, one over its length."""
+and the limits of that; how long a step of the search may be after which it is good; a packed event
+at the block's begin (52 bits, which a float64 holds); the step of the path; whether the time is
+good; when that step begins and one over its length."""
 C = 12 * STRIDE
 """First of the step's twelve coefficients."""
 WAIT_FIELDS = 24
@@ -31,8 +31,8 @@ BEGIN, END, LAST, LEVEL, RISE, LANE, SCALE_A, SCALE_B, NEXT, _SHARE, _POWER = (
     STRIDE * k for k in range(24, 35)
 )
 """Of every pixel that fires: distances at both ends of the piece; rim distance of the last event
-before; reference level; what an event adds to it; lane in the pixels' tile;
-slopes of time over distance at both ends; rim distance of the next event."""
+before; reference level; what an event adds to it; lane in the pixels' tile; slopes of time over
+distance at both ends; rim distance of the next event."""
 FIRE_FIELDS = 35
 _ROUNDS = 6
 _TICK = float(1 << 25)  # a nanosecond in a packed event
@@ -149,7 +149,7 @@ def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def refine(roots, n):  # type: ignore[no-untyped-def]
-    """One step of Chebyshev's method; a root's event by its bits takes the place of its step."""
+    """One step of Chebyshev's method; where SINCE was, the packed event stands then."""
     for j in range(n):
         t, target = roots[TIME + j], roots[TARGET + j]
         inverse = roots[INVERSE + j]

@@ -121,7 +121,7 @@ def may_fire(  # type: ignore[no-untyped-def]
 
     Args:
         stray: how far the way is from its chord at most, px.
-        hit: scratch, bytes, a multiple of eight of them, at least as many as slots.
+        hit: scratch, bytes, a multiple of eight of them, as many as slots.
         slots, pixels: slots and places of these pixels, written.
 
     Returns:
