@@ -129,7 +129,9 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
             state[y, x, edges.LAST] = tile[lanes.LAST + j]
             state[y, x, edges.LEVEL] = tile[lanes.LEVEL + j]
             gaps[at + j] = tile[lanes.END + j]
-    return finish(wait, waiting, since, until, steps, inverse, curve, out, n)
+    if waiting > 0:
+        n = finish(wait, waiting, since, until, steps, inverse, curve, out, n)
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,7 +1,8 @@
 """Events of all markers along their paths, block by block: what `rigs.scene.events` runs on.
 
 In a block each marker's path is fitted and cut into pieces, the pixels that may fire are picked
-from its list, and tiles of them go through the pieces. Noise is added, and the block is read out. Blocks lie on a grid of true time and nothing looks past their borders.
+from its list, and tiles of them go through the pieces. Noise is added, and the block is read out.
+Blocks lie on a grid of true time and nothing looks past their borders.
 """
 
 from __future__ import annotations
