@@ -1,4 +1,6 @@
-"""When the rim of a moving disc crosses one pixel's next thresholds: roots on a cubic path.
+"""When the rim of a moving disc crosses one pixel's next thresholds, however the disc moves.
+
+For pixels whose distance is not known to be monotone on a whole piece; `pixels` has the others.
 
 g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a piece
 of time on which g is proven to be monotone: its rate lies between bounds from the control points
@@ -13,40 +15,39 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.edges import CUT, LAST, LEVEL, OFF, ON, rim_of
+from rigs.scene.edges import CUT, rim_of
+from rigs.scene.pieces import FINE, K0, K1, NODE
 
 _DONE_PX = 1e-10
-_NEWTON = 1e-4  # of the block: after a step as small as that the next error is below 1e-7
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_at(t, zero, rows, guess):  # type: ignore[no-untyped-def]
-    """The step of the path that holds the time `t` after `zero`, looked for from `guess` on."""
-    last = rows.shape[0] - 2
-    k = min(max(guess, 0), last)
-    while k < last and t > rows[k + 1] - zero:
+def step_at(t, since, until, guess):  # type: ignore[no-untyped-def]
+    """The step of the path that holds the time `t` of its block, looked for from `guess` on."""
+    k = guess
+    while t > until[k]:
         k += 1
-    while k > 0 and t < rows[k] - zero:
+    while t < since[k]:
         k -= 1
     return k
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def distance_at(x, y, t, k, zero, rows, inverse, curve):  # type: ignore[no-untyped-def]
-    """Distance of a pixel from the rim at a time `t` after `zero`, in step k, px, and its rate.
+def distance_at(x, y, t, k, since, inverse, curve):  # type: ignore[no-untyped-def]
+    """Distance of a pixel from the rim at a time `t` of its block, in step k, px, and its rate.
 
     Returns:
         the distance, and the rate as a product of two: the rate times the distance from the
         centre, and that distance (of which the caller may spare the division).
     """
-    tau = t - (rows[k] - zero)
+    tau = t - since[k]
     s = tau * inverse[k]
-    dx = x - (curve[k, 0] + tau * (curve[k, 1] + s * (curve[k, 2] + s * curve[k, 3])))
-    dy = y - (curve[k, 4] + tau * (curve[k, 5] + s * (curve[k, 6] + s * curve[k, 7])))
-    r = curve[k, 8] + tau * (curve[k, 9] + s * (curve[k, 10] + s * curve[k, 11]))
-    vx = curve[k, 1] + s * (2.0 * curve[k, 2] + 3.0 * s * curve[k, 3])
-    vy = curve[k, 5] + s * (2.0 * curve[k, 6] + 3.0 * s * curve[k, 7])
-    growth = curve[k, 9] + s * (2.0 * curve[k, 10] + 3.0 * s * curve[k, 11])
+    dx = x - (curve[0, k] + tau * (curve[1, k] + s * (curve[2, k] + s * curve[3, k])))
+    dy = y - (curve[4, k] + tau * (curve[5, k] + s * (curve[6, k] + s * curve[7, k])))
+    r = curve[8, k] + tau * (curve[9, k] + s * (curve[10, k] + s * curve[11, k]))
+    vx = curve[1, k] + s * (2.0 * curve[2, k] + 3.0 * s * curve[3, k])
+    vy = curve[5, k] + s * (2.0 * curve[6, k] + 3.0 * s * curve[7, k])
+    growth = curve[9, k] + s * (2.0 * curve[10, k] + 3.0 * s * curve[11, k])
     away = np.sqrt(dx * dx + dy * dy)
     return away - r, -(dx * vx + dy * vy) - growth * away, away
 
@@ -79,8 +80,8 @@ def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore
 @njit(cache=True, nogil=True, error_model="numpy")
 def _at_row(x, y, k, curve):  # type: ignore[no-untyped-def]
     """Distance of a pixel from the rim at row k, px."""
-    dx, dy = x - curve[k, 0], y - curve[k, 4]
-    return np.sqrt(dx * dx + dy * dy) - curve[k, 8]
+    dx, dy = x - curve[0, k], y - curve[4, k]
+    return np.sqrt(dx * dx + dy * dy) - curve[8, k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -105,16 +106,16 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
     (sa, sb) and (sb, sb).
     """
     tau = sa * h
-    dx = x - (curve[k, 0] + tau * (curve[k, 1] + sa * (curve[k, 2] + sa * curve[k, 3])))
-    dy = y - (curve[k, 4] + tau * (curve[k, 5] + sa * (curve[k, 6] + sa * curve[k, 7])))
+    dx = x - (curve[0, k] + tau * (curve[1, k] + sa * (curve[2, k] + sa * curve[3, k])))
+    dy = y - (curve[4, k] + tau * (curve[5, k] + sa * (curve[6, k] + sa * curve[7, k])))
     away = np.sqrt(dx * dx + dy * dy)
     inverse = 1.0 / away if away > 0.0 else 0.0
     ux, uy = dx * inverse, dy * inverse
     low, high, speed = np.inf, -np.inf, 0.0
     for p, q in ((sa, sa), (sa, sb), (sb, sb)):
-        vx = curve[k, 1] + (p + q) * curve[k, 2] + 3.0 * p * q * curve[k, 3]
-        vy = curve[k, 5] + (p + q) * curve[k, 6] + 3.0 * p * q * curve[k, 7]
-        growth = curve[k, 9] + (p + q) * curve[k, 10] + 3.0 * p * q * curve[k, 11]
+        vx = curve[1, k] + (p + q) * curve[2, k] + 3.0 * p * q * curve[3, k]
+        vy = curve[5, k] + (p + q) * curve[6, k] + 3.0 * p * q * curve[7, k]
+        growth = curve[9, k] + (p + q) * curve[10, k] + 3.0 * p * q * curve[11, k]
         rate = -(ux * vx + uy * vy) - growth
         low, high = min(low, rate), max(high, rate)
         speed = max(speed, np.sqrt(vx * vx + vy * vy))
@@ -123,155 +124,135 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, rows, inverse, curve, first, blocks, stray, tree, threshold, contrast, edge,
-    origin, stack, state, gaps, out, n,
-):  # fmt: skip
-    """Events of pixels over some blocks, however their distances go; see the module's text.
-
-    What is done in a block follows from its own rows alone, to the bit. One long function, because
-    handing arrays on costs numba more than a root does.
+def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, curve):  # type: ignore[no-untyped-def]
+    """When a distance that falls (or rises) from `low` to `high` is `target`: a root in a bracket.
 
     Args:
-        pixels: column << 12 | row, the first `count` of them.
-        rows, inverse, curve: see `marker_path.fit_block`.
-        first: first row of each block, and the last row of all, (blocks + 1,).
-        stray: how far the marker is from the chord of each block at most, px.
-        tree: of `marker_path.bound_rates`; that of block b begins at 4 first[b].
-        threshold, state: of all pixels, (height, width) and (height, width, 4); written.
-        origin: ns to add to every time.
+        t, k: a first guess, ns after the block's begin, and a step near it.
+        fine: how long a step of Newton's method may be after which a time is good, ns.
+    """
+    for _ in range(100):
+        k = step_at(t, since, until, k)
+        value, slope, away = distance_at(x, y, t, k, since, inverse, curve)
+        miss = value - target
+        if (miss > 0.0) == falling:
+            low = t
+        else:
+            high = t
+        before, t = t, t - miss * away / slope
+        # also where the slope is 0 and t is no number
+        if not low <= t <= high:
+            t = 0.5 * (low + high)
+            if high - low < 1e-5 * fine:
+                break
+        elif abs(t - before) < fine:
+            break
+    return t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def events_of_piece(  # type: ignore[no-untyped-def]
+    x, y, on, off, last_one, level, step, ga, piece, base, begin, final, since, until, inverse,
+    curve, tree, contrast, edge, head, stack, out, n,
+):  # fmt: skip
+    """Events of one pixel on a piece of a block, however its distance goes.
+
+    Args:
+        on, off, last_one, level: the pixel's state, see `edges`; step: its threshold.
+        ga: its distance at the begin.
+        piece: see `pieces`.
+        base, begin, final: where the tree of the block begins; the block's first and last row.
+        since, until, inverse, curve: see `pieces` and `marker_path.fit_block`.
+        tree: of `marker_path.bound_rates`.
+        head: packed event at the begin of the block.
         stack: scratch, (160, 3).
-        gaps: distance of each pixel from the rim at the end, px; written.
-        out: packed events as in `sorting`, written from `n` on.
+        out: packed events, written from `n` on.
 
     Returns:
-        how many events `out` holds now.
+        the pixel's state, and how many events `out` holds now.
     """
     reach = CUT * edge
-    for index in range(count):
-        # all that is not in the cache is asked for at once, and not one pixel after the other
-        x, y = pixels[index] >> 12, pixels[index] & 4095
-        gaps[index] = state[y, x, LEVEL] + threshold[y, x]
-    for index in range(count):
-        x, y = pixels[index] >> 12, pixels[index] & 4095
-        code = np.int64(x) << 13 | np.int64(y) << 1
-        ga = _at_row(x, y, first[0], curve)
-        for block in range(blocks):
-            begin, last = first[block], first[block + 1]
-            gb = _at_row(x, y, last, curve)
-            if (
-                min(ga, gb) - stray[block] > state[y, x, ON]
-                and max(ga, gb) + stray[block] < state[y, x, OFF]
-            ):
+    last, node, size = int(piece[K1]), int(piece[NODE]), 1
+    while size < final - begin:
+        size *= 2
+    while node > 1:
+        node, size = node // 2, size // 2
+    # parts yet to be done, the next one on top: a node of the tree with its steps, or, with a
+    # number not above 0, a step with the part of it from sa to sb
+    stack[0, 0], stack[0, 1], stack[0, 2] = piece[NODE], piece[K0], piece[K0] + size
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        node = int(stack[depth, 0])
+        sa, sb = stack[depth, 1], stack[depth, 2]
+        # the end of a part is the beginning of the next one, to the bit
+        if node > 0:
+            k, end = int(sa), min(int(sb), last)
+            a, b = since[k], until[end - 1]
+            dx, dy = x - curve[0, end], y - curve[4, end]
+            away = np.sqrt(dx * dx + dy * dy)
+            gb = away - curve[8, end]
+            slowest, fastest = _node_rates(base + node, dx, dy, away, b - a, tree)
+        else:
+            k = -node
+            end, h = k + 1, until[k] - since[k]
+            a, b = since[k] + sa * h, since[k] + sb * h
+            if sb == 1.0:
+                b, gb = until[k], _at_row(x, y, k + 1, curve)
+            else:
+                gb = distance_at(x, y, b, k, since, inverse, curve)[0]
+            slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
+        if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
+            if depth > 156 or not may_reach(ga, gb, slowest, fastest, b - a, on, off, reach):
                 ga = gb
-                continue
-            # times count from the block's begin, wherever it lies in `rows`
-            final, zero, base = gb, rows[begin], 4 * begin
-            length, start = rows[last] - zero, np.int64(zero + origin)
-            size = 1
-            while size < last - begin:
-                size *= 2
-            # pieces yet to be done, the next one on top: a node of the tree with its steps, or,
-            # with a number not above 0, a step with the part of it from sa to sb
-            stack[0, 0], stack[0, 1], stack[0, 2] = 1.0, begin, begin + size
-            depth = 1
-            while depth > 0:
-                depth -= 1
-                node = int(stack[depth, 0])
-                sa, sb = stack[depth, 1], stack[depth, 2]
-                # the end of a piece is the beginning of the next one, to the bit
-                if node > 0:
-                    k, end = int(sa), min(int(sb), last)
-                    a, b = rows[k] - zero, rows[end] - zero
-                    dx, dy = x - curve[end, 0], y - curve[end, 4]
-                    away = np.sqrt(dx * dx + dy * dy)
-                    gb = away - curve[end, 8]
-                    slowest, fastest = _node_rates(base + node, dx, dy, away, b - a, tree)
-                else:
-                    k = -node
-                    end, h = k + 1, rows[k + 1] - rows[k]
-                    a, b = rows[k] - zero + sa * h, rows[k] - zero + sb * h
-                    if sb == 1.0:
-                        b, gb = rows[k + 1] - zero, _at_row(x, y, k + 1, curve)
-                    else:
-                        gb = distance_at(x, y, b, k, zero, rows, inverse, curve)[0]
-                    slowest, fastest = _part_rates(x, y, sa, sb, k, h, curve)
-                on, off = state[y, x, ON], state[y, x, OFF]
-                if slowest < 0.0 < fastest and (fastest - slowest) * (b - a) > _DONE_PX:
-                    if depth > 156 or not may_reach(
-                        ga, gb, slowest, fastest, b - a, on, off, reach
-                    ):
-                        ga = gb
-                    elif node > 0 and end - k > 1:
-                        half = k + (int(sb) - k) // 2
-                        if half < end:
-                            stack[depth, 0], stack[depth, 1] = 2 * node + 1, half
-                            depth += 1
-                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = 2 * node, k, half
-                        depth += 1
-                    else:
-                        low, high = (0.0, 1.0) if node > 0 else (sa, sb)
-                        middle = 0.5 * (low + high)
-                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, middle, high
-                        depth += 1
-                        stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, low, middle
-                        depth += 1
-                    continue
-                falling = gb < ga
-                target = on if falling else off
-                # a pixel that is out of this disc's reach may be another one's
-                if (target < gb) if falling else (target > gb or ga >= reach):
-                    ga = gb
-                    continue
-                rise, step, level = gb - ga, threshold[y, x], state[y, x, LEVEL]
-                # on a monotone piece time is a function of distance; a cubic through both ends is
-                # the first guess, after which a smooth path needs one step of Newton's method
-                _, slope_a, away_a = distance_at(x, y, a, k, zero, rows, inverse, curve)
-                _, slope_b, away_b = distance_at(x, y, b, end - 1, zero, rows, inverse, curve)
-                scale_a = rise * away_a / slope_a if slope_a * rise > 0.0 else b - a
-                scale_b = rise * away_b / slope_b if slope_b * rise > 0.0 else b - a
-                begun = a
-                while (target >= gb) if falling else (target <= gb):
-                    t = begun
-                    if (target < ga) if falling else (target > ga):
-                        s = (target - ga) / rise
-                        u = 1.0 - s
-                        t = a + s * (
-                            s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b)
-                        )
-                        low, high = begun, b
-                        t = min(max(t, low), high)
-                        for _ in range(100):
-                            k = step_at(t, zero, rows, k)
-                            value, slope, away = distance_at(x, y, t, k, zero, rows, inverse, curve)
-                            miss = value - target
-                            if (miss > 0.0) == falling:
-                                low = t
-                            else:
-                                high = t
-                            before, t = t, t - miss * away / slope
-                            # also where the slope is 0 and t is no number
-                            if not low <= t <= high:
-                                t = 0.5 * (low + high)
-                                if high - low < 1e-9 * length:
-                                    break
-                            elif abs(t - before) < _NEWTON * length:
-                                break
-                    if falling:
-                        level += step
-                        state[y, x, OFF], state[y, x, LAST] = state[y, x, LAST], target
-                        target = rim_of(level + step, contrast, edge)
-                        state[y, x, ON] = target
-                    else:
-                        level -= step
-                        state[y, x, ON], state[y, x, LAST] = state[y, x, LAST], target
-                        target = rim_of(level - step, contrast, edge)
-                        state[y, x, OFF] = target
-                    out[n] = ((start + np.int64(t)) << 25) | code | np.int64(falling)
-                    n += 1
-                    begun = t
-                state[y, x, LEVEL] = level
-                ga = gb
-            ga = final
-        gaps[index] = ga
-    return n
+            elif node > 0 and end - k > 1:
+                half = k + (int(sb) - k) // 2
+                if half < end:
+                    stack[depth, 0], stack[depth, 1] = 2 * node + 1, half
+                    depth += 1
+                stack[depth, 0], stack[depth, 1], stack[depth, 2] = 2 * node, k, half
+                depth += 1
+            else:
+                low, high = (0.0, 1.0) if node > 0 else (sa, sb)
+                middle = 0.5 * (low + high)
+                stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, middle, high
+                depth += 1
+                stack[depth, 0], stack[depth, 1], stack[depth, 2] = -k, low, middle
+                depth += 1
+            continue
+        falling = gb < ga
+        target = on if falling else off
+        # a pixel that is out of this disc's reach may be another one's
+        if (target < gb) if falling else (target > gb or ga >= reach):
+            ga = gb
+            continue
+        rise, begun = gb - ga, a
+        # on a monotone part time is a function of distance; a cubic through both ends is the first
+        # guess, after which a smooth path needs one step of Newton's method
+        _, slope_a, away_a = distance_at(x, y, a, k, since, inverse, curve)
+        _, slope_b, away_b = distance_at(x, y, b, end - 1, since, inverse, curve)
+        scale_a = rise * away_a / slope_a if slope_a * rise > 0.0 else b - a
+        scale_b = rise * away_b / slope_b if slope_b * rise > 0.0 else b - a
+        while (target >= gb) if falling else (target <= gb):
+            if (target < ga) if falling else (target > ga):
+                s = (target - ga) / rise
+                u = 1.0 - s
+                t = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
+                t = min(max(t, begun), b)
+                begun = solve(
+                    x, y, target, falling, begun, b, t, k, piece[FINE], since, until, inverse, curve
+                )
+            if falling:
+                level += step
+                off, last_one = last_one, target
+                target = rim_of(level + step, contrast, edge)
+                on = target
+            else:
+                level -= step
+                on, last_one = last_one, target
+                target = rim_of(level - step, contrast, edge)
+                off = target
+            out[n] = (head + (np.int64(begun) << 25)) | np.int64(falling)
+            n += 1
+        ga = gb
+    return on, off, last_one, level, n

@@ -15,8 +15,10 @@ CUT = 5.0
 ON, OFF, LAST, LEVEL = 0, 1, 2, 3
 """Columns of a pixel's state: rim distance (px) of its next positive and negative event and of
 its last one, and its reference level of log intensity."""
-_TAIL = 1.0 / (1.0 + np.exp(CUT))
-_FAR = 1e6  # px; stands for a rim distance that is never reached
+TAIL = 1.0 / (1.0 + np.exp(CUT))
+"""What the logistic has left where the edge ends."""
+FAR = 1e6
+"""Stands for a rim distance that is never reached, px."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -27,7 +29,7 @@ def level_at(distance, contrast, edge):  # type: ignore[no-untyped-def]
     if distance <= -CUT * edge:
         return contrast
     share = 1.0 / (1.0 + np.exp(distance / edge))
-    return contrast * (share - _TAIL) / (1.0 - 2.0 * _TAIL)
+    return contrast * (share - TAIL) / (1.0 - 2.0 * TAIL)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -39,10 +41,10 @@ def rim_of(level, contrast, edge):  # type: ignore[no-untyped-def]
     """
     rounding = 1e-9 * contrast
     if level <= rounding:
-        return CUT * edge if level >= -rounding else _FAR
+        return CUT * edge if level >= -rounding else FAR
     if level >= contrast - rounding:
-        return -CUT * edge if level <= contrast + rounding else -_FAR
-    share = _TAIL + level / contrast * (1.0 - 2.0 * _TAIL)
+        return -CUT * edge if level <= contrast + rounding else -FAR
+    share = TAIL + level / contrast * (1.0 - 2.0 * TAIL)
     return edge * np.log((1.0 - share) / share)
 
 
@@ -54,7 +56,7 @@ def dark_pixels(threshold, contrast, edge):  # type: ignore[no-untyped-def]
     for y in range(height):
         for x in range(width):
             state[y, x, ON] = rim_of(threshold[y, x], contrast, edge)
-            state[y, x, OFF] = _FAR
+            state[y, x, OFF] = FAR
             state[y, x, LAST] = CUT * edge
             state[y, x, LEVEL] = 0.0
     return state

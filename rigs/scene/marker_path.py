@@ -42,8 +42,24 @@ def markers_in_image(loads, layout_mm, projection):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def largest(values, row, n):  # type: ignore[no-untyped-def]
+    """The largest of the first n of a row of numbers that are not below 0.
+
+    Of their bits, as integers, for only these have a maximum that is done side by side.
+    """
+    bits, most = values.view(np.int64)[row], np.int64(0)
+    for k in range(n):
+        most = max(most, bits[k])
+    bits[0] = most
+    return values[row, 0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
     """Whether marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
+    for c in range(3):
+        if path[i, c, begin] != path[i, c, stop]:
+            return False
     moves = 0
     for c in range(3):
         for k in range(begin, stop):
@@ -90,71 +106,110 @@ def nearest_row(k, first, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_block(path, i, row, first, last, shift, chord, inverse, weights, curve):  # type: ignore[no-untyped-def]
-    """Marker i as cubics between the rows of one block.
-
-    Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
-    is c0 + tau (c1 + s (c2 + s c3)), px; a row of `curve` has these of column, row and radius.
+def inner_weights(first, blocks, weights, inner):  # type: ignore[no-untyped-def]
+    """Weights of rows inside blocks, where a slope is taken through one row before and two after.
 
     Args:
-        path: column, row and radius of each marker, (n, 3, m).
-        row: row of `path` that is the block's first.
-        first, last: the block's first and last row.
-        chord: join rows by straight lines.
-        shift, inverse, weights: of `slope_weights`.
-        curve: (r, 12), written for steps `first` to `last` - 1; the places also at `last`.
+        first: first row of each block, and the last row of all.
+        weights: of `slope_weights`.
+        inner: (3, r), what the three rows count, written; 0 at the two rows at each end of a block.
     """
-    points = min(last - first + 1, 4)
-    for c in range(3):
-        for k in range(first, last + 1):
-            curve[k, 4 * c] = path[i, c, row + k - first]
-        for k in range(first, last + 1):
-            # differences: of what stands still, the slope is 0 to the bit
-            here, low, w = curve[k, 4 * c], nearest_row(k, first, last), k + shift
-            slope = weights[0, w] * (curve[low, 4 * c] - here)
-            slope += weights[1, w] * (curve[low + 1, 4 * c] - here)
-            if points > 2:
-                slope += weights[2, w] * (curve[low + 2, 4 * c] - here)
-            if points > 3:
-                slope += weights[3, w] * (curve[low + 3, 4 * c] - here)
-            curve[k, 4 * c + 1] = slope
-        for k in range(first, last):
-            rate = (curve[k + 1, 4 * c] - curve[k, 4 * c]) * inverse[k]
-            if chord:
-                curve[k, 4 * c + 1], curve[k, 4 * c + 2], curve[k, 4 * c + 3] = rate, 0.0, 0.0
-            else:
-                slope, after = curve[k, 4 * c + 1], curve[k + 1, 4 * c + 1]
-                curve[k, 4 * c + 2] = 3.0 * rate - 2.0 * slope - after
-                curve[k, 4 * c + 3] = slope + after - 2.0 * rate
+    for block in range(blocks):
+        begin, end = first[block], first[block + 1]
+        for k in range(begin, end):
+            inside = begin < k < end - 1
+            inner[0, k] = weights[0, k + block] if inside else 0.0
+            inner[1, k] = weights[2, k + block] if inside else 0.0
+            inner[2, k] = weights[3, k + block] if inside else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-untyped-def]
-    """Bounds of a block's rates as a tree, and how far the marker goes in it.
+def _slope(c, k, first, last, shift, weights, curve):  # type: ignore[no-untyped-def]
+    """Slope of coordinate c at row k of a block."""
+    # differences: of what stands still, the slope is 0 to the bit
+    here, low, slope = curve[4 * c, k], nearest_row(k, first, last), 0.0
+    for j in range(min(last - first + 1, 4)):
+        slope += weights[j, k + shift] * (curve[4 * c, low + j] - here)
+    return slope
 
-    A step's rates stay between the control points of the derivative as a Bezier curve. Node 1
-    holds for the whole block; below node j are 2 j and 2 j + 1; leaves begin at `size`.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_blocks(path, i, row, first, blocks, chord, inverse, weights, inner, curve):  # type: ignore[no-untyped-def]
+    """Marker i as cubics between the rows of some blocks.
+
+    Between rows k and k + 1, with tau = time - t[k] and s = tau / (t[k + 1] - t[k]), a coordinate
+    is c0 + tau (c1 + s (c2 + s c3)), px; a column of `curve` has these of column, row and radius.
 
     Args:
-        first, last: the block's first and last row in `t`.
-        size: leaves, a power of two, not less than the steps.
+        path: column, row and radius of each marker, (n, 3, m).
+        row: row of `path` that is the first of all.
+        first: first row of each block, and the last row of all.
+        chord: join rows by straight lines.
+        inverse, weights, inner: of `slope_weights` and `inner_weights`.
+        curve: (12, r), written for every step; the places also at the last row.
+    """
+    total = first[blocks]
+    for c in range(3):
+        source, place = path[i, c, row:], curve[4 * c]
+        for k in range(total + 1):
+            place[k] = source[k]
+        if chord:
+            for k in range(total):
+                rate = (curve[4 * c, k + 1] - curve[4 * c, k]) * inverse[k]
+                curve[4 * c + 1, k], curve[4 * c + 2, k], curve[4 * c + 3, k] = rate, 0.0, 0.0
+            continue
+        for k in range(total - 2):
+            here = curve[4 * c, k + 1]
+            curve[4 * c + 1, k + 1] = (
+                inner[0, k + 1] * (curve[4 * c, k] - here)
+                + inner[1, k + 1] * (curve[4 * c, k + 2] - here)
+                + inner[2, k + 1] * (curve[4 * c, k + 3] - here)
+            )
+        for block in range(blocks):
+            begin, end = first[block], first[block + 1]
+            curve[4 * c + 1, begin] = _slope(c, begin, begin, end, block, weights, curve)
+            if end - begin > 1:
+                curve[4 * c + 1, end - 1] = _slope(c, end - 1, begin, end, block, weights, curve)
+        for k in range(total - 1):
+            rate = (curve[4 * c, k + 1] - curve[4 * c, k]) * inverse[k]
+            slope, after = curve[4 * c + 1, k], curve[4 * c + 1, k + 1]
+            curve[4 * c + 2, k] = 3.0 * rate - 2.0 * slope - after
+            curve[4 * c + 3, k] = slope + after - 2.0 * rate
+        # a block's last slope looks at its own rows, not at those of the next block
+        for block in range(blocks):
+            begin, end = first[block], first[block + 1]
+            after = _slope(c, end, begin, end, block, weights, curve)
+            rate = (curve[4 * c, end] - curve[4 * c, end - 1]) * inverse[end - 1]
+            slope = curve[4 * c + 1, end - 1]
+            curve[4 * c + 2, end - 1] = 3.0 * rate - 2.0 * slope - after
+            curve[4 * c + 3, end - 1] = slope + after - 2.0 * rate
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
+    """Bounds of a block's rates as a tree.
+
+    A step's rates stay between the control points of the derivative as a Bezier curve. Node 1
+    holds for the whole block; below node j are 2 j and 2 j + 1; the
+    leaves are a power of two.
+
+    Args:
+        first, last: the block's first and last row.
         base: where the tree's node 0 is.
         tree: (nodes, 7): lowest rates of column, row and radius, the highest ones, px/ns, and the
             fastest speed of the centre; written.
-
-    Returns:
-        the lengths of the ways of column, row and radius, at most and together, px.
     """
-    whole = 0.0
+    size = 1
+    while size < last - first:
+        size *= 2
     leaves = base + size - first
     for c in range(3):
         for k in range(first, last):
-            begin = curve[k, 4 * c + 1]
-            middle = begin + curve[k, 4 * c + 2]
-            end = middle + curve[k, 4 * c + 2] + 3.0 * curve[k, 4 * c + 3]
-            low, high = min(begin, min(middle, end)), max(begin, max(middle, end))
-            tree[leaves + k, c], tree[leaves + k, 3 + c] = low, high
-            whole += max(high, -low) * (t[k + 1] - t[k])
+            begin = curve[4 * c + 1, k]
+            middle = begin + curve[4 * c + 2, k]
+            end = middle + curve[4 * c + 2, k] + 3.0 * curve[4 * c + 3, k]
+            tree[leaves + k, c] = min(begin, min(middle, end))
+            tree[leaves + k, 3 + c] = max(begin, max(middle, end))
         for k in range(last, first + size):
             tree[leaves + k, c], tree[leaves + k, 3 + c] = np.inf, -np.inf
         for j in range(size - 1, 0, -1):
@@ -164,32 +219,35 @@ def bound_rates(t, curve, first, last, size, base, tree):  # type: ignore[no-unt
     for j in range(base + 1, base + 2 * size):
         x, y = max(tree[j, 3], -tree[j, 0]), max(tree[j, 4], -tree[j, 1])
         tree[j, 6] = np.sqrt(x * x + y * y)
-    return whole
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def excursion(t, curve, first, last):  # type: ignore[no-untyped-def]
-    """How far a marker strays between two rows, px: (from its start, from the chord to its end).
+def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
+    """How far a marker strays up to a row, px: (from its start, from the chord to its end).
 
-    The control points of its cubics hold the path, and distances from a point or from a segment
-    are convex, so the farthest control point bounds them. Growth counts like a move.
+    At most: the rows' distances from the chord, and how far a cubic is from the line between its
+    rows, which is h s (1 - s) (c2 + c3 (1 + s)). Growth counts like a move.
+
+    Args:
+        spread: scratch, (4, at least the rows).
     """
-    x, y, r = curve[first, 0], curve[first, 4], curve[first, 8]
-    dx, dy, dr = curve[last, 0] - x, curve[last, 4] - y, curve[last, 8] - r
+    x, y, r = curve[0, 0], curve[4, 0], curve[8, 0]
+    dx, dy, dr = curve[0, last] - x, curve[4, last] - y, curve[8, last] - r
     square = dx * dx + dy * dy + dr * dr
     scale = 1.0 / square if square > 0.0 else 0.0
-    far, far_r = dx * dx + dy * dy, abs(dr)
-    off, off_r = 0.0, 0.0
-    for k in range(first, last):
-        third = (t[k + 1] - t[k]) / 3.0
-        for j in range(3):
-            # the control points of step k: its first one, and the two between its ends
-            a, b = third * j, third * (j == 2)
-            px = curve[k, 0] + a * curve[k, 1] + b * curve[k, 2] - x
-            py = curve[k, 4] + a * curve[k, 5] + b * curve[k, 6] - y
-            pr = curve[k, 8] + a * curve[k, 9] + b * curve[k, 10] - r
-            far, far_r = max(far, px * px + py * py), max(far_r, abs(pr))
-            s = min(max((px * dx + py * dy + pr * dr) * scale, 0.0), 1.0)
-            ex, ey = px - s * dx, py - s * dy
-            off, off_r = max(off, ex * ex + ey * ey), max(off_r, abs(pr - s * dr))
-    return np.sqrt(far) + far_r, np.sqrt(off) + off_r
+    for k in range(last):
+        gx, gy, gr = curve[0, k] - x, curve[4, k] - y, curve[8, k] - r
+        s = min(max((gx * dx + gy * dy + gr * dr) * scale, 0.0), 1.0)
+        gx, gy = gx - s * dx, gy - s * dy
+        spread[0, k] = gx * gx + gy * gy
+        spread[1, k] = abs(gr - s * dr)
+    for k in range(last):
+        quarter = 0.25 * (t[k + 1] - t[k])
+        ex, ey = curve[2, k] + curve[3, k], curve[6, k] + curve[7, k]
+        er = curve[10, k] + curve[11, k]
+        ex, ey = max(abs(ex), abs(ex + curve[3, k])), max(abs(ey), abs(ey + curve[7, k]))
+        spread[2, k] = quarter * quarter * (ex * ex + ey * ey)
+        spread[3, k] = quarter * max(abs(er), abs(er + curve[11, k]))
+    most = np.sqrt(largest(spread, 0, last)) + largest(spread, 1, last)
+    most += np.sqrt(largest(spread, 2, last)) + largest(spread, 3, last)
+    return np.sqrt(dx * dx + dy * dy) + abs(dr) + most, most

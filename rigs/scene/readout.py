@@ -15,6 +15,7 @@ is never read.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from rigs.scene.sorting import sort_packed
@@ -88,10 +89,11 @@ def read_scans(  # type: ignore[no-untyped-def]
     start_ns = phase_ns + first * period_ns
     lead_ns = base_ns - start_ns + period_ns - 1
     past = (end_ns - phase_ns) // period_ns - first
-    left, inside = 0, 0
+    left, inside, per_ns = 0, 0, 1.0 / period_ns
     for k in range(n):
         event = events[k]
-        scan = ((event >> 25) + lead_ns) // period_ns
+        # exact, for a half is far more than what rounding adds, and cheaper than a division
+        scan = np.int64(((event >> 25) + lead_ns + 0.5) * per_ns)
         if scan > past:
             events[left] = event
             left += 1

@@ -1,8 +1,8 @@
 """Events of all markers along their paths, block by block: what `rigs.scene.events` runs on.
 
-In a block each marker's path is fitted, the pixels that may fire are picked from its list, and
-each of them is asked whether its distance from the rim meets a threshold. Noise is added, and the
-block is read out. Blocks lie on a grid of true time and nothing looks past their borders.
+In a block each marker's path is fitted and cut into pieces, the pixels that may fire are picked
+from its list, and tiles of them go through the pieces. Noise is added, and the block is read out.
+Blocks lie on a grid of true time and nothing looks past their borders.
 """
 
 from __future__ import annotations
@@ -10,18 +10,21 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.crossings import events_of_pixels
 from rigs.scene.edges import CUT, widen
 from rigs.scene.marker_path import (
-    bound_rates,
     excursion,
-    fit_block,
+    fit_blocks,
+    inner_weights,
     markers_in_image,
     slope_weights,
     stands_still,
 )
 from rigs.scene.noise import noise_events
+from rigs.scene.pieces import FIELDS, cut_block, farthest
+from rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
+from rigs.scene.pixels import events_of_pixels
 from rigs.scene.readout import read_each, read_scans
+from rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
 
 SPAN_NS = 96_000_000
@@ -84,13 +87,18 @@ def trace(  # type: ignore[no-untyped-def]
     """
     path = markers_in_image(loads, layout_mm, projection)
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
-    rows, inverse, curve = np.empty(total), np.empty(total), np.empty((total, 12))
-    weights, tree, stack = np.empty((4, 2 * total)), np.empty((4 * total, 7)), np.empty((160, 3))
-    first, stray = np.empty(total, np.int64), np.empty(total)
+    rows, inverse = np.empty(total), np.empty(total)
+    since, until = np.empty(total), np.empty(total)
+    curve, weights, spread = np.empty((12, total)), np.empty((4, 2 * total)), np.empty((4, total))
+    tree, stack, pieces = np.empty((4 * total, 7)), np.empty((160, 3)), np.empty((total, FIELDS))
+    first, behind = np.empty(total, np.int64), np.empty(total, np.int64)
+    inner, steps = np.empty((3, total)), np.empty((total, STEP_FIELDS))
+    tile, fire = np.empty(STRIDE * PIXEL_FIELDS), np.empty(STRIDE * FIRE_FIELDS)
+    wait = np.empty(STRIDE * WAIT_FIELDS)
     slots, hit = np.empty(place.shape[1], np.int64), np.empty(place.shape[1], np.uint8)
     pixels, gaps = np.empty(place.shape[1], np.int64), np.empty(place.shape[1])
     # of the profile, at the rim: a pixel has no more events than its level goes up and down
-    steepest = 0.26 * contrast / edge
+    steepest, reach = 0.26 * contrast / edge, CUT * edge
     capacity = (1 << 13) + pending.shape[0] + noise_t.shape[0]
     events, other = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     room = 1 << 13
@@ -116,55 +124,66 @@ def trace(  # type: ignore[no-untyped-def]
                 base_ns, leak_below, contrast, edge, path[:, :, begin + first[block]], events, n,
             )  # fmt: skip
         for block in range(blocks):
-            slope_weights(rows, first[block], first[block + 1], block, inverse, weights)
+            a, b = first[block], first[block + 1]
+            slope_weights(rows, a, b, block, inverse, weights)
+            for k in range(a, b):
+                since[k], until[k] = rows[k] - rows[a], rows[k + 1] - rows[a]
+        inner_weights(first, blocks, weights, inner)
         for i in range(path.shape[0]):
             if stands_still(path, i, begin, stop):
                 continue
-            for block in range(blocks):
-                a, b = first[block], first[block + 1]
-                fit_block(path, i, begin + a, a, b, block, chord, inverse, weights, curve)
-            strays, off_chord = excursion(rows, curve, 0, last)
+            fit_blocks(path, i, begin, first, blocks, chord, inverse, weights, inner, curve)
+            strays, off_chord = excursion(rows, curve, last, spread)
             column, row, radius = path[i, 0, begin], path[i, 1, begin], path[i, 2, begin]
             listed = reaches(i, column, row, radius, strays, origin)
             if not listed and strays <= REACH_PX:
                 listed = make_list(i, column, row, radius, state, edge, pixels, origin, aim, place)
             end_x, end_y, end_r = path[i, 0, stop], path[i, 1, stop], path[i, 2, stop]
+            count = 0
             if listed:
                 count = may_fire(
                     i, column, row, radius, end_x - column, end_y - row, end_r - radius,
                     off_chord, origin, aim, place, hit, slots, pixels,
                 )  # fmt: skip
+                if count == 0:
+                    continue
             else:
                 origin[i, 3] = 0.0
-                band = CUT * edge + strays
-                count = near_rim(column, row, radius, band, height, width, pixels)
-                if count > pixels.shape[0]:
-                    pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
-                    near_rim(column, row, radius, band, height, width, pixels)
-            if count == 0:
-                continue
-            widen(i, column, row, radius + CUT * edge + strays, seen)
-            whole = 0.0
+            widen(i, column, row, radius + reach + strays, seen)
+            amount = 0
             for block in range(blocks):
-                a, b = first[block], first[block + 1]
-                size = 1
-                while size < b - a:
-                    size *= 2
-                whole += bound_rates(rows, curve, a, b, size, 4 * a, tree)
-                dx, dy = curve[b, 0] - curve[a, 0], curve[b, 4] - curve[a, 4]
-                square = dx * dx + dy * dy
-                nearest = radius - CUT * edge - 2.0 * strays
-                # a distance from a point that moves straight sags below a line by that much
-                sag = 0.125 * square / nearest if nearest > 0.0 else np.inf
-                stray[block] = excursion(rows, curve, a, b)[1] + sag
-            most = n + count * (int(steepest * whole / lowest) + 2)
-            if most > capacity:
-                capacity = 2 * most
-                events, other = larger(events, capacity), np.empty(capacity, np.int64)
-            n = events_of_pixels(
-                pixels, count, rows, inverse, curve, first, blocks, stray, tree, threshold,
-                contrast, edge, period_ns, stack, state, gaps, events, n,
-            )  # fmt: skip
+                amount = cut_block(
+                    first[block], first[block + 1], block, rows[first[block]], reach, since,
+                    until, curve, spread, pieces, amount,
+                )  # fmt: skip
+                behind[block] = amount
+            pack_steps(last, since, inverse, curve, steps)
+            # pixels that are not from a list are those near the rim, block by block
+            piece = 0
+            for block in range(blocks):
+                end = amount if listed else behind[block]
+                whole = 0.0
+                for k in range(piece, end):
+                    whole += farthest(pieces[k])
+                if not listed:
+                    at = begin + first[block]
+                    x, y, r, band = path[i, 0, at], path[i, 1, at], path[i, 2, at], reach + whole
+                    count = near_rim(x, y, r, band, height, width, pixels)
+                    if count > pixels.shape[0]:
+                        pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
+                        near_rim(x, y, r, band, height, width, pixels)
+                most = n + count * (int(steepest * whole / lowest) + 2)
+                if most > capacity:
+                    capacity = 2 * most
+                    events, other = larger(events, capacity), np.empty(capacity, np.int64)
+                n = events_of_pixels(
+                    pixels, count, pieces[piece:end], first, since, until, inverse, curve, steps,
+                    tree, threshold, contrast, edge, period_ns, stack, tile, fire, wait, state,
+                    gaps, events, n,
+                )  # fmt: skip
+                piece = end
+                if listed:
+                    break
             if listed:
                 renew(i, end_x, end_y, end_r, slots, pixels, gaps, count, state, edge, origin, aim)
         if kept + n > room:

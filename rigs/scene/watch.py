@@ -96,6 +96,9 @@ def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place): 
                 aim[i, BEND, n] = 0.5 * inverse
                 aim[i, RISE, n], aim[i, FALL, n] = rise, fall
                 n += 1
+        for k in range(n, (n + 7) // 8 * 8):
+            aim[i, UX, k], aim[i, UY, k], aim[i, BEND, k] = 0.0, 0.0, 0.0
+            aim[i, RISE, k], aim[i, FALL, k] = _NEVER_PX, _NEVER_PX
     origin[i, 0], origin[i, 1], origin[i, 2] = column, row, radius
     origin[i, _COUNT] = n if fits else 0.0
     origin[i, _NEAREST] = radius - band
@@ -118,7 +121,7 @@ def may_fire(  # type: ignore[no-untyped-def]
 
     Args:
         stray: how far the way is from its chord at most, px.
-        hit: scratch, bytes, a multiple of eight of them, at least as many as slots.
+        hit: scratch, bytes, a multiple of eight of them, as many as slots.
         slots, pixels: slots and places of these pixels, written.
 
     Returns:
@@ -135,28 +138,27 @@ def may_fire(  # type: ignore[no-untyped-def]
     # along the chord the bending term is a parabola; this is how far it and a line are apart
     bow = 0.25 * (dx * dx + dy * dy) / nearest
     margin = np.float32(stray * (1.0 + moved / left) + 2.0 * rest + bow) + _SPARE_PX
-    x, y, grown = np.float32(to_x), np.float32(to_y), np.float32(radius + dr - origin[i, 2])
-    way_x, way_y, growth = np.float32(dx), np.float32(dy), np.float32(dr)
+    x, y = np.float32(from_x + 0.5 * dx), np.float32(from_y + 0.5 * dy)
+    grown = np.float32(radius + 0.5 * dr - origin[i, 2])
+    half_x, half_y, half_r = np.float32(0.5 * dx), np.float32(0.5 * dy), np.float32(0.5 * dr)
     count = int(origin[i, _COUNT])
     ux, uy, bend, rise, fall = aim[i, UX], aim[i, UY], aim[i, BEND], aim[i, RISE], aim[i, FALL]
-    for k in range(count):
+    # slots behind the last one have thresholds that are never met
+    for k in range((count + 7) // 8 * 8):
         across = ux[k] * y - uy[k] * x
-        turn = ux[k] * way_y - uy[k] * way_x
-        end = ux[k] * x + uy[k] * y - across * across * bend[k] + grown
-        start = end - (ux[k] * way_x + uy[k] * way_y + growth)
-        start += (across + across - turn) * turn * bend[k]
-        hit[k] = (
-            (end + margin >= rise[k]) | (start + margin >= rise[k])
-            | (margin - end >= fall[k]) | (margin - start >= fall[k])
-        )  # fmt: skip
+        bent = across * bend[k]
+        turn = ux[k] * half_y - uy[k] * half_x
+        # halfway, and how far from that at both ends
+        middle = ux[k] * x + uy[k] * y + grown - across * bent
+        far = abs(ux[k] * half_x + uy[k] * half_y + half_r - (bent + bent) * turn) + margin
+        hit[k] = (middle + far >= rise[k]) | (far - middle >= fall[k])
     n = 0
     groups = hit.view(np.uint64)
     for group in range((count + 7) // 8):
         if groups[group] != 0:
-            for k in range(8 * group, min(8 * group + 8, count)):
-                if hit[k]:
-                    slots[n], pixels[n] = k, place[i, k]
-                    n += 1
+            for k in range(8 * group, 8 * group + 8):
+                slots[n], pixels[n] = k, place[i, k]
+                n += hit[k]
     return n
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from rigs.scene.edges import CUT
 from rigs.scene.events import EventOptics, Events, MarkerSensor
-from rigs.scene.marker_path import excursion, fit_block, slope_weights
+from rigs.scene.marker_path import excursion, fit_blocks, inner_weights, slope_weights
 
 QUIET = {
     "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,
@@ -178,17 +178,19 @@ def test_a_block_follows_a_polynomial_that_it_can_hold(rows: int) -> None:
     )
     path = np.zeros((1, 3, rows))
     path[0, 0] = polynomial(t)
-    curve, inverse, weights = np.empty((rows, 12)), np.empty(rows), np.empty((4, rows + 1))
-    slope_weights(t, 0, rows - 1, 1, inverse, weights)
-    fit_block(path, 0, 0, 0, rows - 1, 1, False, inverse, weights, curve)
+    curve, inverse, weights = np.empty((12, rows)), np.empty(rows), np.empty((4, rows + 1))
+    inner, first = np.empty((3, rows)), np.array([0, rows - 1])
+    slope_weights(t, 0, rows - 1, 0, inverse, weights)
+    inner_weights(first, 1, weights, inner)
+    fit_blocks(path, 0, 0, first, 1, False, inverse, weights, inner, curve)
     for k in range(rows - 1):
         for s in (0.0, 0.3, 0.5, 1.0):
             tau = s * (t[k + 1] - t[k])
-            c = curve[k, :4]
+            c = curve[:4, k]
             value = c[0] + tau * (c[1] + s * (c[2] + s * c[3]))
             assert value == pytest.approx(polynomial(t[k] + tau), abs=1e-12)
     fine = np.linspace(0.0, t[-1], 2001)
-    strays, off_chord = excursion(t, curve, 0, rows - 1)
+    strays, off_chord = excursion(t, curve, rows - 1, np.empty((4, rows)))
     assert strays >= np.abs(polynomial(fine) - polynomial(0.0)).max() - 1e-12
     chord = sorted((polynomial(0.0), polynomial(t[-1])))
     outside = np.maximum(chord[0] - polynomial(fine), polynomial(fine) - chord[1]).max()
