@@ -1,0 +1,161 @@
+"""The tables of the page about clocks: by campaign, the worst trials, and what was set aside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.report import Table, number
+from flows.campaigns import Collected
+from flows.sync_series import All
+from flows.sync_trials import DEVICES, TrialClocks
+from storage.files import read_json
+from storage.writer import RECORD
+
+ROWS = 10
+"""So many of the worst trials are shown."""
+
+
+def by_campaign(shown: All) -> Table:
+    """One row a campaign and device."""
+    rows = []
+    for campaign, trials in shown.campaigns.items():
+        for name in DEVICES:
+            there = [trial.devices[name] for trial in trials if name in trial.devices]
+            if not there:
+                continue
+            uncertain = [device.against_events_us for device in there]
+            drift = [device.drift_ppm for device in there if device.drift_ppm is not None]
+            gates = sorted({device.gate_us for device in there if device.gate_us is not None})
+            rows.append([
+                campaign,
+                name,
+                " or ".join(sorted({device.grade for device in there})),
+                " or ".join(sorted({device.kind for device in there})),
+                number(float(np.median(uncertain))),
+                number(max(uncertain)),
+                " or ".join(f"{gate:g}" for gate in gates) or "–",
+                f"{min(drift):.2f} to {max(drift):.2f}" if drift else "–",
+                str(len(there)),
+                str(sum(trial.changed for trial in trials)),
+            ])  # fmt: skip
+    return Table(
+        (
+            "campaign", "device", "grade", "uncertainty is", "median (µs)", "worst (µs)",
+            "gate (µs)", "drift (ppm)", "trials", "refitted clocks in use",
+        ),
+        rows,
+        "Uncertainty of events is that of their own clock; of frames and arm, that of events "
+        "against them.",
+    )  # fmt: skip
+
+
+def _grades(trial: TrialClocks) -> str:
+    return ", ".join(f"{name}: {device.grade}" for name, device in trial.devices.items())
+
+
+def _against(trial: TrialClocks, name: str) -> str:
+    return number(trial.devices[name].against_events_us) if name in trial.devices else "–"
+
+
+def most_uncertain(shown: All) -> Table:
+    """The trials with the highest uncertainty."""
+    worst = sorted((trial for _, trial in shown.rows), key=lambda trial: -trial.worst_us)[:ROWS]
+    rows = [
+        [
+            trial.name,
+            trial.campaign,
+            str(trial.number),
+            *(_against(trial, name) for name in DEVICES),
+            _grades(trial),
+        ]
+        for trial in worst
+    ]
+    columns = ("trial", "campaign", "taken as", *(f"{name} (µs)" for name in DEVICES), "grades")
+    return Table(columns, rows, "The highest uncertainty first.")
+
+
+def most_missed(shown: All) -> Table:
+    """The trials in which most pulses were missed."""
+    hit = sorted((trial for _, trial in shown.rows if trial.missed), key=lambda t: -t.missed)
+    rows = [
+        [trial.name, trial.campaign, str(trial.number), *_counts(trial), _grades(trial)]
+        for trial in hit[:ROWS]
+    ]
+    columns = ("trial", "campaign", "taken as", *DEVICES, "grades")
+    words = "Pulses missed / late / spurious, of those sent; most missed first."
+    return Table(columns, rows, words if rows else "No device missed a pulse in any trial.")
+
+
+def _counts(trial: TrialClocks) -> list[str]:
+    found = []
+    for name in DEVICES:
+        pulses = trial.devices[name].pulses if name in trial.devices else None
+        shown = [pulses[kind] for kind in ("missed", "late", "spurious")] if pulses else []
+        found.append(" / ".join(map(str, shown)) or "–")
+    return found
+
+
+def doubtful(shown: All) -> Table:
+    """Committed trials that would not be kept today."""
+    rows = [[trial.name, trial.campaign, trial.doubt] for _, trial in shown.rows if trial.doubt]
+    return Table(("trial", "campaign", "why"), rows, "Committed trials; look at them by hand.")
+
+
+def quarantined(campaigns: Sequence[Collected]) -> Table:
+    """Attempts that were set aside because of a clock, with the reason in words."""
+    rows = []
+    for item in campaigns:
+        for known in item.campaign.quarantined():
+            reason = _reason(item.campaign.folder / "quarantine" / str(known["folder"]), known)
+            if reason:
+                attempt = known.get("attempt")
+                shown = "–" if attempt is None else str(attempt)
+                rows.append([str(known["trial"]), item.name, shown, reason])
+    return Table(
+        ("trial", "campaign", "attempt", "why it was set aside"),
+        rows,
+        "Attempts in quarantine because of a clock.",
+    )
+
+
+def _reason(folder: Path, known: dict[str, Any]) -> str:
+    """Why, as far as clocks go; empty where it was something else."""
+    if "gate: " not in str(known["cause"]) or not (folder / RECORD).exists():
+        return ""
+    gates = read_json(folder / RECORD)["quality"]["gates"]
+    failed = {name: gate for name, gate in gates.items() if not gate["passed"]}
+    return "; ".join(
+        words(name, gate)
+        for start, words in _WORDS.items()
+        for name, gate in failed.items()
+        if name.startswith(start)
+    )
+
+
+def _uncertainty(name: str, gate: dict[str, Any]) -> str:
+    device = name.removeprefix("sync_uncertainty_").removesuffix("_s")
+    if isinstance(gate["value"], str):
+        return f"{device} has no clock: {gate['value']}"
+    return (
+        f"{device} ({gate['grade']}): uncertain by {1e6 * gate['value']:.1f} µs, "
+        f"{1e6 * gate['limit']:g} µs are allowed"
+    )
+
+
+def _unvouched(name: str, gate: dict[str, Any]) -> str:
+    if gate["value"] < 0:
+        return "nobody knows which part of the recording the pulses vouch for"
+    return (
+        f"the recording goes on for {gate['value']:.2f} s beyond the pulses on which a clock "
+        f"stands, {gate['limit']:g} s are allowed"
+    )
+
+
+_WORDS: dict[str, Callable[[str, dict[str, Any]], str]] = {
+    "sync_uncertainty_": _uncertainty,
+    "sync_unvouched_s": _unvouched,
+}
