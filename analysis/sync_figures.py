@@ -115,7 +115,7 @@ def over_trials(
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(
-            len(panels), 1, figsize=(7.6, 1.9 * len(panels) + 0.9), sharex=True, squeeze=False
+            len(panels), 1, figsize=(7.6, 1.8 * len(panels) + 1.3), sharex=True, squeeze=False
         )
         handles: dict[str, Any] = {}
         for axes, panel in zip(grid[:, 0], panels, strict=True):
@@ -139,10 +139,11 @@ def over_trials(
 
 
 def _panel(axes: Any, panel: OverTrials) -> None:
-    for device, (name, numbers, values) in panel.series.items():
+    beside = 0.15 * (np.arange(len(panel.series)) - (len(panel.series) - 1) / 2)
+    for (device, (name, numbers, values)), aside in zip(panel.series.items(), beside, strict=True):
         axes.plot(
-            numbers, values, MARKS.get(device, "o"), ms=3.5, mew=0, alpha=0.75,
-            color=COLOURS.get(device, RED), label=name, rasterized=len(numbers) > DENSE,
+            np.asarray(numbers) + aside, values, MARKS[device], ms=4, mew=0, alpha=0.75,
+            color=COLOURS[device], label=name, rasterized=len(numbers) > DENSE,
         )  # fmt: skip
     for gate in panel.gates:
         axes.plot(

@@ -155,13 +155,15 @@ def sync(
     if as_json:
         console.print_json(result)
         return
-    from flows.sync import COLUMNS, table_rows
+    from flows.sync import COLUMNS, tables
 
-    simulated = " (simulated)" if result["simulated"] else ""
-    console.print_table(f"Clocks{simulated}", COLUMNS, table_rows(result))
+    for title, rows in tables(result):
+        console.print_table(title, COLUMNS, rows)
     console.results.print(
-        "Uncertainty of frames and arm: of events against them, both clocks together."
+        "Median and worst: uncertainty of events against the device, both clocks together; "
+        "of events that of their own clock."
     )
+    simulated = " (simulated)" if result["simulated"] else ""
     console.results.print(f"Page{simulated}: {Path(result['page']).resolve()}", soft_wrap=True)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from analysis import labelling
 from flows.campaigns import Collected
-from flows.trial_work import Made, TrialWork, run_trials, stale_trials
+from flows.trial_work import TrialWork, run_trials, stale_trials
 from protocols.settings import Labelling
 from storage.derived import make_key
 from storage.recording import Recording
@@ -30,15 +30,9 @@ def _wanted(campaigns: list[Collected]) -> list[TrialWork]:
     ]
 
 
-def _label_one(work: TrialWork) -> Made:
-    """Runs in a process of its own."""
-    label = labelling.label_recording(work.recording, work.settings)
-    return label.as_json(), label.as_arrays()
-
-
 def label(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     """Label every trial of `campaigns` that needs it."""
     wanted = _wanted(campaigns)
     stale = stale_trials(store, STEP, wanted)
-    run_trials(store, STEP, "label", stale, _label_one)
+    run_trials(store, STEP, "label", stale, labelling.label_results)
     return {"step": "label", "done": len(stale), "fresh": len(wanted) - len(stale)}

@@ -8,7 +8,6 @@ its results become stale exactly then.
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -16,50 +15,21 @@ import numpy as np
 from analysis import synchronise
 from flows import console
 from flows.campaigns import Collected
+from flows.sync_fit import DEVICES, fit_again
 from flows.sync_page import PAGE, render
-from flows.sync_trials import DEVICES, TrialClocks, read_trials, same_clocks
-from flows.trial_work import Made, TrialWork, run_trials, stale_trials
+from flows.sync_trials import TrialClocks, read_trials
+from flows.trial_work import TrialWork, run_trials, stale_trials
 from storage.derived import Derived, make_key
 from storage.files import write_text
 from storage.recording import Recording
 from storage.store import SYNC, Store
 
 PAGE_VERSION = 1
-POINTS = 200
-"""So many residuals are kept of a device in a trial, evenly spread over it."""
 
 
 def sync_key(recording: Recording) -> str:
     """The key of a trial's clocks, fitted again."""
     return make_key(SYNC, synchronise.VERSION, recording.raw_checksum, None)
-
-
-def _fit_one(work: TrialWork) -> Made:
-    """Runs in a process of its own."""
-    recording = work.recording
-    found = synchronise.synchronise_recording(recording)
-    # as a file gives them back, which is how the record has them
-    clocks = json.loads(json.dumps(found.to_json()))
-    known = recording.record["clocks"]
-    data: dict[str, Any] = {"raw": recording.raw_checksum, "refused": found.refused}
-    # a clock that is refused now is told to people; it is no better one
-    if all(name in found.devices for name in DEVICES if name in known) and not same_clocks(
-        clocks, known
-    ):
-        data["clocks"] = clocks
-    return data, _residuals(found)
-
-
-def _residuals(found: synchronise.TrialSync) -> dict[str, Any]:
-    """Residuals over the trial's time by device: ``NAME_s`` and ``NAME_us``."""
-    fits = {name: device.fit for name, device in found.devices.items() if device.fit is not None}
-    begin = min((int(fit.pulse_ns[0]) for fit in fits.values()), default=0)
-    arrays: dict[str, Any] = {}
-    for name, fit in fits.items():
-        some = np.unique(np.linspace(0, fit.pulse_ns.size - 1, POINTS).round().astype(np.int64))
-        arrays[f"{name}_s"] = (fit.pulse_ns[some] - begin) / 1e9
-        arrays[f"{name}_us"] = fit.residual_ns[some] / 1e3
-    return arrays
 
 
 def sync(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
@@ -70,7 +40,7 @@ def sync(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         for _, recording in item.trials
     ]
     stale = stale_trials(store, SYNC, wanted)
-    run_trials(store, SYNC, "sync", stale, _fit_one)
+    run_trials(store, SYNC, "sync", stale, fit_again)
     for work in wanted:
         work.recording.forget_clocks()
     trials = {item.name: read_trials(store, item) for item in campaigns}
@@ -118,7 +88,7 @@ def campaign_numbers(trials: list[TrialClocks], fitted: int) -> dict[str, Any]:
         if not there:
             continue
         uncertainty = [device.against_events_us for device in there]
-        drift = [device.drift_ppm for device in there if device.drift_ppm is not None]
+        drift = [device.drift_ppm for device in there]
         wired = [device.pulses for device in there if device.pulses is not None]
         devices[name] = {
             "grade": " or ".join(sorted({device.grade for device in there})),
@@ -126,7 +96,7 @@ def campaign_numbers(trials: list[TrialClocks], fitted: int) -> dict[str, Any]:
                 "median": float(np.median(uncertainty)),
                 "worst": max(uncertainty),
             },
-            "drift_ppm": [min(drift), max(drift)] if drift else None,
+            "drift_ppm": [min(drift), max(drift)],
             "pulses": {
                 kind: sum(pulses[kind] for pulses in wired)
                 for kind in ("missed", "late", "spurious")
@@ -143,30 +113,31 @@ def campaign_numbers(trials: list[TrialClocks], fitted: int) -> dict[str, Any]:
     }
 
 
-def table_rows(result: dict[str, Any]) -> list[list[str]]:
-    """What `sliplab sync` prints, under `COLUMNS`."""
-    rows = []
+def tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """What `sliplab sync` prints of every campaign: a title, and rows under `COLUMNS`."""
+    found = []
+    simulated = " (simulated)" if result["simulated"] else ""
     for campaign, known in result["campaigns"].items():
-        trials = f"{known['refitted']} / {known['changed']}"
-        for device, found in known["devices"].items():
-            drift, pulses, uncertain = (
-                found["drift_ppm"], found["pulses"], found["uncertainty_us"]
-            )  # fmt: skip
-            rows.append([
-                campaign,
-                device,
-                found["grade"],
-                f"{uncertain['median']:.1f}",
-                f"{uncertain['worst']:.1f}",
-                "-" if drift is None else f"{drift[0]:.2f} to {drift[1]:.2f}",
-                "-" if pulses is None else " / ".join(map(str, pulses.values())),
-                trials,
-            ])  # fmt: skip
-    return rows
+        rows = []
+        for device, numbers in known["devices"].items():
+            drift, pulses = numbers["drift_ppm"], numbers["pulses"]
+            rows.append(
+                [
+                    device,
+                    numbers["grade"],
+                    f"{numbers['uncertainty_us']['median']:.1f}",
+                    f"{numbers['uncertainty_us']['worst']:.1f}",
+                    f"{drift[0]:.1f} to {drift[1]:.1f}",
+                    "-" if pulses is None else " / ".join(map(str, pulses.values())),
+                ]
+            )
+        trials = f"{known['trials']} trials, {known['refitted']} refitted"
+        title = f"Clocks of {campaign}{simulated}: {trials}, {known['changed']} changed"
+        found.append((title, rows))
+    return found
 
 
 COLUMNS = (
-    "campaign", "device", "grade", "median (µs)", "worst (µs)", "drift (ppm)",
-    "missed / late / spurious", "trials refitted / changed",
+    "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
 )  # fmt: skip
 """Uncertainties are of events against the device, both clocks together; of events, their own."""

@@ -119,7 +119,8 @@ def _drift(shown: All, simulated: bool) -> Section:
         [
             "What the box gains on a device. The drift of the box cannot be told from that of the "
             "device: when all devices move together it is most likely the box that moved, when one "
-            "moves alone it is that one.",
+            "moves alone it is that one. Where frames are timed by their arrival, it is the "
+            "host's clock that drifts.",
         ],
         [
             Figure(

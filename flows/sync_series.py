@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from analysis.sync_figures import Gate, OverTrials, Residuals
-from flows.sync_trials import DEVICES, DeviceClocks, TrialClocks
+from flows.sync_fit import DEVICES
+from flows.sync_trials import DeviceClocks, TrialClocks
 
 
 class All:

@@ -10,8 +10,9 @@ import numpy as np
 
 from analysis.report import Table, number
 from flows.campaigns import Collected
+from flows.sync_fit import DEVICES
 from flows.sync_series import All
-from flows.sync_trials import DEVICES, TrialClocks
+from flows.sync_trials import TrialClocks
 from storage.files import read_json
 from storage.writer import RECORD
 
@@ -28,7 +29,7 @@ def by_campaign(shown: All) -> Table:
             if not there:
                 continue
             uncertain = [device.against_events_us for device in there]
-            drift = [device.drift_ppm for device in there if device.drift_ppm is not None]
+            drift = [device.drift_ppm for device in there]
             gates = sorted({device.gate_us for device in there if device.gate_us is not None})
             rows.append([
                 campaign,
@@ -38,7 +39,7 @@ def by_campaign(shown: All) -> Table:
                 number(float(np.median(uncertain))),
                 number(max(uncertain)),
                 " or ".join(f"{gate:g}" for gate in gates) or "–",
-                f"{min(drift):.2f} to {max(drift):.2f}" if drift else "–",
+                f"{min(drift):.2f} to {max(drift):.2f}",
                 str(len(there)),
                 str(sum(trial.changed for trial in trials)),
             ])  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,17 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flows.campaigns import Collected
+from flows.sync_fit import DEVICES
+from storage.clockmap import ClockMap
 from storage.derived import Derived
 from storage.recording import Recording
 from storage.store import SYNC, Store
 
 F64 = npt.NDArray[np.float64]
-
-DEVICES = ("events", "frames", "arm")
-_SAME = 1e-9
-"""Figures that differ by less than this share came from the same fit on another processor."""
-_SAME_DRIFT = 10**6
-"""Parts in 10**18: a nanosecond over a quarter of an hour."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +28,7 @@ class DeviceClocks:
         kind: ``95 %`` or ``hard bound``: what the uncertainty means.
         against_events_us: of events against this device, both maps together; of events, their own.
         gate_us: what the protocol allows; None where the record has no such gate.
+        drift_ppm: what the box gains on the device.
         pulses: ``seen``, ``missed``, ``late``, ``spurious``; None without a wire.
     """
 
@@ -40,9 +36,8 @@ class DeviceClocks:
     kind: str
     against_events_us: float
     gate_us: float | None
-    drift_ppm: float | None
+    drift_ppm: float
     pulses: dict[str, int] | None
-    residual_p95_us: float | None
 
 
 @dataclass(frozen=True)
@@ -136,27 +131,7 @@ def _device(clocks: Mapping[str, Any], gates: Mapping[str, Any], name: str) -> D
         known["kind"],
         both / 1e3,
         None if limit is None else 1e6 * limit,
-        known.get("drift_ppm"),
+        # through the host, what is recorded is the drift of one step of the way
+        known["drift_ppm"] if wired else ClockMap.from_json(known["map"]).drift_ppm(),
         {kind: known[f"pulses_{kind}"] for kind in kinds} if wired else None,
-        known["residual_p95_ns"] / 1e3 if wired else None,
     )
-
-
-def same_clocks(one: Any, other: Any, name: str = "") -> bool:
-    """Whether two trials' clocks, as JSON, agree in every map and figure.
-
-    Processors differ in the last digit of a float, which is no other fit.
-    """
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(
-            same_clocks(one[key], other[key], key) for key in one
-        )
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(
-            same_clocks(a, b, name) for a, b in zip(one, other, strict=True)
-        )
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=_SAME, abs_tol=_SAME)
-    if name == "drift" and isinstance(one, int) and isinstance(other, int):
-        return abs(one - other) <= _SAME_DRIFT
-    return bool(one == other)

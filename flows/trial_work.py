@@ -7,7 +7,6 @@ then is kept, and the next run makes the rest.
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows import console
+from flows import console, stopping
 from flows.orchestration import Parcel, run
 from flows.timing import timed
 from storage.derived import Derived
@@ -26,8 +25,9 @@ from storage.store import Store
 
 CHUNK = 64
 
-Made = tuple[dict[str, Any], dict[str, Any]]
-"""A result's JSON and its arrays."""
+Make = Callable[[Recording, Any], tuple[dict[str, Any], dict[str, Any]]]
+"""Of a trial and settings, a result's JSON and its arrays. It runs in processes of their own, so it
+stands in a module, best in one that loads quickly."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,13 @@ class _Step:
 
     Attributes:
         name: where its results are kept; title: what people call it.
-        make: makes one result; it runs in other processes, so it must be a function of a module.
     """
 
     store: Store
     name: str
     title: str
     work: list[TrialWork]
-    make: Callable[[TrialWork], Made]
+    make: Make
 
 
 def stale_trials(store: Store, step: str, wanted: list[TrialWork]) -> list[TrialWork]:
@@ -70,7 +69,7 @@ def run_trials(
     step: str,
     title: str,
     work: list[TrialWork],
-    make: Callable[[TrialWork], Made],
+    make: Make,
 ) -> None:
     """Make every result of `work` and keep it among the derived results of `step`."""
     if work:
@@ -78,16 +77,11 @@ def run_trials(
         run(named, Parcel(_Step(store, step, title, work, make)))
 
 
-def _leave_signals_to_the_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; only the parent answers it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
 def _chunk(parcel: Parcel[tuple[_Step, list[TrialWork], ProcessPoolExecutor, console.Bar]]) -> int:
     """Some trials on all cores; each is kept as soon as it is there."""
     step, work, pool, bar = parcel.content
-    futures = {pool.submit(step.make, item): item for item in work}
+    futures = {pool.submit(step.make, item.recording, item.settings): item for item in work}
     for future in as_completed(futures):
         item = futures[future]
         name = item.recording.folder.name
@@ -106,7 +100,7 @@ def _trials_flow(wanted: Parcel[_Step]) -> int:
     with (
         timed(step.store, step.title),
         ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=_leave_signals_to_the_parent
+            workers, mp_context=get_context("spawn"), initializer=stopping.leave_to_parent
         ) as pool,
         console.bar(f"{step.title} (trials)", len(step.work)) as bar,
     ):
