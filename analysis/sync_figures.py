@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator
 
-from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
+from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, svg_text
 
 F64 = npt.NDArray[np.float64]
 
@@ -146,9 +146,11 @@ def _panel(axes: Any, panel: OverTrials) -> None:
             color=COLOURS[device], label=name, rasterized=len(numbers) > DENSE,
         )  # fmt: skip
     for gate in panel.gates:
+        # gates of the same height alternate, so that both colours are seen
+        begin = 4 * list(panel.series).index(gate.device)
         axes.plot(
-            [gate.first - 0.5, gate.last + 0.5], [gate.value] * 2, ls="--", lw=1.2, color=RED,
-            label="gate",
+            [gate.first - 0.5, gate.last + 0.5], [gate.value] * 2, ls=(begin, (4, 4)), lw=1.4,
+            color=COLOURS[gate.device], label=f"gate of {gate.device}",
         )  # fmt: skip
     axes.set_ylabel(panel.label)
     if panel.logarithmic:

@@ -52,6 +52,18 @@ def short_note(summary: dict[str, Any]) -> str:
     return note
 
 
+def worst(summary: dict[str, Any]) -> tuple[str, str]:
+    """The worst trial's uncertainty, and which device it is of, with its grade."""
+    sync = summary["sync"]
+    value = number(sync["worst_uncertainty_us"], 1, "µs")
+    known: dict[str, float] = sync["worst_against_events_us"]
+    if not known:
+        return value, "no clock"
+    device = max(known, key=lambda name: known[name])
+    against = "" if device == "events" else "events against "
+    return value, f"{against}{device} ({sync['grades'][device]})"
+
+
 def section(store: Store, summary: dict[str, Any]) -> Section:
     """The report's few words on clocks, with the way to their own page."""
     sync = summary["sync"]

@@ -261,12 +261,12 @@ def provenance(summary: dict[str, Any]) -> Section:
         for name, value in summary["protocols"].items()
     ]
     seeds = summary["seeds"]
+    uncertain, device = clock_words.worst(summary)
     return Section(
         "How it was made",
         [
             f"Network seeds {', '.join(map(str, seeds['network']))} (used: {seeds['chosen']}). "
-            f"Clocks: {summary['sync']['grade']}, at worst "
-            f"{number(summary['sync']['worst_uncertainty_us'], 1)} µs (95 %)."
+            f"Clocks: at worst {uncertain}, {device}."
         ],
         (),
         [

@@ -23,6 +23,7 @@ def headline(summary: dict[str, Any]) -> list[Number]:
     accuracy = summary["kinematic"]["accuracy"]
     latency = summary["kinematic"]["latency_ms"]["incipient"]
     lead = summary["gravity"]["lead_ms"]
+    uncertain, device = clock_words.worst(summary)
     return [
         Number(
             "trials committed",
@@ -42,11 +43,7 @@ def headline(summary: dict[str, Any]) -> list[Number]:
             f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}; "
             f"{clock_words.short_note(summary)}",
         ),
-        Number(
-            "clock uncertainty",
-            number(summary["sync"]["worst_uncertainty_us"], 1, "µs"),
-            f"worst trial, {summary['sync']['grade']}",
-        ),
+        Number("clock uncertainty", uncertain, f"worst trial, {device}"),
     ]
 
 

@@ -54,12 +54,11 @@ def by_campaign(shown: All) -> Table:
     )  # fmt: skip
 
 
-def _grades(trial: TrialClocks) -> str:
-    return ", ".join(f"{name}: {device.grade}" for name, device in trial.devices.items())
-
-
 def _against(trial: TrialClocks, name: str) -> str:
-    return number(trial.devices[name].against_events_us) if name in trial.devices else "–"
+    if name not in trial.devices:
+        return "–"
+    known = trial.devices[name]
+    return f"{number(known.against_events_us)} ({known.grade})"
 
 
 def most_uncertain(shown: All) -> Table:
@@ -71,23 +70,21 @@ def most_uncertain(shown: All) -> Table:
             trial.campaign,
             str(trial.number),
             *(_against(trial, name) for name in DEVICES),
-            _grades(trial),
         ]
         for trial in worst
     ]
-    columns = ("trial", "campaign", "taken as", *(f"{name} (µs)" for name in DEVICES), "grades")
-    return Table(columns, rows, "The highest uncertainty first.")
+    columns = ("trial", "campaign", "taken as no.", *(f"{name} (µs)" for name in DEVICES))
+    return Table(columns, rows, "Uncertainty with its grade, the highest first.")
 
 
 def most_missed(shown: All) -> Table:
     """The trials in which most pulses were missed."""
     hit = sorted((trial for _, trial in shown.rows if trial.missed), key=lambda t: -t.missed)
     rows = [
-        [trial.name, trial.campaign, str(trial.number), *_counts(trial), _grades(trial)]
-        for trial in hit[:ROWS]
+        [trial.name, trial.campaign, str(trial.number), *_counts(trial)] for trial in hit[:ROWS]
     ]
-    columns = ("trial", "campaign", "taken as", *DEVICES, "grades")
-    words = "Pulses missed / late / spurious, of those sent; most missed first."
+    columns = ("trial", "campaign", "taken as no.", *DEVICES)
+    words = "Pulses missed / late / spurious; most missed first."
     return Table(columns, rows, words if rows else "No device missed a pulse in any trial.")
 
 

@@ -53,7 +53,9 @@ def recordings(store: Store) -> list[Recording]:
 def sliplab(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     """The command line, in this process."""
     monkeypatch.setattr("sys.argv", ["sliplab", *map(str, arguments)])
-    return main()
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(str(ended.value.code))
 
 
 def results(store: Store) -> list[dict[str, Any]]:
