@@ -139,8 +139,9 @@ def _uncertainty(shown: All, simulated: bool) -> Section:
         [
             Figure(
                 over_trials([uncertainty_panel(shown)], firsts(shown), simulated=simulated),
-                "One mark a trial; the dashed line is the gate of the protocol for this grade. A "
-                "trial above it would not have been committed.",
+                "One mark a trial; the dashed lines are the protocol's gates for these grades. A "
+                "trial is committed below them; above stands only one whose clocks came out "
+                "worse when they were fitted again.",
             )
         ],
     )

@@ -18,7 +18,7 @@ from flows.label import label
 from flows.orders import make_order
 from flows.summary import _sync as sync_summary
 from flows.sync import sync
-from flows.sync_fit import same_clocks
+from flows.sync_fit import fit_again, same_clocks
 from storage.catalogue import catalogue
 from storage.derived import Derived
 from storage.files import read_json, sha256, write_json
@@ -157,6 +157,30 @@ def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None
     assert label(store, collected(store))["done"] == 0
     text = Path(result["page"]).read_text()
     assert "<td>1</td>" in text  # one trial with refitted clocks
+
+
+def test_a_refusal_keeps_the_record_and_is_told(
+    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sync(store, collected(store))
+    first = recordings(store)[0]
+    found = synchronise.synchronise_recording(first)
+    del found.devices["frames"]
+    found.refused["frames"] = "ambiguous: it fits twice"
+    monkeypatch.setattr(synchronise, "synchronise_recording", lambda recording: found)
+    data, arrays = fit_again(first, None)
+    assert "clocks" not in data
+    assert "frames_us" not in arrays
+    kept = Derived.of(store, "sync", "tiny")
+    before = kept.read(first.folder.name)
+    kept.write(first.folder.name, before["key"], data, arrays)
+    result = sync(store, collected(store))
+    assert (result["done"], result["campaigns"]["tiny"]["refused"]) == (0, 1)
+    said = capsys.readouterr().err
+    assert "frames cannot be fitted again (ambiguous: it fits twice)" in said
+    assert recordings(store)[0].clocks == first.record["clocks"]
+    (kept.folder / f"{first.folder.name}.json").unlink()
+    assert sync(store, collected(store))["done"] == 1
 
 
 def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
