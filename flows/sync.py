@@ -8,14 +8,14 @@ its results become stale exactly then.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from analysis import synchronise
 from flows import console
 from flows.campaigns import Collected
-from flows.sync_fit import DEVICES, fit_again
+from flows.sync_fit import fit_again
+from flows.sync_numbers import campaign_numbers
 from flows.sync_page import PAGE, render
 from flows.sync_trials import TrialClocks, read_trials
 from flows.trial_work import TrialWork, run_trials, stale_trials
@@ -46,7 +46,10 @@ def sync(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     trials = {item.name: read_trials(store, item) for item in campaigns}
     page = _write_page(store, campaigns, wanted, trials)
     fitted = {item.name: sum(work.campaign == item.name for work in stale) for item in campaigns}
-    numbers = {name: campaign_numbers(found, fitted[name]) for name, found in trials.items()}
+    numbers = {
+        name: {"refitted": fitted[name], **campaign_numbers(found)}
+        for name, found in trials.items()
+    }
     for name, found in trials.items():
         for trial in found:
             if trial.refused:
@@ -67,7 +70,7 @@ def _write_page(
     campaigns: list[Collected],
     wanted: list[TrialWork],
     trials: dict[str, list[TrialClocks]],
-) -> Any:
+) -> Path:
     path = store.folder / "report" / PAGE
     quarantined = [[item.name, item.campaign.quarantined()] for item in campaigns]
     shown = [[work.campaign, work.key] for work in wanted]
@@ -78,39 +81,6 @@ def _write_page(
         write_text(path, render(campaigns, trials, simulated=store.simulated))
         kept.write("page", key, {})
     return path
-
-
-def campaign_numbers(trials: list[TrialClocks], fitted: int) -> dict[str, Any]:
-    """What is known of a campaign's clocks, by device; uncertainties are of events against it."""
-    devices = {}
-    for name in DEVICES:
-        there = [trial.devices[name] for trial in trials if name in trial.devices]
-        if not there:
-            continue
-        uncertainty = [device.against_events_us for device in there]
-        drift = [device.drift_ppm for device in there]
-        wired = [device.pulses for device in there if device.pulses is not None]
-        devices[name] = {
-            "grade": " or ".join(sorted({device.grade for device in there})),
-            "uncertainty_us": {
-                "median": float(np.median(uncertainty)),
-                "worst": max(uncertainty),
-            },
-            "drift_ppm": [min(drift), max(drift)],
-            "pulses": {
-                kind: sum(pulses[kind] for pulses in wired)
-                for kind in ("missed", "late", "spurious")
-            }
-            if wired
-            else None,
-        }
-    return {
-        "trials": len(trials),
-        "refitted": fitted,
-        "changed": sum(trial.changed for trial in trials),
-        "refused": sum(bool(trial.refused) for trial in trials),
-        "devices": devices,
-    }
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

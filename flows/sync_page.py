@@ -61,7 +61,8 @@ def render(
 
 
 def _headline(shown: All) -> list[Number]:
-    found = [Number("trials", str(len(shown.rows)))]
+    changed = sum(trial.changed for _, trial in shown.rows)
+    found = [Number("trials", str(len(shown.rows)), f"{changed} with refitted clocks in use")]
     for device, name in device_names(shown).items():
         worst = max(
             trial.devices[device].against_events_us

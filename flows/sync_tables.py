@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from analysis.report import Table, number
 from flows.campaigns import Collected
 from flows.sync_fit import DEVICES
+from flows.sync_numbers import PULSES, campaign_numbers
 from flows.sync_series import All
 from flows.sync_trials import TrialClocks
 from storage.files import read_json
@@ -24,25 +23,23 @@ def by_campaign(shown: All) -> Table:
     """One row a campaign and device."""
     rows = []
     for campaign, trials in shown.campaigns.items():
-        for name in DEVICES:
-            there = [trial.devices[name] for trial in trials if name in trial.devices]
-            if not there:
-                continue
-            uncertain = [device.against_events_us for device in there]
-            drift = [device.drift_ppm for device in there]
-            gates = sorted({device.gate_us for device in there if device.gate_us is not None})
-            rows.append([
-                campaign,
-                name,
-                " or ".join(sorted({device.grade for device in there})),
-                " or ".join(sorted({device.kind for device in there})),
-                number(float(np.median(uncertain))),
-                number(max(uncertain)),
-                " or ".join(f"{gate:g}" for gate in gates) or "–",
-                f"{min(drift):.2f} to {max(drift):.2f}",
-                str(len(there)),
-                str(sum(trial.changed for trial in trials)),
-            ])  # fmt: skip
+        known = campaign_numbers(trials)
+        for name, device in known["devices"].items():
+            least, most = device["drift_ppm"]
+            rows.append(
+                [
+                    campaign,
+                    name,
+                    device["grade"],
+                    device["kind"],
+                    number(device["uncertainty_us"]["median"]),
+                    number(device["uncertainty_us"]["worst"]),
+                    " or ".join(f"{gate:g}" for gate in device["gates_us"]) or "–",
+                    f"{least:.2f} to {most:.2f}",
+                    str(device["trials"]),
+                    str(known["changed"]),
+                ]
+            )
     return Table(
         (
             "campaign", "device", "grade", "uncertainty is", "median (µs)", "worst (µs)",
@@ -92,7 +89,7 @@ def _counts(trial: TrialClocks) -> list[str]:
     found = []
     for name in DEVICES:
         pulses = trial.devices[name].pulses if name in trial.devices else None
-        shown = [pulses[kind] for kind in ("missed", "late", "spurious")] if pulses else []
+        shown = [pulses[kind] for kind in PULSES] if pulses else []
         found.append(" / ".join(map(str, shown)) or "–")
     return found
 
