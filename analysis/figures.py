@@ -7,53 +7,20 @@ it still says so when somebody copies it out of the report.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator, NullLocator
 
+from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
+
 Array = npt.NDArray[Any]
 
-BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#666666",
-)
 CLASS_COLOURS = (BLUE, ORANGE, RED)
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
-_STYLE = {
-    "font.size": 9,
-    "font.family": "DejaVu Sans",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "legend.frameon": False,
-    "svg.hashsalt": "sliplab",
-    "svg.fonttype": "none",
-    "savefig.dpi": 150,
-    "figure.constrained_layout.use": True,
-}
-
-
-def _svg(figure: Any, simulated: bool) -> str:
-    if simulated:
-        figure.suptitle("simulated", x=0.995, ha="right", fontsize=8, color=GREY, style="italic")
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    plt.close(figure)
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
 
 
 def _name_cells(
@@ -83,14 +50,14 @@ def collected_grid(
     simulated: bool,
 ) -> str:
     """Collected of planned trials for each pair of levels, counts of shape (rows, columns)."""
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(5.2, 0.42 * len(rows) + 1.3))
         share = np.divide(counts, planned, out=np.zeros(counts.shape), where=planned > 0)
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1.6, aspect="auto")
         for (i, j), value in np.ndenumerate(counts):
             axes.text(j, i, f"{value} of {planned[i, j]}", ha="center", va="center", fontsize=8)
         _name_cells(axes, rows, columns, row_name, column_name)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def trial_overview(
@@ -112,7 +79,7 @@ def trial_overview(
         onsets_s: incipient and gross onset, seconds; None where there is none.
         motion_s: when the slide or retraction begins.
     """
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, (top, middle, low) = plt.subplots(
             3, 1, figsize=(7.6, 6.2), sharex=True, height_ratios=(3, 1.6, 2.2)
         )
@@ -144,12 +111,12 @@ def trial_overview(
             top.plot([], [], color=colour, lw=1.2, label=name)
         top.legend(loc="upper left", fontsize=8)
         low.set_xlim(0, span)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def confusion(matrix: Array, *, simulated: bool) -> str:
     """Confusion matrix, int (3, 4): the last column holds windows without a unique winner."""
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(5.2, 3.3))
         total = matrix.sum(axis=1, keepdims=True)
         share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
@@ -166,7 +133,7 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
             )
         said = [*CLASS_WORDS, "undecided"]
         _name_cells(axes, CLASS_WORDS, said, "true class", "class said by the network")
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def outputs(
@@ -183,7 +150,7 @@ def outputs(
     Args:
         end_s: (n,) ends of the windows, seconds; counts, smoothed: (n, 3).
     """
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(2, 1, figsize=(7.6, 4.2), sharex=True, sharey=True)
         for panel, values, name in (
             (axes[0], counts, "raw"),
@@ -203,7 +170,7 @@ def outputs(
         axes[0].legend(loc="upper right", ncols=5, fontsize=8, bbox_to_anchor=(1.0, 1.25))
         axes[1].set_xlabel("time since the recording began (s)")
         axes[1].set_xlim(0, float(end_s[-1]) if len(end_s) else 1.0)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def distributions(
@@ -214,7 +181,7 @@ def distributions(
     zero: str = "",
 ) -> str:
     """Every value of each group as a dot, the median as a bar."""
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(6.6, 0.42 * max(len(groups), 2) + 1.1))
         rng = np.random.default_rng(0)
         for row, (name, values) in enumerate(groups.items()):
@@ -233,12 +200,12 @@ def distributions(
         axes.set_yticks(range(len(groups)), list(groups))
         axes.set_ylim(len(groups) - 0.5, -0.8)
         axes.set_xlabel(label)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simulated: bool) -> str:
     """Loss and accuracies by epoch, with the chosen epoch."""
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         figure, (left, right) = plt.subplots(1, 2, figsize=(7.6, 2.5))
         epochs = [row["epoch"] for row in history]
         left.plot(epochs, [row["loss"] for row in history], color=BLUE, label="training")
@@ -260,7 +227,7 @@ def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simu
             axes.set_xlabel("epoch")
             axes.xaxis.get_major_locator().set_params(integer=True)
             axes.legend(fontsize=8)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 def cost_against_error(
@@ -279,7 +246,7 @@ def cost_against_error(
         errors: key to the name of its axis, one panel each.
         lines: by name, errors by key that are drawn as level lines.
     """
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(STYLE):
         rows = -(-len(errors) // 2)
         figure, grid = plt.subplots(
             rows, 2, figsize=(7.6, 2.5 * rows + 0.4), squeeze=False, sharex=True
@@ -303,7 +270,7 @@ def cost_against_error(
             axes.set_xlabel(cost_name)
         handles, titles = grid.flat[0].get_legend_handles_labels()
         figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
-        return _svg(figure, simulated)
+        return svg_text(figure, simulated)
 
 
 _SERIES = (

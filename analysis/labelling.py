@@ -19,6 +19,9 @@ from storage.recording import Recording
 F64 = npt.NDArray[np.float64]
 VERSION = 2
 
+Results = tuple[dict[str, Any], dict[str, Any]]
+"""A result's JSON and its arrays."""
+
 
 @dataclass(frozen=True)
 class Label:
@@ -61,6 +64,12 @@ class Label:
             "frame_ns": self.frame_ns,
             "displacement_px": np.round(self.displacement_px, 3).astype(np.float32),
         }
+
+
+def label_results(recording: Recording, settings: Labelling) -> Results:
+    """A trial's label as it is kept: JSON and arrays."""
+    label = label_recording(recording, settings)
+    return label.as_json(), label.as_arrays()
 
 
 def label_recording(recording: Recording, settings: Labelling) -> Label:

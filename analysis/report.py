@@ -30,6 +30,14 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Link:
+    """A page beside this one: its file's name, and what it shows."""
+
+    file: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Section:
     """One part of the report."""
 
@@ -37,6 +45,7 @@ class Section:
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = field(default=())
+    links: Sequence[Link] = ()
 
 
 @dataclass(frozen=True)

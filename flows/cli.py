@@ -13,7 +13,7 @@ from protocols.errors import InputError
 
 app = typer.Typer(
     name="sliplab",
-    help="Run tactile slip experiments: plan, collect, label, train, evaluate, report.",
+    help="Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -147,6 +147,27 @@ def collect(
 
 
 @app.command()
+def sync(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Fit the clocks of every trial again and write report/sync.html about them."""
+    result = _run_step(store, campaign, "sync")
+    if as_json:
+        console.print_json(result)
+        return
+    from flows.sync import COLUMNS, tables
+
+    for title, rows in tables(result):
+        console.print_table(title, COLUMNS, rows)
+    console.results.print(
+        "Median and worst: uncertainty of events against the device, both clocks together; "
+        "of events that of their own clock."
+    )
+    simulated = " (simulated)" if result["simulated"] else ""
+    console.results.print(f"Page{simulated}: {Path(result['page']).resolve()}", soft_wrap=True)
+
+
+@app.command()
 def label(
     store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
 ) -> None:
@@ -194,7 +215,7 @@ def study(
     pilot: Annotated[bool, typer.Option("--pilot", help="The small protocols.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the whole chain: collect, label, train, evaluate, report."""
+    """Run the whole chain: collect, sync, label, train, evaluate, report."""
     names = PILOT if pilot else FULL
     protocols = [package_file("protocols", f"{name}.yaml") for name in names]
     _chain(folder, protocols, rig, as_json)
@@ -322,6 +343,11 @@ def _prepare(folder: Path) -> None:
 
 
 def _step(folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
+    """Run one analysis step on a store and print what it did."""
+    _finish(_run_step(folder, names, step, **options), f"{step} {folder}", as_json)
+
+
+def _run_step(folder: Path, names: list[str] | None, step: str, **options: Any) -> dict[str, Any]:
     """Run one analysis step on a store."""
     from importlib import import_module
 
@@ -331,12 +357,12 @@ def _step(folder: Path, names: list[str] | None, as_json: bool, step: str, **opt
     _prepare(folder)
     from flows.campaigns import collected
 
-    result = getattr(import_module(f"flows.{step}"), step)(
+    result: dict[str, Any] = getattr(import_module(f"flows.{step}"), step)(
         store, collected(store, names), **options
     )
     if not result["done"]:
         console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
-    _finish(result, f"{step} {folder}", as_json)
+    return result
 
 
 def _chain(folder: Path, protocols: list[Path], rig: Path, as_json: bool) -> None:

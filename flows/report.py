@@ -13,13 +13,14 @@ from flows import evaluate, sections, timing
 from flows.campaigns import Collected
 from flows.orchestration import Parcel, run
 from flows.summary import make_summary
+from flows.sync_page import PAGE as CLOCKS
 from flows.train import wanted_models
 from storage.derived import Derived, make_key
 from storage.files import read_json, write_json, write_text
 from storage.store import Store, StoreError
 
 STEP = "report"
-VERSION = 2
+VERSION = 3
 
 
 def report_folder(store: Store) -> Path:
@@ -28,7 +29,7 @@ def report_folder(store: Store) -> Path:
 
 
 def _key(store: Store, campaigns: list[Collected]) -> str:
-    """What the report is made of: the evaluation, and all that was collected.
+    """What the report is made of: the evaluation, all that was collected, a page to link to.
 
     Raises:
         StoreError: there is no evaluation yet.
@@ -45,7 +46,8 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
         ]
         for item in campaigns
     ]
-    return make_key(STEP, VERSION, [evaluated, collected], None)
+    clocks = (report_folder(store) / CLOCKS).exists()
+    return make_key(STEP, VERSION, [evaluated, collected, clocks], None)
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)

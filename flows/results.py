@@ -12,6 +12,7 @@ from analysis.detection import detect
 from analysis.metrics import CLASSES
 from analysis.report import Figure, Section, Table, number, percent
 from analysis.training import Fitted
+from flows import clock_words
 from flows.campaigns import Collected
 from flows.evaluate import trial_counts
 from protocols.settings import Detection
@@ -147,10 +148,10 @@ def latency(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool
                 figures.distributions(
                     groups, "latency (ms)", simulated=simulated, zero="true onset"
                 ),
-                "Each dot is a trial; the bar is the median.",
+                "Each dot is a trial; the bar is the median." + clock_words.figure_note(summary),
             )
         ],
-        [Table(["onset", *_names()], table, "Milliseconds; n counts trials.")],
+        [Table(["onset", *_names()], table, _statistics_caption(summary))],
     )
 
 
@@ -185,19 +186,20 @@ def lead(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -
                 figures.distributions(
                     named, "lead before gross slip (ms)", simulated=simulated, zero="gross slip"
                 ),
-                "Each dot is a trial, by configuration; the bar is the median.",
+                "Each dot is a trial, by configuration; the bar is the median."
+                + clock_words.figure_note(summary),
             )
         ],
-        [
-            Table(
-                ["experiment", *_names(), "detected first"], table, "Milliseconds; n counts trials."
-            )
-        ],
+        [Table(["experiment", *_names(), "detected first"], table, _statistics_caption(summary))],
     )
 
 
 def _names() -> list[str]:
     return [name.replace("_", " ") for name in _STATISTICS]
+
+
+def _statistics_caption(summary: dict[str, Any]) -> str:
+    return f"Milliseconds; n counts trials. {clock_words.latency_note(summary)}"
 
 
 def _statistics(values: dict[str, Any]) -> list[str]:
@@ -259,12 +261,12 @@ def provenance(summary: dict[str, Any]) -> Section:
         for name, value in summary["protocols"].items()
     ]
     seeds = summary["seeds"]
+    uncertain, device = clock_words.worst(summary)
     return Section(
         "How it was made",
         [
             f"Network seeds {', '.join(map(str, seeds['network']))} (used: {seeds['chosen']}). "
-            f"Clocks: {summary['sync']['grade']}, at worst "
-            f"{number(summary['sync']['worst_uncertainty_us'], 1)} µs (95 %)."
+            f"Clocks: at worst {uncertain}, {device}."
         ],
         (),
         [

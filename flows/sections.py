@@ -9,7 +9,7 @@ import numpy as np
 from analysis import dataset, figures
 from analysis.report import Figure, Number, Section, Table, number, percent
 from analysis.training import Fitted
-from flows import results
+from flows import clock_words, results
 from flows.campaigns import Collected
 from flows.label import STEP as LABELS
 from protocols.factors import Level
@@ -23,6 +23,7 @@ def headline(summary: dict[str, Any]) -> list[Number]:
     accuracy = summary["kinematic"]["accuracy"]
     latency = summary["kinematic"]["latency_ms"]["incipient"]
     lead = summary["gravity"]["lead_ms"]
+    uncertain, device = clock_words.worst(summary)
     return [
         Number(
             "trials committed",
@@ -34,18 +35,15 @@ def headline(summary: dict[str, Any]) -> list[Number]:
             "incipient latency",
             number(latency["median"], 0, "ms"),
             f"median of {latency['n']}; {latency['missed']} missed, "
-            f"{latency['false_early']} false early",
+            f"{latency['false_early']} false early; {clock_words.short_note(summary)}",
         ),
         Number(
             "gravity lead",
             number(lead["median"], 0, "ms"),
-            f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}",
+            f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}; "
+            f"{clock_words.short_note(summary)}",
         ),
-        Number(
-            "clock uncertainty",
-            number(summary["sync"]["worst_uncertainty_us"], 1, "µs"),
-            f"worst trial, {summary['sync']['grade']}",
-        ),
+        Number("clock uncertainty", uncertain, f"worst trial, {device}"),
     ]
 
 
@@ -68,6 +66,7 @@ def make_sections(
         results.latency(evaluation, summary, simulated),
         results.lead(evaluation, summary, simulated),
         results.labels(summary),
+        clock_words.section(store, summary),
         results.provenance(summary),
     ]
     return [section for section in found if section is not None]

@@ -22,6 +22,11 @@ def _handle(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def leave_to_parent() -> None:
+    """Ctrl-C reaches every process of a terminal; only the parent answers it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def requested() -> bool:
     """Whether somebody asked the program to stop."""
     return _requested.is_set()

@@ -1,4 +1,4 @@
-"""The whole chain: collect every protocol, then label, train, evaluate and report."""
+"""The whole chain: collect every protocol, synchronise, then label, train, evaluate and report."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from flows.evaluate import evaluate
 from flows.label import label
 from flows.orders import Order
 from flows.report import report
+from flows.sync import sync
 from flows.train import train
 from storage.store import Store
 
@@ -35,7 +36,7 @@ def study(orders: list[Order]) -> Outcome:
     store = Store.open(orders[0].store)
     campaigns = collected(store, [order.campaign for order in orders])
     steps = []
-    for step in (label, train, evaluate, report):
+    for step in (sync, label, train, evaluate, report):
         result = step(store, campaigns)
         steps.append(result)
         if not result["done"]:

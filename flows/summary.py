@@ -79,7 +79,7 @@ def _sync(campaigns: list[Collected]) -> dict[str, Any]:
     worst: dict[str, float] = {}
     for item in campaigns:
         for _, recording in item.trials:
-            clocks = recording.record["clocks"]
+            clocks = recording.clocks
             for device in ("events", "frames", "arm"):
                 if device in clocks:
                     grades.setdefault(device, set()).add(clocks[device]["grade"])

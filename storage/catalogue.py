@@ -32,7 +32,7 @@ def catalogue(store: Store) -> pd.DataFrame:
                 "events": record["counts"]["events"],
                 "frames": record["counts"]["frames"],
                 "frame_source": recording.frame_source,
-                "sync_uncertainty_us": record["clocks"]["events"]["uncertainty_ns"] / 1000,
+                "sync_uncertainty_us": recording.clocks["events"]["uncertainty_ns"] / 1000,
                 "passed": record["quality"]["passed"],
             }
             row.update(_condition(record["condition"]))

@@ -29,10 +29,23 @@ class Tracks:
 
 
 class Recording:
-    """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns."""
+    """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
 
-    def __init__(self, folder: Path) -> None:
+    A committed trial is never rewritten. Where its clocks were fitted again and came out
+    otherwise, the new ones stand among the derived results, and are used in the record's place.
+
+    Args:
+        folder: the trial's own folder.
+        sync_file: where the result of fitting its clocks again is, once there is one.
+    """
+
+    def __init__(self, folder: Path, sync_file: Path | None = None) -> None:
         self.folder = folder
+        self.sync_file = sync_file
+
+    def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None]]:
+        """To another process goes where the trial is, not what was read of it."""
+        return Recording, (self.folder, self.sync_file)
 
     @cached_property
     def record(self) -> Json:
@@ -45,10 +58,42 @@ class Recording:
         return str(self.record["trial"])
 
     @cached_property
-    def checksum(self) -> str:
-        """One hash that stands for the raw data of this trial."""
+    def raw_checksum(self) -> str:
+        """One hash that stands for the raw data of this trial and its record."""
         sums = read_json(self.folder / CHECKSUMS)
         return "".join(str(sums[name]["sha256"])[:16] for name in sorted(sums))
+
+    @property
+    def checksum(self) -> str:
+        """What stands for all that analysis reads of this trial: raw data and clocks in use."""
+        refitted = self._refitted
+        return self.raw_checksum if refitted is None else self.raw_checksum + str(refitted["key"])
+
+    @cached_property
+    def clocks(self) -> Json:
+        """What is known of every device's clock: fitted again, or else as the record has it."""
+        refitted = self._refitted
+        return dict(self.record["clocks"] if refitted is None else refitted["clocks"])
+
+    @property
+    def refitted(self) -> bool:
+        """Whether other clocks are in use than those of the record."""
+        return self._refitted is not None
+
+    @cached_property
+    def _refitted(self) -> Json | None:
+        """The result of fitting again, where it holds other clocks than the record's."""
+        if self.sync_file is None or not self.sync_file.exists():
+            return None
+        found = read_json(self.sync_file)
+        # a trial that was taken anew under this id has nothing to do with it
+        same = found.get("raw") == self.raw_checksum
+        return found if same and found.get("clocks") is not None else None
+
+    def forget_clocks(self) -> None:
+        """Look for refitted clocks anew: they have just been written."""
+        for name in ("_refitted", "clocks"):
+            self.__dict__.pop(name, None)
 
     @property
     def has_video(self) -> bool:
@@ -76,7 +121,7 @@ class Recording:
         Raises:
             KeyError: the trial has no such clock.
         """
-        return ClockMap.from_json(self.record["clocks"][device]["map"])
+        return ClockMap.from_json(self.clocks[device]["map"])
 
     def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
         """Events between two times of the time line, on the camera's own clock."""

@@ -25,6 +25,8 @@ from storage.streams import Json
 from storage.writer import PROVENANCE, TrialWriter
 
 FORMAT = 1
+SYNC = "sync"
+"""The step whose results hold clocks that were fitted again; recordings read them there."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
@@ -79,7 +81,7 @@ class Campaign:
     def recordings(self) -> Iterator[Recording]:
         """The committed trials by id."""
         for path in self._folders("trials"):
-            yield Recording(path)
+            yield Recording(path, self._sync_file(path.name))
 
     def recording(self, trial_id: str) -> Recording:
         """One committed trial.
@@ -90,7 +92,7 @@ class Campaign:
         path = self.folder / "trials" / safe_name(trial_id)
         if not path.is_dir():
             raise StoreError(f"{path}: no such trial in campaign '{self.name}'")
-        return Recording(path)
+        return Recording(path, self._sync_file(trial_id))
 
     def begin(
         self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
@@ -150,6 +152,10 @@ class Campaign:
     def provenance(self, recording: Recording) -> Json:
         """When, where and with which versions a trial was taken."""
         return read_json(recording.folder / PROVENANCE)
+
+    def _sync_file(self, trial_id: str) -> Path:
+        """Where the sync step keeps what it found of a trial."""
+        return self.folder.parent.parent / "derived" / SYNC / self.name / f"{trial_id}.json"
 
     def _folders(self, name: str) -> Iterator[Path]:
         folder = self.folder / name

@@ -41,7 +41,7 @@ def test_every_step_did_its_work(ran: tuple[list[Order], Outcome]) -> None:
     _, outcome = ran
     assert [item["committed"] for item in outcome.collected] == [6, 2]
     assert [(step["step"], step["done"]) for step in outcome.steps] == [
-        ("label", 8), ("train", 1), ("evaluate", 1), ("report", 1),
+        ("sync", 8), ("label", 8), ("train", 1), ("evaluate", 1), ("report", 1),
     ]  # fmt: skip
 
 
@@ -92,6 +92,10 @@ def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outc
     assert "Every number and picture here is simulated" in text
     assert text.count("simulated tracks of the markers (no video was drawn)") >= 3
     assert "the video" not in text
+    assert '<a href="sync.html">' in text
+    assert (store_of(ran).folder / "report" / "sync.html").exists()
+    assert text.count("Frames: hardware trigger; events against them within") == 2
+    assert "No wire ties" not in text
     assert text.count("<svg") >= 7
     assert text.count(">simulated</text>") == text.count("<figure>")
     for outside in ("http://", "https://", "src="):
@@ -102,7 +106,7 @@ def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outc
 def test_nothing_changed_is_nothing_to_do(ran: tuple[list[Order], Outcome]) -> None:
     again = study(ran[0])
     assert [item["taken"] for item in again.collected] == [0, 0]
-    assert [step["done"] for step in again.steps] == [0, 0, 0, 0]
+    assert [step["done"] for step in again.steps] == [0, 0, 0, 0, 0]
 
 
 def test_another_margin_is_evaluation_and_report_only(
@@ -116,7 +120,9 @@ def test_another_margin_is_evaluation_and_report_only(
     orders = [make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder), ran[0][1]]
     outcome = study(orders)
     done = [(step["step"], step["done"]) for step in outcome.steps]
-    assert done == [("label", 0), ("train", 0), ("evaluate", 1), ("report", 1)]
+    assert done == [
+        ("sync", 0), ("label", 0), ("train", 0), ("evaluate", 1), ("report", 1),
+    ]  # fmt: skip
     assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
     assert read_summary(store)["detection"]["tiny"]["margin"] == 3.0
     study(ran[0])  # back to what the other tests know
