@@ -1,6 +1,6 @@
 """Pixels side by side: which of many meet thresholds on a piece of a marker's path, and when.
 
-One pixel's events wait for each other; those of many pixels do not, and where their numbers lie side
+One pixel's events wait for each other; those of many do not, and where their numbers lie side
 by side a compiler does four or eight of them at a time. So all that a pixel needs stands in a
 tile, one field after the other with a lane for each pixel, and is worked on in loops without
 branches. Fields are constant distances apart, which is how the compiler knows that lanes do not

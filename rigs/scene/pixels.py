@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene import edges, lanes, roots
+from rigs.scene import edges, roots
 from rigs.scene import pieces as of
+from rigs.scene import pixel_lanes as lanes
 from rigs.scene.crossings import events_of_piece
 from rigs.scene.edges import CUT
 from rigs.scene.marker_path import bound_rates
@@ -36,7 +37,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
         threshold, state: of all pixels, (height, width) and (height, width, 4); written.
         origin: ns to add to every time.
         stack: scratch, (160, 3).
-        tile, fire, wait: scratch, tiles of the fields in `lanes` and `roots`.
+        tile, fire, wait: scratch, tiles of the fields in `pixel_lanes` and `roots`.
         gaps: distance of each pixel from the rim at the end, px; written.
         out: packed events as in `sorting`, written from `n` on.
 
@@ -55,7 +56,10 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
             pixel = pixels[at + j]
             x, y = pixel >> 12, pixel & 4095
             tile[lanes.X + j], tile[lanes.Y + j] = x, y
-            tile[lanes.ON + j], tile[lanes.OFF + j] = state[y, x, edges.ON], state[y, x, edges.OFF]
+            tile[lanes.ON + j], tile[lanes.OFF + j] = (
+                state[y, x, edges.ON],
+                state[y, x, edges.OFF],
+            )
             tile[lanes.LAST + j] = state[y, x, edges.LAST]
             tile[lanes.LEVEL + j] = state[y, x, edges.LEVEL]
             tile[lanes.STEP + j] = threshold[y, x]
@@ -125,7 +129,10 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
         for j in range(size):
             pixel = pixels[at + j]
             x, y = pixel >> 12, pixel & 4095
-            state[y, x, edges.ON], state[y, x, edges.OFF] = tile[lanes.ON + j], tile[lanes.OFF + j]
+            state[y, x, edges.ON], state[y, x, edges.OFF] = (
+                tile[lanes.ON + j],
+                tile[lanes.OFF + j],
+            )
             state[y, x, edges.LAST] = tile[lanes.LAST + j]
             state[y, x, edges.LEVEL] = tile[lanes.LEVEL + j]
             gaps[at + j] = tile[lanes.END + j]
@@ -158,5 +165,8 @@ def settle(tile, fire, n):  # type: ignore[no-untyped-def]
             before = fire[roots.LAST + j]
             tile[lanes.ON + lane] = following if comes else before
             tile[lanes.OFF + lane] = before if comes else following
-            tile[lanes.LAST + lane], tile[lanes.LEVEL + lane] = target, fire[roots.LEVEL + j]
+            tile[lanes.LAST + lane], tile[lanes.LEVEL + lane] = (
+                target,
+                fire[roots.LEVEL + j],
+            )
     return left

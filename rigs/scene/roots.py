@@ -3,7 +3,7 @@
 On a monotone piece time is a function of distance. A cubic through both ends is the first guess;
 then one step of Chebyshev's method, which is Newton's with the curvature, is nearly always enough.
 What is not good enough yet waits in a second tile for more of them; what never gets good is left
-to `crossings.solve`. Fields and lanes as in `lanes`.
+to `crossings.solve`. Fields and lanes as in `pixel_lanes`.
 """
 
 from __future__ import annotations
