@@ -29,8 +29,8 @@ static uint32_t crc_add(uint32_t crc, uint8_t byte)
 
 void line_init(void)
 {
-    UBRR0 = F_CPU / 8 / BAUD - 1;
     UCSR0A = _BV(U2X0);
+    UBRR0 = F_CPU / 8 / BAUD - 1;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
 }
@@ -102,10 +102,17 @@ void put_number(uint32_t value)
 
 void put_us(uint64_t us)
 {
-    uint32_t thousand_seconds = us / 1000000000;
+    /* Times come nearly in order, so the leading digits are stepped: a division of 64 bits would
+     * take as long as the rest of the line. */
+    static uint64_t begin;
+    static uint32_t thousand_seconds;
+    for (; us < begin; begin -= 1000000000)
+        thousand_seconds--;
+    for (; us - begin >= 1000000000; begin += 1000000000)
+        thousand_seconds++;
     if (thousand_seconds)
         put_digits(thousand_seconds, 1);
-    put_digits(us - thousand_seconds * 1000000000ULL, thousand_seconds ? 9 : 1);
+    put_digits(us - begin, thousand_seconds ? 9 : 1);
 }
 
 void put_end(void)

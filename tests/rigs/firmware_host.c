@@ -1,13 +1,13 @@
 /* Runs the sync box's firmware in simavr with its serial port on a pty, for test_firmware.py.
  *
- * firmware_host ELF TRACE DELAY EVERY
+ * firmware_host ELF TRACE DELAY EVERY WRAPS_AT WRAPS
  *
- * Prints `port` and the name of the pty. The trace gets a line for each change of an output, with the cycle of
- * the timer's match that made it and how many cycles later the simulator showed it (it lets an
- * instruction end first): `1 cycle level late` for the trigger, `2 ...` for the code. `X cycle` is
- * an exposure that was put on the capture pin: DELAY cycles after each trigger, or, where EVERY is
- * not 0, every EVERY cycles. `R cycle` is a reset, asked for with SIGUSR1. `S cycle us` says now and
- * then which cycle the simulator had reached at which time of the monotonic clock.
+ * Prints `port` and the name of the pty. The trace gets a line for each change of an output, with
+ * the cycle of the timer's match that made it and how many cycles later the simulator showed it (it
+ * lets an instruction end first): `1 cycle level late` for the trigger, `2 ...` for the code.
+ * `X cycle` is an exposure that was put on the capture pin: DELAY cycles after each trigger, or,
+ * where EVERY is not 0, every EVERY cycles. WRAPS is written once to the firmware's count of timer
+ * wraps at the address WRAPS_AT, for a box that has been on for long. SIGUSR1 resets the board.
  */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -26,6 +26,7 @@
 
 #define MHZ 16
 #define POLL_CYCLES 1600
+#define BOOTED 16000 /* the firmware has cleared its memory and counts */
 #define TCNT1L 0x84
 #define OCR1AL 0x88
 #define LAGS_US 50000 /* behind the wall clock by more than this: do not try to catch up */
@@ -34,6 +35,7 @@ static avr_t *avr;
 static FILE *trace;
 static int port, room = 1;
 static avr_cycle_count_t delay, every;
+static uint32_t wraps_at, wraps;
 static volatile sig_atomic_t reset_asked;
 
 static void ask_reset(int number)
@@ -109,22 +111,32 @@ static void on_room(struct avr_irq_t *irq, uint32_t value, void *param)
 /* Bytes from the pty go in, and the simulated time waits for the wall clock. */
 static avr_cycle_count_t poll_port(avr_t *a, avr_cycle_count_t when, void *param)
 {
-    static uint64_t origin, told;
+    static uint64_t origin;
+    static int poked;
     uint8_t bytes[16];
     (void)param;
     for (ssize_t i = 0, n = room ? read(port, bytes, sizeof bytes) : 0; i < n; i++)
         avr_raise_irq(avr_io_getirq(a, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT), bytes[i]);
+    if (!poked && a->cycle > BOOTED) {
+        poked = 1;
+        for (int i = 0; i < 4 && wraps; i++)
+            a->data[wraps_at + i] = wraps >> 8 * i;
+    }
     uint64_t wall = wall_us(), simulated = a->cycle / MHZ;
     if (!origin || wall - origin > simulated + LAGS_US)
         origin = wall - simulated;
     if (simulated > wall - origin)
         usleep(simulated - (wall - origin));
-    if (simulated >= told + 100000) {
-        told = simulated;
-        fprintf(trace, "S %llu %llu\n", (unsigned long long)a->cycle, (unsigned long long)wall_us());
-        fflush(trace);
-    }
     return when + POLL_CYCLES;
+}
+
+static void plug_in(void)
+{
+    room = 1;
+    set_exposure(0);
+    avr_cycle_timer_register(avr, POLL_CYCLES, poll_port, NULL);
+    if (every)
+        avr_cycle_timer_register(avr, every, expose, NULL);
 }
 
 static void no_sleep(avr_t *a, avr_cycle_count_t cycles)
@@ -135,11 +147,15 @@ static void no_sleep(avr_t *a, avr_cycle_count_t cycles)
 int main(int argc, char **argv)
 {
     elf_firmware_t firmware = {0};
-    if (argc != 5 || elf_read_firmware(argv[1], &firmware))
+    if (argc != 7 || elf_read_firmware(argv[1], &firmware))
         return 2;
     trace = fopen(argv[2], "w");
+    if (trace)
+        setvbuf(trace, NULL, _IOLBF, 0);
     delay = strtoull(argv[3], NULL, 10);
     every = strtoull(argv[4], NULL, 10);
+    wraps_at = strtoul(argv[5], NULL, 10);
+    wraps = strtoul(argv[6], NULL, 10);
 
     port = posix_openpt(O_RDWR | O_NOCTTY | O_NONBLOCK);
     if (!trace || port < 0 || grantpt(port) || unlockpt(port))
@@ -167,10 +183,7 @@ int main(int argc, char **argv)
     avr_irq_register_notify(uart + UART_IRQ_OUTPUT, on_byte, NULL);
     avr_irq_register_notify(uart + UART_IRQ_OUT_XON, on_room, (void *)1);
     avr_irq_register_notify(uart + UART_IRQ_OUT_XOFF, on_room, NULL);
-    avr_cycle_timer_register(avr, POLL_CYCLES, poll_port, NULL);
-    set_exposure(0);
-    if (every)
-        avr_cycle_timer_register(avr, every, expose, NULL);
+    plug_in();
     signal(SIGUSR1, ask_reset);
     printf("port %s\n", ptsname(port)); /* the simulator prints lines of its own */
     fflush(stdout);
@@ -179,8 +192,8 @@ int main(int argc, char **argv)
         state = avr_run(avr);
         if (reset_asked) {
             reset_asked = 0;
-            fprintf(trace, "R %llu\n", (unsigned long long)avr->cycle);
             avr_reset(avr);
+            plug_in(); /* the simulator forgot */
         }
     }
     return 1;
