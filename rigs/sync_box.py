@@ -191,7 +191,7 @@ class SerialSyncBox:
     def _check(self, port: SyncPort) -> None:
         """Raise what is wrong; the port's news are held."""
         if self._running and self._train is not None:
-            quiet_s = (self._now_ns() - self._heard_ns) / 1e9
+            quiet_s = (port.read_to_ns - self._heard_ns) / 1e9
             if quiet_s > self._train.longest_gap_s + self._settings.silence_s:
                 port.fail(
                     SyncBoxFault(

@@ -62,6 +62,8 @@ class SyncPort:
         news: held by whoever looks at what the reading thread changes.
         fault: the first one, while `news` is held; everything raises it from then on.
         lines: cuts lines, and counts garbled ones.
+        read_to_ns: all that came before this time of the host's has been taken; a host that was
+            busy for a while has not heard a silence.
 
     Raises:
         SyncBoxFault: no such port, or no sync box with this protocol behind it, after `boot_s` and
@@ -78,6 +80,7 @@ class SyncPort:
         self.news = threading.Condition()
         self.fault: SyncBoxFault | None = None
         self.lines = LineReader()
+        self.read_to_ns = now_ns()
         self._answers: deque[tuple[str, int]] = deque(maxlen=MOST_ANSWERS)
         self._greeted = False
         self._closing = threading.Event()
@@ -187,18 +190,19 @@ class SyncPort:
 
     def _listen(self) -> None:
         while not self._closing.is_set():
+            began_ns = self._now_ns()
             try:
                 data = self._serial.read(self._serial.in_waiting or 1)
-            except (OSError, serial.SerialException) as error:
-                with self.news:
-                    self.fail(_gone(error))
-                return
-            arrived_ns = self._now_ns()
-            if data:
+                arrived_ns = self._now_ns()
                 with self.news:
                     for body in self.lines.bodies(data):
                         self._sort(body, arrived_ns)
+                    self.read_to_ns = began_ns
                     self.news.notify_all()
+            except Exception as error:  # a thread that dies must not look like a silent box
+                with self.news:
+                    self.fail(_gone(error))
+                return
 
     def _sort(self, body: str, arrived_ns: int) -> None:
         if body.startswith("B "):

@@ -26,7 +26,7 @@
 
 #define MHZ 16
 #define POLL_CYCLES 1600
-#define BOOTED 16000 /* the firmware has cleared its memory and counts */
+#define BOOTED 16000 /* the firmware has cleared its memory, counts and listens */
 #define TCNT1L 0x84
 #define OCR1AL 0x88
 #define LAGS_US 50000 /* behind the wall clock by more than this: do not try to catch up */
@@ -115,7 +115,8 @@ static avr_cycle_count_t poll_port(avr_t *a, avr_cycle_count_t when, void *param
     static int poked;
     uint8_t bytes[16];
     (void)param;
-    for (ssize_t i = 0, n = room ? read(port, bytes, sizeof bytes) : 0; i < n; i++)
+    ssize_t n = room && a->cycle > BOOTED ? read(port, bytes, sizeof bytes) : 0;
+    for (ssize_t i = 0; i < n; i++)
         avr_raise_irq(avr_io_getirq(a, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT), bytes[i]);
     if (!poked && a->cycle > BOOTED) {
         poked = 1;

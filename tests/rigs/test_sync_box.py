@@ -20,7 +20,7 @@ from rigs.wire.sync_box import PtySyncBox
 
 SEED = 0xACE1
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
-ANSWER_S, SILENCE_S = 0.2, 0.3
+ANSWER_S, SILENCE_S = 0.3, 0.4
 SLACK_S = 0.5
 """What a busy machine may add to a bound."""
 
@@ -178,6 +178,18 @@ def test_silence_ends_a_train(wire: PtySyncBox, box: SerialSyncBox) -> None:
     wire.silence(False)
     box.start(100.0, SEED)
     assert pulses_of(box, 1)[0] == 0
+
+
+def test_a_host_that_was_busy_has_not_heard_a_silence(wire: PtySyncBox, box: SerialSyncBox) -> None:
+    box.start(200.0, SEED)
+    pulses_of(box, 3)
+    port = box._port
+    assert port is not None
+    with port.news:  # the reading thread can take nothing meanwhile
+        threading.Event().wait(0.08 + SILENCE_S + 0.3)
+        box._check(port)
+    assert len(pulses_of(box, 40)) >= 40
+    assert not box.losses
 
 
 @pytest.mark.parametrize("ask", ["read_clock", "stop"])
