@@ -78,10 +78,14 @@ static volatile struct exposure exposures[QUEUE];
 static volatile uint8_t ticks_in, ticks_out, exposures_in, exposures_out;
 static volatile uint32_t dropped; /* reports without room, since the last ARM */
 static volatile uint32_t exposures_seen;
+static volatile uint8_t listening; /* to exposures, from GO to ARM */
 
+/* Always on, so that no old stamp waits for the day when somebody listens. */
 ISR(TIMER1_CAPT_vect)
 {
     uint64_t cycles = cycles_at(ICR1);
+    if (!listening)
+        return;
     uint32_t number = exposures_seen++;
     uint8_t next = (exposures_in + 1) % QUEUE;
     if (next == exposures_out) {
@@ -197,7 +201,7 @@ static void go(void)
         remaining = LEAD;
         /* an output changes one cycle after its match */
         set_up((uint16_t)edge_cycles - 1 - LEAD);
-        TIMSK1 |= _BV(ICIE1);
+        listening = 1;
     }
 }
 
@@ -265,7 +269,7 @@ static void arm(char *text)
     code_begin(&coder, code, start);
     ATOMIC_BLOCK(ATOMIC_FORCEON)
     {
-        TIMSK1 &= ~_BV(ICIE1);
+        listening = 0;
         ticks_in = ticks_out = exposures_in = exposures_out = 0;
         carried = ticks_sent = dropped = exposures_seen = 0;
     }
@@ -372,7 +376,7 @@ int main(void)
     OUTPUT_PORT = EXPOSURE; /* its pull-up: an input that is not wired stays quiet */
     OUTPUT_DIRECTION = TRIGGER | CODE;
     TCCR1B = _BV(ICNC1) | _BV(ICES1) | _BV(CS10);
-    TIMSK1 = _BV(TOIE1) | _BV(OCIE1A);
+    TIMSK1 = _BV(TOIE1) | _BV(OCIE1A) | _BV(ICIE1);
     set_sleep_mode(SLEEP_MODE_IDLE);
     line_init();
     sei();

@@ -212,6 +212,21 @@ def test_exposures_are_stamped_to_the_microsecond(run: Run, connect: Connect, de
     assert np.array_equal(stamps, edges // MHZ * 1000)
 
 
+def test_exposures_of_a_camera_that_runs_by_itself(run: Run, connect: Connect) -> None:
+    """It ran before the train did: those exposures are not among the stamps."""
+    board = run(every=77_777)
+    box = connect(board)
+    for _ in range(3):
+        train(box, 100.0, "regular", 40)
+        stamps = box.read_exposures().t_ns
+        begin = board.edges(1)[board.edges(1) <= board.exposures()[-1]]
+        first = begin[np.flatnonzero(np.diff(begin, prepend=0) != 160_000)[-1]]
+        edges = board.exposures() - first
+        assert len(stamps) >= 40
+        assert np.array_equal(stamps, edges[edges >= 0][: len(stamps)] // MHZ * 1000)
+        assert not box.losses
+
+
 def test_all_is_reported_at_the_highest_rate_with_exposures(run: Run, connect: Connect) -> None:
     board = run(delay=200)
     box = connect(board)
