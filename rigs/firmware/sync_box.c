@@ -1,12 +1,8 @@
-/* Sync box of SlipLab: ticks, a coded pulse train, exposure stamps, and one clock for all three.
+/* Sync box of SlipLab: what it is told over the serial port, and what it reports.
  *
- * Timer1 counts cycles (16 MHz) and never stops. Its compare unit toggles the output pins, so every
- * edge is exact to the cycle whatever the processor is doing; an interrupt behind each edge only
- * sets up the next one. Its capture unit stamps exposures in the same way. The protocol stands in
- * docs/sync-box.md and is told here, in `obey` and `report`.
- *
- * There is no watchdog: old bootloaders of the Nano hang after a watchdog reset. A box that hangs
- * is silent, and the host notices silence.
+ * docs/sync-box.md has the protocol; `obey` and `report` follow it line by line. There is no
+ * watchdog: old bootloaders of the Nano hang after a watchdog reset. A box that hangs is silent,
+ * and the host notices silence.
  */
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -15,199 +11,21 @@
 #include <avr/wdt.h>
 #include <stdlib.h>
 #include <string.h>
-#include <util/atomic.h>
 
-#include "code.h"
 #include "line.h"
-#include "pins.h"
+#include "train.h"
 
 #define NAME "sliplab-sync-box 1" /* the number is the protocol's */
 
-#define CYCLES_PER_US 16
-#define LONGEST_PULSE 80000UL /* 5 ms: an arm that looks every 2 ms or 4 ms sees it */
-#define LEAD 32000 /* from GO to tick 0: time to answer before the first report */
-#define WAYPOINT 0x8000UL
 #define LEAST_MILLIHERTZ 1000UL
 #define MOST_MILLIHERTZ 1000000UL
 #define ALL_TO_MILLIHERTZ 200000UL /* up to here ticks with bit 0 are reported too */
-#define CYCLES_PER_KILOSECOND 16000000000ULL
-#define QUEUE 32
-#define PATIENCE 64 /* reports until it is told how many were dropped, in a full queue */
-
-/* -- clock ------------------------------------------------------------------------------------ */
-
-static volatile uint32_t wraps; /* of the timer; with its 16 bits the clock lasts 203 days */
-
-ISR(TIMER1_OVF_vect)
-{
-    wraps++;
-}
-
-/* Cycles since the start at a count that the timer showed a moment ago; interrupts are off. */
-static uint64_t cycles_at(uint16_t count)
-{
-    uint32_t w = wraps;
-    if ((TIFR1 & _BV(TOV1)) && count < 0x8000)
-        w++; /* it wrapped before that count and the interrupt has not been served yet */
-    return (uint64_t)w << 16 | count;
-}
-
-static uint64_t now(void)
-{
-    uint64_t cycles;
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
-    {
-        cycles = cycles_at(TCNT1);
-    }
-    return cycles;
-}
-
-/* -- reports, from interrupts to the main loop ------------------------------------------------ */
-
-struct tick {
-    uint32_t number;
-    uint64_t cycles;
-    uint8_t bit;
-};
-struct exposure {
-    uint32_t number;
-    uint64_t cycles;
-};
-static volatile struct tick ticks[QUEUE];
-static volatile struct exposure exposures[QUEUE];
-static volatile uint8_t ticks_in, ticks_out, exposures_in, exposures_out;
-static volatile uint32_t dropped; /* reports without room, since the last ARM */
-static volatile uint32_t exposures_seen;
-static volatile uint8_t listening; /* to exposures, from GO to ARM */
-
-/* Always on, so that no old stamp waits for the day when somebody listens. */
-ISR(TIMER1_CAPT_vect)
-{
-    uint64_t cycles = cycles_at(ICR1);
-    if (!listening)
-        return;
-    uint32_t number = exposures_seen++;
-    uint8_t next = (exposures_in + 1) % QUEUE;
-    if (next == exposures_out) {
-        dropped++;
-        return;
-    }
-    exposures[exposures_in].number = number;
-    exposures[exposures_in].cycles = cycles;
-    exposures_in = next;
-}
-
-/* -- the train -------------------------------------------------------------------------------- */
-
-static struct {
-    uint32_t millihertz, period, rest; /* period in cycles, and what division by the rate leaves */
-    uint32_t width;
-    uint32_t last; /* how many ticks; 0 is without end */
-    uint8_t all;   /* report ticks with bit 0 too */
-} plan;
-static struct coder coder;
-static volatile uint8_t running, stopping;
-static volatile uint32_t ticks_sent;
-static uint64_t edge_cycles; /* of the edge to come or just gone */
-static uint32_t remaining;   /* cycles from the match set up now to the edge */
-static uint32_t carried;     /* of `rest`, to spread it over the ticks */
-static uint8_t bit, high;
-
-/* Set up the next match: the edge if the timer can count that far, else a point on the way. */
-static inline void set_up(uint16_t from)
-{
-    uint16_t step = remaining > UINT16_MAX ? WAYPOINT : remaining;
-    remaining -= step;
-    OCR1A = from + step;
-    OCR1B = from + step;
-    if (remaining == 0)
-        TCCR1A = bit ? _BV(COM1A0) | _BV(COM1B0) : _BV(COM1A0);
-}
-
-static inline void report_tick(void)
-{
-    uint32_t number = ticks_sent++;
-    if (!bit && !plan.all)
-        return;
-    uint8_t next = (ticks_in + 1) % QUEUE;
-    if (next == ticks_out) {
-        dropped++;
-        return;
-    }
-    ticks[ticks_in].number = number;
-    ticks[ticks_in].cycles = edge_cycles;
-    ticks[ticks_in].bit = bit;
-    ticks_in = next;
-}
-
-ISR(TIMER1_COMPA_vect)
-{
-    if (!running)
-        return;
-    if (remaining) { /* on the way */
-        if (stopping && !high)
-            running = 0;
-        else
-            set_up(OCR1A);
-        return;
-    }
-    /* The timer has made the edge. The ports hold the level while the timer is let go of them. */
-    high = !high;
-    if (high)
-        OUTPUT_PORT |= bit ? TRIGGER | CODE : TRIGGER;
-    else
-        OUTPUT_PORT &= ~(TRIGGER | CODE);
-    TCCR1A = 0;
-    if (high) {
-        remaining = plan.width;
-        set_up(OCR1A);
-        report_tick();
-        edge_cycles += plan.width;
-        return;
-    }
-    if (stopping || ticks_sent == plan.last) { /* never 0 here: a tick has been sent */
-        running = 0;
-        return;
-    }
-    uint32_t low = plan.period - plan.width;
-    carried += plan.rest;
-    if (carried >= plan.millihertz) {
-        carried -= plan.millihertz;
-        low++;
-    }
-    bit = code_next(&coder);
-    remaining = low;
-    set_up(OCR1A);
-    edge_cycles += low;
-}
-
-static uint64_t first_cycles; /* of tick 0 */
-
-static void go(void)
-{
-    ATOMIC_BLOCK(ATOMIC_FORCEON)
-    {
-        OCR1A = TCNT1 - 1; /* just gone by: no match comes for 4 ms */
-    }
-    __asm__ volatile("nop"); /* a match that came before is served here and ignored */
-    ATOMIC_BLOCK(ATOMIC_FORCEON)
-    {
-        /* a whole microsecond, so that reports of round rates are exact */
-        edge_cycles = (cycles_at(TCNT1) + LEAD) / CYCLES_PER_US * CYCLES_PER_US;
-        first_cycles = edge_cycles;
-        bit = code_next(&coder);
-        high = stopping = 0;
-        running = 1;
-        remaining = LEAD;
-        /* an output changes one cycle after its match */
-        set_up((uint16_t)edge_cycles - 1 - LEAD);
-        listening = 1;
-    }
-}
+#define PATIENCE 64 /* reports until it is told how many were dropped, while others wait */
 
 /* -- commands --------------------------------------------------------------------------------- */
 
 static uint8_t armed, stop_asked;
+static uint64_t first_cycles; /* of tick 0 */
 
 static void fail(const char *why)
 {
@@ -238,7 +56,7 @@ static void arm(char *text)
     char *hz = strsep(&text, " "), *seed = strsep(&text, " "), *n = strsep(&text, " ");
     uint32_t rate = millihertz(hz), start = seed ? strtoul(seed, NULL, 10) : 0;
     enum code code;
-    if (running) {
+    if (train_runs()) {
         fail(PSTR("running"));
         return;
     }
@@ -260,19 +78,10 @@ static void arm(char *text)
         fail(PSTR("code must be lfsr, irregular or regular"));
         return;
     }
-    plan.millihertz = rate;
-    plan.period = CYCLES_PER_KILOSECOND / rate;
-    plan.rest = CYCLES_PER_KILOSECOND % rate;
-    plan.width = plan.period / 2 < LONGEST_PULSE ? plan.period / 2 : LONGEST_PULSE;
-    plan.last = strtoul(n, NULL, 10);
-    plan.all = rate <= ALL_TO_MILLIHERTZ;
-    code_begin(&coder, code, start);
-    ATOMIC_BLOCK(ATOMIC_FORCEON)
-    {
-        listening = 0;
-        ticks_in = ticks_out = exposures_in = exposures_out = 0;
-        carried = ticks_sent = dropped = exposures_seen = 0;
-    }
+    struct train train = {.millihertz = rate, .ticks = strtoul(n, NULL, 10)};
+    train.all = rate <= ALL_TO_MILLIHERTZ;
+    code_begin(&train.coder, code, start);
+    train_arm(&train);
     armed = 1;
     put_text(PSTR("OK ARM"));
     put_end();
@@ -284,7 +93,7 @@ static void obey(char *text)
         put_text(PSTR("ID " NAME));
         put_end();
     } else if (!strncmp_P(text, PSTR("T? "), 3)) {
-        uint64_t cycles = now();
+        uint64_t cycles = clock_now();
         put_text(PSTR("T "));
         put_number(strtoul(text + 3, NULL, 10));
         put_text(PSTR(" "));
@@ -293,18 +102,19 @@ static void obey(char *text)
     } else if (!strncmp_P(text, PSTR("ARM "), 4)) {
         arm(text + 4);
     } else if (!strcmp_P(text, PSTR("GO"))) {
-        if (!armed && !running) {
+        if (!armed && !train_runs()) {
             fail(PSTR("not armed"));
             return;
         }
         if (armed) /* a host that missed the answer may ask again */
-            go();
+            first_cycles = train_go();
         armed = 0;
         put_text(PSTR("OK GO "));
         put_us(first_cycles / CYCLES_PER_US);
         put_end();
     } else if (!strcmp_P(text, PSTR("STOP"))) {
-        stopping = stop_asked = 1;
+        train_stop();
+        stop_asked = 1;
         armed = 0;
     } else {
         fail(PSTR("unknown"));
@@ -318,32 +128,28 @@ static uint8_t report(void)
 {
     static uint32_t told;
     static uint8_t since;
-    uint32_t lost;
-    ATOMIC_BLOCK(ATOMIC_FORCEON)
-    {
-        lost = dropped;
-    }
+    uint32_t lost = train_dropped();
+    struct tick tick;
+    struct exposure exposure;
     if (lost != told && ++since >= PATIENCE) {
         since = 0;
         told = lost;
         put_text(PSTR("D "));
         put_number(lost);
-    } else if (ticks_in != ticks_out) {
+    } else if (train_tick(&tick)) {
         put_text(PSTR("P "));
-        put_number(ticks[ticks_out].number);
-        put_text(ticks[ticks_out].bit ? PSTR(" 1 ") : PSTR(" 0 "));
-        put_us(ticks[ticks_out].cycles / CYCLES_PER_US);
-        ticks_out = (ticks_out + 1) % QUEUE;
-    } else if (stop_asked && !running) {
+        put_number(tick.number);
+        put_text(tick.bit ? PSTR(" 1 ") : PSTR(" 0 "));
+        put_us(tick.cycles / CYCLES_PER_US);
+    } else if (stop_asked && !train_runs()) {
         stop_asked = 0;
         put_text(PSTR("OK STOP "));
-        put_number(ticks_sent);
-    } else if (exposures_in != exposures_out) {
+        put_number(train_ticks_sent());
+    } else if (train_exposure(&exposure)) {
         put_text(PSTR("X "));
-        put_number(exposures[exposures_out].number);
+        put_number(exposure.number);
         put_text(PSTR(" "));
-        put_us(exposures[exposures_out].cycles / CYCLES_PER_US);
-        exposures_out = (exposures_out + 1) % QUEUE;
+        put_us(exposure.cycles / CYCLES_PER_US);
     } else if (lost != told) {
         since = PATIENCE; /* nothing else to send */
         return 1;
@@ -358,8 +164,7 @@ static uint8_t report(void)
 static void rest(void)
 {
     cli();
-    if (line_waits() || ticks_in != ticks_out || exposures_in != exposures_out
-        || (stop_asked && !running)) {
+    if (line_waits() || train_reports_wait() || (stop_asked && !train_runs())) {
         sei();
         return;
     }
@@ -373,10 +178,7 @@ int main(void)
 {
     MCUSR = 0;
     wdt_disable(); /* a bootloader may have left it on */
-    OUTPUT_PORT = EXPOSURE; /* its pull-up: an input that is not wired stays quiet */
-    OUTPUT_DIRECTION = TRIGGER | CODE;
-    TCCR1B = _BV(ICNC1) | _BV(ICES1) | _BV(CS10);
-    TIMSK1 = _BV(TOIE1) | _BV(OCIE1A) | _BV(ICIE1);
+    train_init();
     set_sleep_mode(SLEEP_MODE_IDLE);
     line_init();
     sei();
