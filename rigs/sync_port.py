@@ -101,7 +101,7 @@ class SyncPort:
         self._thread.start()
         try:
             self._greet()
-        except SyncBoxFault:
+        except BaseException:
             self.close()
             raise
 

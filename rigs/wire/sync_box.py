@@ -142,7 +142,10 @@ class PtySyncBox:
                 if self._silent:
                     continue
                 for body in self._lines.bodies(os.read(self._master, 4096) if ready else b""):
-                    self._obey(body)
+                    try:
+                        self._obey(body)
+                    except ValueError:
+                        self._say("E unknown")
                 for _ in range(self._lines.wrong):
                     self._say("E checksum")
                 self._lines.wrong = 0

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+import serial
 
 from protocols.timing import Code
 from rigs.capabilities import RigError, SyncBox
@@ -262,6 +263,37 @@ def test_reports_missing_at_the_end_are_counted(wire: PtySyncBox, box: SerialSyn
     threading.Event().wait(0.1)
     box.stop()
     assert box.losses.pulses >= 5
+
+
+def test_what_nobody_reads_is_counted_and_not_kept(
+    wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rigs.sync_box.MOST_WAITING", 5)
+    box.start(1000.0, SEED)
+    end = time.monotonic() + 5.0
+    while box.losses.unread < 10 and time.monotonic() < end:
+        threading.Event().wait(0.01)
+    box.stop()
+    assert len(box.read_pulses()) == 5
+    assert len(box.read_exposures()) == 5
+    assert box.losses.unread >= 10
+    assert box.losses.pulses == 0
+
+
+def test_what_the_box_refuses_is_said(
+    wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rigs.wire.sync_box.MOST_HZ", 50.0)
+    with pytest.raises(SyncBoxFault, match="refuses ARM: rate must be"):
+        box.start(100.0, SEED)
+
+
+@pytest.mark.parametrize("line", [b"ARM\n", seal("ARM 100"), seal("ARM x 1 0 lfsr"), seal("FLY")])
+def test_the_stand_in_survives_nonsense(wire: PtySyncBox, box: SerialSyncBox, line: bytes) -> None:
+    with serial.Serial(wire.port, timeout=1.0) as port:
+        port.write(line)
+        assert port.readline().startswith(b"E ")
+    box.connect()
 
 
 def test_an_unplugged_box(wire: PtySyncBox, box: SerialSyncBox) -> None:
