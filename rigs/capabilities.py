@@ -37,6 +37,9 @@ class ArmState(Enum):
     PROTECTIVE_STOP = "protective stop"
     EMERGENCY_STOP = "emergency stop"
     DISCONNECTED = "disconnected"
+    REMOTE_CONTROL_OFF = "remote control off"
+    NOT_RUNNING = "not running"
+    """Switched off, or the program that listens for moves has ended."""
 
     @property
     def healthy(self) -> bool:

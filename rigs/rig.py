@@ -365,6 +365,8 @@ def _fault(state: ArmState, phase: str) -> ArmFault:
         ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
         ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm at the pendant",
         ArmState.DISCONNECTED: "check power and network of the arm's controller",
+        ArmState.REMOTE_CONTROL_OFF: "switch the pendant to remote control",
+        ArmState.NOT_RUNNING: "switch the arm on, then connect again",
     }.get(state, "look at the arm")
     return ArmFault(
         "arm",
