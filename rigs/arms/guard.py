@@ -59,8 +59,10 @@ class Guard:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         plate = limits.plate
-        self._frame = plate and PlateFrame.taught(
-            (plate.centre_mm, plate.right_mm, plate.above_mm)
+        self._frame = (
+            PlateFrame.taught((plate.centre_mm, plate.right_mm, plate.above_mm))
+            if plate is not None
+            else None
         )
 
     def check(self, begin: Pose, path: Sequence[Segment]) -> None:

@@ -1,10 +1,10 @@
 """Poses in and out of each arm's own language, converted in this one place.
 
 SlipLab speaks mm and rotation vectors in degrees (`rigs.capabilities.Pose`). Universal Robots
-controllers speak metres and rotation vectors in radians (URScript manual, `p[x, y, z, rx, ry, rz]`).
-ABB controllers speak mm and unit quaternions w x y z (RAPID `pose`). A rotation has several
-rotation vectors and two quaternions; what comes out here is always the short one: an angle of at
-most 180 degrees, and w >= 0.
+controllers speak metres and rotation vectors in radians (`p[x, y, z, rx, ry, rz]` of the URScript
+manual). ABB controllers speak mm and unit quaternions w x y z (RAPID `pose`). A rotation has
+several rotation vectors and two quaternions; what comes out here is always the short one: an angle
+of at most 180 degrees, and w >= 0.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ def distance_mm(one: Pose, other: Pose) -> float:
 def between(one: Pose, other: Pose, share: float) -> Pose:
     """The pose at `share` (0 to 1) of the straight way with the shortest turn."""
     x, y, z = (a + share * (b - a) for a, b in zip(one.xyz_mm, other.xyz_mm, strict=True))
+    if one.rotvec_deg == other.rotvec_deg:
+        return Pose((x, y, z), one.rotvec_deg)
     turn = (_rotation(one).inv() * _rotation(other)).as_rotvec() * share
     rotation = _rotation(one) * Rotation.from_rotvec(turn)
     a, b, c = np.degrees(rotation.as_rotvec()).tolist()

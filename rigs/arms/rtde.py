@@ -10,6 +10,7 @@ Protocol (the maker's RTDE guide, version 2): big-endian `u16 size, u8 command`,
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import struct
 import time
@@ -107,10 +108,8 @@ class RtdeReader:
     def close(self) -> None:
         """Give the connection back; safe to call more than once and from another thread."""
         if self._socket is not None:
-            try:
+            with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits in `read`
-            except OSError:
-                pass
             self._socket.close()
 
     def _ask(self, command: int, body: bytes, deadline: float) -> bytes:

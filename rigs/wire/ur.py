@@ -96,7 +96,7 @@ class UrStandIn:
         self.host, self._cycle_hz = host, cycle_hz
         self.motion = motion or StraightMotion(HOME)
         self.clock = ControllerClock(time.monotonic, rate)
-        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut)
+        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, rate)
         self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[_Client] = []
@@ -323,7 +323,8 @@ def _whole_script(text: str) -> str | None:
 
 
 def _send(writer: asyncio.StreamWriter, command: int, body: bytes) -> None:
-    writer.write(HEADER.pack(HEADER.size + len(body), command) + body)
+    if not writer.is_closing():
+        writer.write(HEADER.pack(HEADER.size + len(body), command) + body)
 
 
 def _command_last(pair: tuple[str, int | float]) -> bool:

@@ -50,6 +50,7 @@ class UrProgram:
         joints_deg: what the joints are said to be; a stand-in has no joints.
         digital_inputs: levels of the digital inputs by controller time.
         cut: what to do for the faults that concern the link.
+        rate: controller seconds a host second; the watchdog watches the host, in its seconds.
     """
 
     def __init__(
@@ -59,8 +60,9 @@ class UrProgram:
         joints_deg: Sequence[float],
         digital_inputs: Callable[[float], int],
         cut: Callable[[Kind], None],
+        rate: float = 1.0,
     ) -> None:
-        self.motion, self._reach_mm, self._cut = motion, reach_mm, cut
+        self.motion, self._reach_mm, self._cut, self._rate = motion, reach_mm, cut, rate
         self.joints_deg = list(joints_deg)
         self.digital_inputs = digital_inputs
         self.ints_in, self.doubles_in = [0] * 48, [0.0] * 48
@@ -80,6 +82,10 @@ class UrProgram:
         self._operation = 0
         self._left_from: Pose | None = None
         self._t = 0.0
+        self._here = motion.pose(0.0).xyz_mm
+        self._speed_mm_s = [0.0, 0.0, 0.0]
+        self.speed_fraction = 1.0
+        """Where the pendant's speed slider stands."""
 
     @property
     def program_running(self) -> bool:
@@ -88,7 +94,10 @@ class UrProgram:
 
     def cycle(self, t_s: float) -> None:
         """Advance to controller time `t_s`."""
-        self._t = t_s
+        here = self.motion.pose(t_s).xyz_mm
+        seconds = max(t_s - self._t, 1e-9)
+        self._speed_mm_s = [(b - a) / seconds for a, b in zip(self._here, here, strict=True)]
+        self._here, self._t = here, t_s
         self._moving_faults()
         self._idle_faults()
         if self._watchdog_s is not None and t_s - self._written_s > self._watchdog_s:
@@ -176,6 +185,8 @@ class UrProgram:
             "timestamp": lambda: t_s,
             "actual_TCP_pose": lambda: to_ur(self.motion.pose(t_s)),
             "target_TCP_pose": lambda: to_ur(self.motion.pose(t_s)),
+            "target_TCP_speed": lambda: [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0],
+            "target_speed_fraction": lambda: self.speed_fraction,
             "actual_q": lambda: [angle * 0.017453292519943295 for angle in self.joints_deg],
             "actual_digital_input_bits": lambda: self.digital_inputs(t_s),
             "robot_status_bits": lambda: 1 | (2 if self.program_running else 0),
@@ -217,7 +228,7 @@ class UrProgram:
         elif command == 31:
             self.happen(Kind.PROTECTIVE_STOP)
         elif command == 35:
-            self._watchdog_s, self._written_s = 1.0 / values[0], self._t
+            self._watchdog_s, self._written_s = self._rate / values[0], self._t
         elif command == 36:
             far = distance_mm(from_ur(values[:6]), Pose((0, 0, 0), (0, 0, 0)))
             self.ints_out[1] = int(far <= self._reach_mm)
