@@ -286,8 +286,6 @@ class UrArm:
             self._lost = str(error)
             if self._control is not None:
                 self._control.kill()  # or it would connect again and send the move again
-            if not self._run.done:
-                self._end_program()
             self._stream.wake()
 
     def _take(self, packet: Packet) -> None:

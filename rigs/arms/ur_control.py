@@ -54,7 +54,8 @@ class ControlProcess:
         ControlError: it was not ready within `START_S`; the child is gone.
     """
 
-    def __init__(self, host: str, frequency_hz: float, start_s: float = START_S) -> None:
+    def __init__(self, host: str, frequency_hz: float) -> None:
+        start_s = START_S
         ours, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
         self._lock = threading.Lock()

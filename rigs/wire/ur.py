@@ -147,6 +147,10 @@ class UrStandIn:
         """A person turns remote control on (or off, without ending the program)."""
         self._inside(lambda: setattr(self.program, "remote", on))
 
+    def hang_program(self, hung: bool) -> None:
+        """The control program says that it runs, and takes no command any more."""
+        self._inside(lambda: setattr(self.program, "hung", hung))
+
     def unlock(self) -> None:
         """A person unlocks a protective stop, or releases an emergency stop."""
         self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))

@@ -84,6 +84,8 @@ class UrProgram:
         self._t = 0.0
         self._here = motion.pose(0.0).xyz_mm
         self._speed_mm_s = [0.0, 0.0, 0.0]
+        self.hung = False
+        """The program says that it runs and takes no command."""
         self.speed_fraction = 1.0
         """Where the pendant's speed slider stands."""
 
@@ -111,7 +113,8 @@ class UrProgram:
                 return
             self._blocking = False
             self.ints_out[0] = DONE
-        self._command(self.ints_in[0])
+        if not self.hung:
+            self._command(self.ints_in[0])
 
     def write(self, name: str, value: int | float) -> None:
         """A client wrote one input register."""
