@@ -381,26 +381,31 @@ class UrArm:
         return True
 
     def _end_program(self) -> bool:
-        """End the controller's program, and any move with it, through the text ports."""
+        """End the controller's program, and any move with it, through the text ports.
+
+        Returns:
+            Whether the controller said that it did. A script that was handed over may do it too,
+            but nothing says so: only a pose stream that is still there can show it.
+        """
         host = self._settings.host
-        script = f"stopl({STOP_DECELERATION_MM_S2 / MM_PER_M:g})\n"
         try:
             if ur_ports.dashboard(host, "stop", PORT_S) == "Stopped":
                 return True
         except ur_ports.PortError:
-            pass  # the other port may still take the script
-        try:
+            pass  # the other port may still take a script
+        script = f"stopl({STOP_DECELERATION_MM_S2 / MM_PER_M:g})\n"
+        with contextlib.suppress(ur_ports.PortError):
             ur_ports.send_script(host, script, PORT_S)
-        except ur_ports.PortError:
-            return False
-        return True
+        return False
 
     def _wait_still(self) -> bool:
         return self._stream.wait_for(self._is_still, STILL_S)
 
     def _is_still(self) -> bool:
         status = self._status
-        return status is not None and status.speed_mm_s < STILL_MM_S and not status.move_runs
+        if status is None or status.speed_mm_s >= STILL_MM_S:
+            return False
+        return not (status.move_runs and status.running)  # a program that was ended clears nothing
 
     def _moves(self) -> bool:
         return self._status is not None and self._status.move_runs

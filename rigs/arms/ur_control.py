@@ -73,7 +73,11 @@ class ControlProcess:
                 start_new_session=True,  # Ctrl-C is the parent's to handle: it stops the arm first
             )
         self._pipe = Connection(ours.detach())
-        self._answer("connect", start_s)
+        try:
+            self._answer("connect", start_s)
+        except ControlError:
+            self.close()
+            raise
 
     def call(self, name: str, *arguments: Any, within_s: float) -> Any:
         """The result of one call. Thread-safe: a second caller waits for the first.
@@ -86,11 +90,11 @@ class ControlProcess:
             raise ControlError(f"{name}: the call before it has not ended")
         try:
             if self._child.poll() is not None:
-                raise ControlError(f"{name}: the control client is gone{self._said()}")
+                raise ControlError(f"{name}: the control client is gone")
             try:
                 self._pipe.send((name, arguments, within_s))
             except OSError:
-                raise ControlError(f"{name}: the control client is gone{self._said()}") from None
+                raise ControlError(f"{name}: the control client is gone") from None
             return self._answer(name, within_s)
         finally:
             self._lock.release()

@@ -53,7 +53,7 @@ class Connections:
 
     def __init__(self) -> None:
         self._servers: list[asyncio.Server] = []
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._live: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
 
     async def listen(
         self,
@@ -64,13 +64,15 @@ class Connections:
         """Take connections on a port; `talk` speaks with one and may end by a lost connection."""
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            self._writers.add(writer)
+            task = asyncio.current_task()
+            assert task is not None
+            self._live[writer] = task
             try:
                 await talk(reader, writer)
-            except (OSError, asyncio.IncompleteReadError):
-                pass  # the client left
+            except (OSError, asyncio.IncompleteReadError, asyncio.CancelledError):
+                pass  # the client left, or the link was cut
             finally:
-                self._writers.discard(writer)
+                del self._live[writer]
                 writer.close()
 
         self._servers.append(await asyncio.start_server(serve, host, port))
@@ -80,5 +82,6 @@ class Connections:
         for server in self._servers:
             server.close()
         self._servers.clear()
-        for writer in list(self._writers):
+        for writer, task in list(self._live.items()):
             writer.transport.abort()
+            task.cancel()
