@@ -59,6 +59,22 @@ def short_rotvec_deg(rotvec_deg: F64) -> F64:
     return np.degrees(Rotation.from_rotvec(np.radians(rotvec_deg)).as_rotvec())
 
 
+def compose(one: Pose, other: Pose) -> Pose:
+    """`other`, given in the frame that `one` describes, in the frame that `one` is given in."""
+    rotation = _rotation(one)
+    x, y, z = (np.asarray(one.xyz_mm) + rotation.apply(other.xyz_mm)).tolist()
+    a, b, c = np.degrees((rotation * _rotation(other)).as_rotvec()).tolist()
+    return Pose((x, y, z), (a, b, c))
+
+
+def inverse(pose: Pose) -> Pose:
+    """The pose that undoes `pose`: composed with it, either way, it is the origin."""
+    back = _rotation(pose).inv()
+    x, y, z = (-back.apply(pose.xyz_mm)).tolist()
+    a, b, c = np.degrees(back.as_rotvec()).tolist()
+    return Pose((x, y, z), (a, b, c))
+
+
 def angle_deg(one: Pose, other: Pose) -> float:
     """Angle of the smallest turn from one pose's rotation to the other's, degrees."""
     return math.degrees((_rotation(one).inv() * _rotation(other)).magnitude())

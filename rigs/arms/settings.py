@@ -68,8 +68,6 @@ class _Arm(StrictModel):
     host: Host
     tool: ToolSettings = ToolSettings()
     limits: Limits
-    acceleration_mm_s2: Positive = 100.0
-    """At the start and the end of each segment."""
 
 
 class UrSettings(_Arm):
@@ -81,6 +79,8 @@ class UrSettings(_Arm):
     """
 
     driver: Literal["ur"] = "ur"
+    acceleration_mm_s2: Positive = 100.0
+    """At the start and the end of each segment."""
     frequency_hz: Annotated[int, Field(ge=10, le=500)] = 500
     """Rate of the pose stream; 500 is the controller's own."""
     sync_input: Annotated[int, Field(ge=0, le=17)] = 0
@@ -97,6 +97,8 @@ class AbbSettings(_Arm):
     egm_bind: Host = "0.0.0.0"
     username: str = "Default User"
     password: str = "robotics"
+    egm_point: Literal["tool", "flange"] = "tool"
+    """Whose pose the controller's EGM stream tells; held against the web services on connecting."""
     task: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "T_ROB1"
 
 

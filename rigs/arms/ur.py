@@ -16,13 +16,13 @@ import contextlib
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from rigs.arms import ur_ports
 from rigs.arms.guard import Guard
 from rigs.arms.pose import MM_PER_M, distance_mm, to_ur
 from rigs.arms.rtde import Packet, RtdeError, RtdeReader
+from rigs.arms.run import Run
 from rigs.arms.settings import UrSettings
 from rigs.arms.stream import PoseStream, Sample
 from rigs.arms.ur_control import WATCHDOG_HZ, ControlError, ControlProcess
@@ -52,18 +52,6 @@ STILL_MM_S = 0.01
 """Below this commanded speed the arm stands still."""
 
 
-@dataclass
-class _Run:
-    """One path that was started."""
-
-    path: Sequence[Segment]
-    finished: list[tuple[int, int]] = field(default_factory=list)
-    done: bool = False
-    cancelled: bool = False
-    error: ArmFault | None = None
-    thread: threading.Thread | None = None
-
-
 class UrArm:
     """A Universal Robots arm; an `Arm` of `rigs.capabilities`."""
 
@@ -78,7 +66,7 @@ class UrArm:
         self._lost: str | None = "not connected"
         self._remote = True
         self._closing = False
-        self._run = _Run((), done=True)
+        self._run = Run((), done=True)
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
         self._starting = threading.Lock()
@@ -162,7 +150,7 @@ class UrArm:
             if state is not ArmState.READY:
                 raise self._fault(state, "cannot move")
             self._check(path)
-            run = _Run(path)
+            run = Run(path)
             self._run = run
             try:
                 self._send(path[0])
@@ -178,10 +166,7 @@ class UrArm:
         Raises:
             ArmFault: the path was given up for a reason that `state` does not tell.
         """
-        state, run = self.state(), self._run
-        if run.error is not None and state.healthy:
-            raise run.error
-        return Progress(state, tuple(run.finished), run.done)
+        return self._run.progress(self.state())
 
     def read_poses(self) -> PoseChunk:
         """Poses since the last call, one a packet."""
@@ -331,7 +316,7 @@ class UrArm:
         if not self._call("moveL", to_ur(segment.to), speed, acceleration, True):
             raise self._fault(self.state(), "did not take a move")
 
-    def _follow(self, run: _Run) -> None:
+    def _follow(self, run: Run) -> None:
         """A path's thread: wait for each segment to end, hand over the next one."""
         try:
             for index, segment in enumerate(run.path):
@@ -348,7 +333,7 @@ class UrArm:
             run.done = True
             self._stream.wake()
 
-    def _await_segment(self, run: _Run, segment: Segment) -> tuple[int, int] | None:
+    def _await_segment(self, run: Run, segment: Segment) -> tuple[int, int] | None:
         """Start and end of the move that was just sent; None if it was stopped."""
 
         def ended() -> bool:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Protocol
 
 from rigs.arms.pose import angle_deg, between, distance_mm
 from rigs.capabilities import Pose
+
+
+_OFF_LINE_MM = 0.01
 
 
 class Motion(Protocol):
@@ -106,6 +109,25 @@ class StraightMotion:
             length = distance_mm(begin, to) or angle_deg(begin, to)
             self._line = _Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s)
             self._rest_s = t_s + self._line.ramp.seconds
+
+    def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
+        """Run on to `to` without a rest, if the way there goes on straight at the same speed.
+
+        Returns:
+            Whether it does; if not, nothing has changed.
+        """
+        with self._lock:
+            line = self._line
+            if t_s >= self._rest_s or line.ramp.peak != speed_mm_s:
+                return False
+            ramp = replace(line.ramp, length=distance_mm(line.begin, to))
+            on_line = between(line.begin, to, line.ramp.length / ramp.length if ramp.length else 0)
+            braking = speed_mm_s / ramp.acceleration
+            if distance_mm(on_line, line.end) > _OFF_LINE_MM or t_s > self._rest_s - braking:
+                return False
+            self._line = replace(line, end=to, ramp=ramp)
+            self._rest_s = line.start_s + ramp.seconds
+            return True
 
     def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
         """Come to rest on the line, at its end at the latest."""
