@@ -3,7 +3,8 @@
 What that server cannot do shapes this driver. It has no stop, so a way is sent in pieces of at most
 `segment_s` seconds and a stop waits for the one that runs. It answers nothing while a move runs, so
 poses are known only between pieces. It tells no time, so times are the host's. It tells no safety
-state, so a protective stop is a move that is not answered. `rigs.arms.abb` has none of these limits.
+state, so a protective stop is a move that is not answered. `rigs.arms.abb` has none of these
+limits.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ ZONE = (0, 0.3, 0.3, 0.03)
 """Pieces of one segment run into each other: a fly-by point of RAPID's z0."""
 FINE = (1, 0.0, 0.0, 0.0)
 """The last piece of a segment ends at rest."""
+STILL_MM, STILL_S = 0.001, 0.02
+"""An arm that went no further than this in that time stands still, mm and s."""
 ARRIVED_MM = 0.1
 """A segment that ends further than this from its target was stopped by somebody."""
 
@@ -141,7 +144,7 @@ class AbbSocketArm:
     def stop(self) -> None:
         """Send no further piece and wait for the one that runs: there is no stop on this wire.
 
-        Takes at most 2 `segment_s` + `OVERTIME_S`.
+        Takes at most 2 `segment_s` + `OVERTIME_S` + `ANSWER_S`.
 
         Raises:
             ArmFault: the piece that runs did not end in time.
@@ -192,8 +195,7 @@ class AbbSocketArm:
         self._ask(Command.SET_ZONE, ZONE if pieces > 1 else FINE)
         for piece in range(1, pieces + 1):
             if run.cancelled:
-                self._ask(Command.SET_ZONE, FINE)
-                self._look()
+                self._settle()
                 return False
             if piece == pieces > 1:
                 self._ask(Command.SET_ZONE, FINE)
@@ -203,6 +205,19 @@ class AbbSocketArm:
             self._look()
         last = self._stream.last
         return last is not None and distance_mm(last.pose, segment.to) <= ARRIVED_MM
+
+    def _settle(self) -> None:
+        """Wait until it stands: a fly-by move is answered before its end. Raises RapidError."""
+        deadline, poll = time.monotonic() + ANSWER_S, threading.Event()
+        before = None
+        while time.monotonic() < deadline:
+            self._look()
+            here = self._stream.last
+            if before is not None and here and distance_mm(before.pose, here.pose) < STILL_MM:
+                return
+            before = here
+            poll.wait(STILL_S)
+        raise RapidError("the arm does not come to rest")
 
     def _look(self) -> None:
         """Ask for the pose; its time is the middle of the question. Raises RapidError."""

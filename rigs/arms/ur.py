@@ -85,7 +85,9 @@ class UrArm:
             self._open_stream()
             self._check_remote()
             state = self.state()
-            if state is not ArmState.READY and state is not ArmState.NOT_RUNNING:
+            if state is ArmState.READY:  # the client would end that program without a word
+                raise ArmFault("arm", "runs somebody's program; end it at the pendant first")
+            if state is not ArmState.NOT_RUNNING:
                 raise self._fault(state, "cannot connect")
             self._take_control()
         except BaseException:
@@ -108,6 +110,8 @@ class UrArm:
         }:
             raise self._fault(self.state(), "cannot recover")
         self.close()
+        with contextlib.suppress(ur_ports.PortError):
+            ur_ports.dashboard(self._settings.host, "stop", PORT_S)
         self.connect()
 
     def state(self) -> ArmState:
@@ -210,9 +214,11 @@ class UrArm:
         control, self._control = self._control, None
         if control is not None:
             if self._lost is None:
-                with contextlib.suppress(ControlError):
+                try:
                     control.call("stopL", STOP_DECELERATION_MM_S2 / MM_PER_M, True, within_s=PORT_S)
                     control.call("stopScript", within_s=PORT_S)
+                except ControlError:
+                    self._end_program()
             control.close()
         self._run.cancelled = True
         self._lost = self._lost or "closed"

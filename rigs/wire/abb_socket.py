@@ -1,8 +1,8 @@
 """A stand-in for the small RAPID socket server on an ABB controller (port 5000).
 
-One client at a time; a second one is taken by the network and not answered until the first has left.
-A fly-by move is answered inside its zone, so that the next one can run on from it without a rest;
-a fine-point move is answered at rest. A move that a safety stop ends is never answered.
+One client at a time; a second one is taken by the network and not answered until the first has
+left. A fly-by move is answered inside its zone, so that the next one can run on from it without a
+rest; a fine-point move is answered at rest. A move that a safety stop ends is never answered.
 """
 
 from __future__ import annotations
@@ -152,11 +152,12 @@ class RapidStandIn:
         now = self.clock.now_s()
         if not self.motion.extend(to, self._speed_mm_s, now):
             self.motion.move(to, self._speed_mm_s, ACCELERATION_MM_S2, now)
+        zone_mm = min(self._zone_mm, distance_mm(begin, to) / 2)  # RAPID's own rule
         loop = asyncio.get_running_loop()
         while self.moving() or self._stopped:
             here = self.pose()
             self._reach(Stage.MOVING, distance_mm(begin, here))
-            if not self._stopped and 0 < distance_mm(here, to) < self._zone_mm:
+            if not self._stopped and 0 < distance_mm(here, to) < zone_mm:
                 return
             tick = loop.create_future()
             loop.call_later(_POLL_S, _end, tick)

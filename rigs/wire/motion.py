@@ -15,7 +15,6 @@ from typing import Protocol
 from rigs.arms.pose import angle_deg, between, distance_mm
 from rigs.capabilities import Pose
 
-
 _OFF_LINE_MM = 0.01
 
 

@@ -6,6 +6,7 @@ measured. The client is the real ur_rtde throughout.
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable
 
@@ -13,11 +14,14 @@ import pytest
 
 from rigs.arms import ur as driver
 from rigs.arms import ur_control
+from rigs.arms.rtde import HEADER, SETUP_INPUTS
+from rigs.arms.rtde import PORT as RTDE_PORT
+from rigs.arms.ur import UrArm
 from rigs.arms.ur_control import ControlError, ControlProcess
 from rigs.capabilities import ArmFault, ArmState, Pose, Segment
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.ur import HOME
-from tests.rigs.arms.conftest import MakeArm, MakeRobot
+from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import until
 
 BUSY_S = 3.0
@@ -201,9 +205,21 @@ def test_a_second_client_is_refused_and_the_first_slides_on(
     first = arm_on(robot)
     first.start([Segment(TARGET, 10.0)])
     second = arm_on(robot, connected=False)
-    fails(second.connect, ur_control.START_S, "another program has control")
+    fails(second.connect, driver.ANSWER_S, "runs somebody's program")
     until(lambda: first.progress().done, 5.0)
     assert len(first.progress().finished) == 1
+
+
+def test_registers_that_are_taken_are_told(robot_of: MakeRobot) -> None:
+    """Somebody who writes the registers without a program: a PLC, or a client that starts up."""
+    robot = robot_of()
+    taker = socket.create_connection((robot.host, RTDE_PORT), 2.0)
+    with taker:
+        body = b"input_int_register_0"
+        taker.sendall(HEADER.pack(HEADER.size + len(body), SETUP_INPUTS) + body)
+        assert taker.recv(100)
+        arm = UrArm(ur_settings(robot.host))
+        fails(arm.connect, ur_control.START_S, "another program has control of it")
 
 
 def test_a_bad_call_is_an_error_and_the_client_lives_on(

@@ -53,6 +53,19 @@ def test_a_stop_has_no_jump_and_keeps_to_the_line(at_s: float) -> None:
     assert not motion.moving(at_s + 1)
 
 
+def test_a_line_may_be_extended_on_its_way_and_only_straight_on() -> None:
+    motion = StraightMotion(A)
+    motion.move(Pose((1.0, 0.0, 0.0), A.rotvec_deg), 1.0, 100.0, 0.0)
+    further = Pose((3.0, 0.0, 0.0), A.rotvec_deg)
+    assert not motion.extend(Pose((1.0, 2.0, 0.0), A.rotvec_deg), 1.0, 0.5)  # round a corner
+    assert not motion.extend(further, 2.0, 0.5)  # at another speed
+    assert motion.extend(further, 1.0, 0.5)
+    t = np.linspace(0.1, 2.9, 100)
+    assert np.diff(xs(motion, t)) / np.diff(t) == pytest.approx(1.0)
+    assert not motion.extend(further, 1.0, 5.0)  # it rests
+    assert motion.pose(5.0) == further
+
+
 def test_a_fast_clock_runs_at_its_rate() -> None:
     host = iter([10.0, 10.0, 12.0])
     clock = ControllerClock(lambda: next(host), rate=5.0, offset_s=100.0)
