@@ -21,6 +21,7 @@ PORT = 30004
 HEADER = struct.Struct(">HB")
 TYPES = {"DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6D": "6d"}
 """RTDE's names of the types that are used here, as `struct` writes them."""
+_LAST_LOOK_S = 0.01
 REQUEST_PROTOCOL_VERSION, SETUP_OUTPUTS, SETUP_INPUTS = 86, 79, 73
 GET_VERSION, START, PAUSE, DATA, TEXT = 118, 83, 80, 85, 77
 
@@ -135,9 +136,10 @@ class RtdeReader:
 
     def _more(self, deadline: float) -> None:
         left = deadline - time.monotonic()
-        if left <= 0 or self._socket is None:
-            raise TimeoutError("nothing came in time")
-        self._socket.settimeout(left)
+        if self._socket is None:
+            raise ConnectionError("closed")
+        # A thread that was kept waiting itself still looks once at what has come meanwhile.
+        self._socket.settimeout(max(left, _LAST_LOOK_S))
         data = self._socket.recv(65536)
         if not data:
             raise ConnectionError("the controller closed the connection")

@@ -32,7 +32,7 @@ from storage.streams import PoseChunk, PulseChunk
 
 ANSWER_S = 3.0
 """Connecting the pose stream, with every answer of its set-up, s."""
-SILENCE_S = 0.5
+SILENCE_S = 1.0
 """A pose stream silent for this long is lost, s."""
 COMMAND_S = 2.0
 """One call of the control client: the controller takes a command within a few cycles, s."""
@@ -74,7 +74,7 @@ class UrArm:
     def connect(self) -> None:
         """Open the pose stream, take control, set tool, payload and watchdog.
 
-        Takes at most `ANSWER_S` + `SILENCE_S` + `PORT_S` + `ur_control.START_S` + 3 `COMMAND_S`.
+        Takes at most `ANSWER_S` + `SILENCE_S` + 3 `PORT_S` + `ur_control.START_S` + 3 `COMMAND_S`.
 
         Raises:
             ArmFault: no connection, somebody else has control, or the arm may not move now.
@@ -255,6 +255,7 @@ class UrArm:
                 raise ArmFault(
                     "arm", "another program has control of it; end that program first"
                 ) from None
+            self._end_program()  # its script may have come through
             raise ArmFault("arm", f"gave no control: {error}") from None
         tcp = to_ur(Pose(tool.tcp_mm, tool.tcp_rotvec_deg))
         centre = [value / MM_PER_M for value in tool.centre_of_mass_mm]

@@ -62,7 +62,7 @@ class RapidStandIn:
     def start(self) -> None:
         """Open the port and run. Raises OSError if it is taken."""
         self._thread = LoopThread(f"stand-in {self.host}")
-        self._thread.run(self._listen())
+        self._thread.call(self._listen)
 
     def close(self) -> None:
         """Cut every connection and give the port back."""
@@ -81,7 +81,7 @@ class RapidStandIn:
         assert self._thread is not None
         self._thread.call(self._connections.cut)
         self._stopped = self._silent = False
-        self._thread.run(self._listen())
+        self._thread.call(self._listen)
 
     def pose(self) -> Pose:
         """Where the tool centre point is now."""
@@ -91,9 +91,9 @@ class RapidStandIn:
         """Whether it is on its way now."""
         return self.motion.moving(self.clock.now_s())
 
-    async def _listen(self) -> None:
+    def _listen(self) -> None:
         self._turn = asyncio.Lock()
-        await self._connections.listen(self.host, self.port, self._talk)
+        self._connections.listen(self.host, self.port, self._talk)
 
     def _happen(self, kind: Kind) -> None:
         if kind is Kind.LINK_CUT:

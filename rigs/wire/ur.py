@@ -41,6 +41,8 @@ VERSION = (5, 11, 1, 108318)
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
+_STALL_S = 0.1
+"""A stand-in that was kept from running this long must not blame its client for it."""
 _UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
 _INT32 = {"robot_mode", "safety_mode"}
 _UINT64 = {"actual_digital_input_bits", "actual_digital_output_bits"}
@@ -115,7 +117,7 @@ class UrStandIn:
         """Open the ports and run. Raises OSError if one of them is taken."""
         self._thread = LoopThread(f"stand-in {self.host}")
         try:
-            self._thread.run(self._listen())
+            self._thread.call(self._listen)
         except OSError:
             self._thread.close()
             raise
@@ -141,7 +143,7 @@ class UrStandIn:
         assert self._thread is not None
         self._thread.call(self._connections.cut)
         self._silent = False
-        self._thread.run(self._listen())
+        self._thread.call(self._listen)
 
     def set_remote(self, on: bool) -> None:
         """A person turns remote control on (or off, without ending the program)."""
@@ -173,13 +175,13 @@ class UrStandIn:
         else:
             self._connections.cut()
 
-    async def _listen(self) -> None:
+    def _listen(self) -> None:
         for port, talk in (
             (RTDE_PORT, self._rtde),
             (DASHBOARD_PORT, self._dashboard),
             (SCRIPT_PORT, self._script),
         ):
-            await self._connections.listen(self.host, port, talk)
+            self._connections.listen(self.host, port, talk)
 
     async def _may_answer(self) -> None:
         """Returns at once, or never while the controller is silent."""
@@ -190,6 +192,9 @@ class UrStandIn:
         """Every controller cycle that is due, each with its own packets."""
         asyncio.get_running_loop().call_later(_TICK_S, self._tick)
         due = int(self.clock.now_s() * self._cycle_hz)
+        late_s = (due - self._cycle) / self._cycle_hz
+        if late_s > _STALL_S * self.clock.rate:
+            self.program.forgive(late_s)
         while self._cycle < due:
             self._cycle += 1
             t_s = self._cycle / self._cycle_hz

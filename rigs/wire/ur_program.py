@@ -126,6 +126,10 @@ class UrProgram:
         else:
             self.doubles_in[index] = float(value)
 
+    def forgive(self, seconds: float) -> None:
+        """The stand-in itself stood still for `seconds` of controller time and heard nobody."""
+        self._written_s += seconds
+
     def script(self, text: str) -> None:
         """A whole script came in on the script port: what ran before is ended by it."""
         if not self.remote:

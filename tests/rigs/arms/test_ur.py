@@ -54,7 +54,9 @@ def test_a_slide_at_0_6_mm_s_is_straight_and_at_its_speed(
 def check_slide(robot_of: MakeRobot, arm_on: MakeArm, speed: float, rate: float) -> None:
     arm = arm_on(robot_of(rate=rate))
     arm.read_poses()
-    (span,) = follow(arm, Segment(at(15.0), speed))
+    finished = follow(arm, Segment(at(15.0), speed))
+    assert finished, arm.state()
+    (span,) = finished
     chunk = arm.read_poses()
     t_s, xyz = middle(chunk, span)
     assert np.polyfit(t_s, xyz[:, 1], 1)[0] == pytest.approx(speed, rel=0.005)

@@ -14,6 +14,7 @@ import pytest
 
 from rigs.arms import ur as driver
 from rigs.arms import ur_control
+from rigs.arms.pose import distance_mm
 from rigs.arms.rtde import HEADER, SETUP_INPUTS
 from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.arms.ur import UrArm
@@ -81,7 +82,7 @@ def test_recovering_unlocks_nothing_and_needs_a_person_first(
     where = robot.pose()
     arm.recover()
     assert arm.state() is ArmState.READY
-    assert robot.pose() == where  # the interrupted move did not go on
+    assert distance_mm(robot.pose(), where) < 1e-6  # the interrupted move did not go on
     arm.start([Segment(TARGET, 40.0)])
     until(lambda: arm.progress().done, 5.0)
     assert len(arm.progress().finished) == 1
@@ -101,7 +102,7 @@ def test_a_link_lost_while_sliding(robot_of: MakeRobot, arm_on: MakeArm, kind: K
     robot.restore_link()
     arm.recover()
     assert arm.state() is ArmState.READY
-    assert robot.pose() == where  # the client did not send the move again
+    assert distance_mm(robot.pose(), where) < 1e-6  # the client did not send the move again
 
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
@@ -138,11 +139,11 @@ def test_a_link_lost_while_connecting_or_uploading(
     monkeypatch.setattr(ur_control, "START_S", 2.0)
     robot = robot_of(faults=[Fault(kind, stage)])
     arm = arm_on(robot, connected=False)
-    fails(arm.connect, min(within_s, 2.0), "check its power|gave no control")
+    fails(arm.connect, min(within_s, 2.0) + 2 * driver.PORT_S, "check its power|gave no control")
     assert arm.state() is ArmState.DISCONNECTED
     robot.restore_link()
     monkeypatch.undo()
-    arm.connect()
+    arm.recover()  # the script may have come through: whatever runs is ended first
     assert arm.state() is ArmState.READY
 
 
