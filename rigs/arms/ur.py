@@ -70,11 +70,14 @@ class UrArm:
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
         self._starting = threading.Lock()
+        self._commanding = threading.Lock()
+        """Held while a move or a stop is handed over: no move may follow the stop that ends it."""
 
     def connect(self) -> None:
         """Open the pose stream, take control, set tool, payload and watchdog.
 
-        Takes at most `ANSWER_S` + `SILENCE_S` + 3 `PORT_S` + `ur_control.START_S` + 3 `COMMAND_S`.
+        Takes at most `ANSWER_S` + 3 `SILENCE_S` + 3 `PORT_S` + `ur_control.START_S` +
+        3 `COMMAND_S`.
 
         Raises:
             ArmFault: no connection, somebody else has control, or the arm may not move now.
@@ -137,7 +140,7 @@ class UrArm:
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path`: checked against all limits, first move taken by the controller.
 
-        Takes at most `PORT_S` + (2 + segments) `COMMAND_S`.
+        Takes at most `PORT_S` + `BEGIN_S` + (1 + segments) `COMMAND_S`, and 2 `PORT_S` on a fault.
 
         Raises:
             GuardError: a limit forbids the path; nothing was sent.
@@ -157,7 +160,7 @@ class UrArm:
             run = Run(path)
             self._run = run
             try:
-                self._send(path[0])
+                self._send(run, path[0])
             except ArmFault:
                 run.done = True
                 raise
@@ -183,7 +186,7 @@ class UrArm:
     def stop(self) -> None:
         """Stop the arm by every way that is left; never unlocks anything.
 
-        Takes at most `COMMAND_S` + 2 `PORT_S` + 2 `STILL_S`.
+        Takes at most 2 `COMMAND_S` + 2 `PORT_S` + 3 `STILL_S`.
 
         Raises:
             ArmFault: it was moving and could not be seen to stand still. Its own watchdog ends the
@@ -314,21 +317,30 @@ class UrArm:
                     "safety limits or its reach",
                 )
 
-    def _send(self, segment: Segment) -> None:
-        """Hand one move to the controller. Raises ArmFault if it is not taken."""
+    def _send(self, run: Run, segment: Segment) -> bool:
+        """Hand one move to the controller; False if a stop came first.
+
+        Raises:
+            ArmFault: it was not taken.
+        """
         self._stream.wait_for(lambda: not self._moves(), BEGIN_S)
-        self._rose_ns = self._fell_ns = None
         speed = segment.speed_mm_s / MM_PER_M
         acceleration = self._settings.acceleration_mm_s2 / MM_PER_M
-        if not self._call("moveL", to_ur(segment.to), speed, acceleration, True):
+        with self._commanding:
+            if run.cancelled:
+                return False
+            self._rose_ns = self._fell_ns = None
+            taken = self._call("moveL", to_ur(segment.to), speed, acceleration, True)
+        if not taken:
             raise self._fault(self.state(), "did not take a move")
+        return True
 
     def _follow(self, run: Run) -> None:
         """A path's thread: wait for each segment to end, hand over the next one."""
         try:
             for index, segment in enumerate(run.path):
-                if index:
-                    self._send(segment)
+                if index and not self._send(run, segment):
+                    break
                 times = self._await_segment(run, segment)
                 if times is None:
                     break
@@ -363,13 +375,18 @@ class UrArm:
         return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
 
     def _ask_control_to_stop(self) -> bool:
+        """Whether the control client took a stop, behind any move that was on its way to it."""
         if self._control is None or self._lost is not None:
+            return False
+        if not self._commanding.acquire(timeout=COMMAND_S):
             return False
         deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
         try:
             self._control.call("stopL", deceleration, True, within_s=COMMAND_S)
         except ControlError:
             return False
+        finally:
+            self._commanding.release()
         return True
 
     def _end_program(self) -> bool:

@@ -131,6 +131,21 @@ def test_a_stop_in_a_slide_stands_still_soon_and_says_so(
     assert len(follow(arm, Segment(at(0.0), 20.0))) == 1  # and it can go on
 
 
+def test_no_move_follows_a_stop_however_short_the_segments(
+    robot_of: MakeRobot, arm_on: MakeArm
+) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+    for attempt in range(3):
+        path = [Segment(at(attempt + 0.1 * step), 20.0) for step in range(1, 60)]
+        arm.start(path)
+        until(lambda: len(arm.progress().finished) > 2 + attempt, 10.0)  # noqa: B023
+        arm.stop()
+        where, now = robot.pose(), arm.now_ns()
+        until(lambda: arm.now_ns() > now + 300_000_000, 5.0)  # noqa: B023
+        assert robot.pose() == where
+
+
 def test_what_the_guard_forbids_is_never_sent(robot_of: MakeRobot, arm_on: MakeArm) -> None:
     robot = robot_of(joints_deg=(0, -90, 90, -90, -90, 0))
     arm = arm_on(robot)

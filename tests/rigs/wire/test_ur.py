@@ -21,7 +21,7 @@ from tests.rigs.loopback import own_address, until
 
 CLIENT_S = 30.0
 HEAD = """
-import json, sys
+import json, sys, time
 host, home = sys.argv[1], [0.4, 0.0, 0.3, 3.141592653589793, 0.0, 0.0]
 from rtde_control import RTDEControlInterface
 from rtde_receive import RTDEReceiveInterface
@@ -58,6 +58,9 @@ receive = RTDEReceiveInterface(host)
 control = RTDEControlInterface(host)
 said["mode"] = receive.getRobotMode()
 said["moved"] = control.moveL([0.4, 0.0, 0.295, 3.141592653589793, 0.0, 0.0], 0.04, 0.5)
+late = time.monotonic() + 5.0  # its packets may come after the answer
+while abs(receive.getActualTCPPose()[2] - 0.295) > 1e-4 and time.monotonic() < late:
+    pass
 said["z"] = receive.getActualTCPPose()[2]
 said["taken"] = control.moveL(home, 0.001, 0.5, True)
 said["running"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
@@ -144,3 +147,20 @@ def test_in_local_control_nothing_from_outside_runs(robot: UrStandIn) -> None:
     robot.set_remote(False)
     assert ur_ports.dashboard(robot.host, "is in remote control", 1.0) == "false"
     assert ur_ports.dashboard(robot.host, "stop", 1.0) != "Stopped"
+
+
+def test_it_runs_as_a_process_of_its_own() -> None:
+    host = own_address()
+    process = subprocess.Popen([sys.executable, "-m", "rigs.wire.ur", host])
+    try:
+        until(lambda: _answers(host), 20.0)
+    finally:
+        process.kill()
+        process.wait(5.0)
+
+
+def _answers(host: str) -> bool:
+    try:
+        return ur_ports.dashboard(host, "robotmode", 1.0) == "Robotmode: RUNNING"
+    except ur_ports.PortError:
+        return False
