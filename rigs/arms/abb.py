@@ -13,24 +13,14 @@ import threading
 import time
 from collections.abc import Sequence
 
-from abb_motion_program_exec.abb_motion_program_exec_client import MotionProgram
-from abb_motion_program_exec.commands.rapid_types import (
-    confdata,
-    fine,
-    loaddata,
-    pose,
-    robtarget,
-    speeddata,
-    tooldata,
-)
-
 from rigs.arms.abb_egm import EgmPose, EgmReceiver
+from rigs.arms.abb_program import PAUSE_S, motion_program
 from rigs.arms.abb_rws import REQUEST_S, WebError, WebServices, WebStatus
 from rigs.arms.guard import Guard
-from rigs.arms.pose import compose, distance_mm, quaternion
+from rigs.arms.pose import compose, distance_mm
 from rigs.arms.run import Run
 from rigs.arms.segments import SegmentWatch, is_at
-from rigs.arms.settings import AbbSettings, ToolSettings
+from rigs.arms.settings import AbbSettings
 from rigs.arms.stream import PoseStream, Sample
 from rigs.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
 from storage.streams import PoseChunk, PulseChunk
@@ -47,11 +37,8 @@ STOPPED_S = 2.0
 """From a stop being taken to the program having stopped, s."""
 OVERTIME_S = 5.0
 """How much longer than half as long again a path may take before it is stopped, s."""
-PAUSE_S = 0.05
-"""Rest between two segments, so that the end of one can be seen, s."""
 AGREE_MM = 0.5
 """How far EGM and the web services may differ in where the arm stands, mm."""
-_TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S = 500.0, 5000.0, 1000.0
 
 
 class AbbArm:
@@ -162,7 +149,7 @@ class AbbArm:
                 self._guard.check(begin, path)
                 self._guard.check_joints(self._web.joints_deg())
                 _, configuration = self._web.flange()
-                program = self._program(path, configuration)
+                program = motion_program(self._settings.tool, path, configuration)
                 run = Run(path)
                 self._watch = SegmentWatch(self._planned or begin, path)
                 self._run = run
@@ -257,9 +244,7 @@ class AbbArm:
             self._threads.append(threading.Thread(target=work, daemon=True))
             self._threads[-1].start()
         began_ns = time.monotonic_ns()
-        program = MotionProgram(tool=_tooldata(settings.tool))
-        program.WaitTime(PAUSE_S)  # sets the tool, and starts the pose stream
-        self._web.start(program)
+        self._web.start(motion_program(settings.tool))  # sets the tool, starts the pose stream
         if not self._stream.wait_for(lambda: self._fresh_since(began_ns), FIRST_POSE_S):
             raise ArmFault(
                 "arm",
@@ -388,29 +373,6 @@ class AbbArm:
             for one, segment in zip(places, run.path, strict=False)
         ]
 
-    def _program(self, path: Sequence[Segment], configuration: Sequence[float]) -> MotionProgram:
-        program = MotionProgram(tool=_tooldata(self._settings.tool))
-        for segment in path:
-            target = robtarget(
-                list(segment.to.xyz_mm), list(quaternion(segment.to)), confdata(*configuration),
-                [0.0] * 6,
-            )  # fmt: skip
-            speed = speeddata(
-                segment.speed_mm_s, _TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S
-            )
-            program.MoveL(target, speed, fine)
-            program.WaitTime(PAUSE_S)
-        return program
-
     def _fault(self, state: ArmState, what: str) -> ArmFault:
         reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
         return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")
-
-
-def _tooldata(tool: ToolSettings) -> tooldata:
-    frame = Pose(tool.tcp_mm, tool.tcp_rotvec_deg)
-    centre = list(tool.centre_of_mass_mm)
-    if not any(centre):
-        centre = [0.0, 0.0, 0.001]  # RAPID refuses a load whose centre is the origin
-    load = loaddata(max(tool.mass_kg, 0.001), centre, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
-    return tooldata(True, pose(list(frame.xyz_mm), list(quaternion(frame))), load)

@@ -50,6 +50,8 @@ ARRIVED_MM = 0.1
 """A move that ends further than this from its target was stopped by somebody."""
 STILL_MM_S = 0.01
 """Below this commanded speed the arm stands still."""
+_NEWS_S = 0.1
+"""How long a packet with news of the state may be on its way, s."""
 
 
 class UrArm:
@@ -310,6 +312,9 @@ class UrArm:
             )
         for segment in path:
             if not self._call("isPoseWithinSafetyLimits", to_ur(segment.to)):
+                # The client says no as well when the program has ended under it.
+                if self._stream.wait_for(lambda: self.state() is not ArmState.READY, _NEWS_S):
+                    raise self._fault(self.state(), "cannot move")
                 x, y, z = segment.to.xyz_mm
                 raise RigError(
                     "arm",
@@ -390,22 +395,9 @@ class UrArm:
         return True
 
     def _end_program(self) -> bool:
-        """End the controller's program, and any move with it, through the text ports.
-
-        Returns:
-            Whether the controller said that it did. A script that was handed over may do it too,
-            but nothing says so: only a pose stream that is still there can show it.
-        """
-        host = self._settings.host
-        try:
-            if ur_ports.dashboard(host, "stop", PORT_S) == "Stopped":
-                return True
-        except ur_ports.PortError:
-            pass  # the other port may still take a script
-        script = f"stopl({STOP_DECELERATION_MM_S2 / MM_PER_M:g})\n"
-        with contextlib.suppress(ur_ports.PortError):
-            ur_ports.send_script(host, script, PORT_S)
-        return False
+        """End the controller's program by the text ports; whether it said that it did."""
+        deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
+        return ur_ports.end_program(self._settings.host, deceleration, PORT_S)
 
     def _wait_still(self) -> bool:
         return self._stream.wait_for(self._is_still, STILL_S)

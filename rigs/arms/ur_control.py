@@ -25,8 +25,12 @@ from typing import Any
 
 START_S = 10.0
 """How long the child may take to connect, upload the control script and see it run, s."""
-WATCHDOG_HZ = 2.0
-"""The controller ends the program, and with it any move, unless it is written to this often."""
+WATCHDOG_HZ = 1.0
+"""The controller ends the program, and with it any move, unless it is written to this often.
+
+A host that records cameras may keep a process waiting for half a second; and a move that goes on
+for a second more goes no further than its own target, which was held against all limits.
+"""
 KICK_S = 0.1
 """How often the child writes to the controller when there is nothing else to say, s."""
 _IDLE_KICK_S = 1.0

@@ -7,6 +7,7 @@ need no program on the controller, so they are what is left when the control cli
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 
@@ -45,6 +46,25 @@ def send_script(host: str, script: str, within_s: float) -> None:
             link.shutdown(socket.SHUT_WR)
     except OSError as error:
         raise PortError(f"script port of {host}: {error}") from None
+
+
+def end_program(host: str, deceleration_m_s2: float, within_s: float) -> bool:
+    """End the controller's program, and any move with it, by one port or the other.
+
+    Takes at most twice `within_s`.
+
+    Returns:
+        Whether the controller said that it did. A script that was handed over may do it too, but
+        nothing says so: only a pose stream that is still there can show it.
+    """
+    try:
+        if dashboard(host, "stop", within_s) == "Stopped":
+            return True
+    except PortError:
+        pass  # the other port may still take a script
+    with contextlib.suppress(PortError):
+        send_script(host, f"stopl({deceleration_m_s2:g})\n", within_s)
+    return False
 
 
 def _line(link: socket.socket, deadline: float) -> str:

@@ -15,7 +15,6 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 from rigs.arms.rtde import (
     DATA,
@@ -26,13 +25,13 @@ from rigs.arms.rtde import (
     SETUP_INPUTS,
     SETUP_OUTPUTS,
     START,
-    TYPES,
 )
 from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.capabilities import Pose
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.loop import Connections, LoopThread
 from rigs.wire.motion import ControllerClock, Motion, StraightMotion
+from rigs.wire.ur_client import Client, send
 from rigs.wire.ur_program import Safety, UrProgram
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
@@ -43,31 +42,6 @@ JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
 _STALL_S = 0.1
 """A stand-in that was kept from running this long must not blame its client for it."""
-_UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
-_INT32 = {"robot_mode", "safety_mode"}
-_UINT64 = {"actual_digital_input_bits", "actual_digital_output_bits"}
-_SCALARS = {
-    "timestamp", "actual_execution_time", "speed_scaling", "target_speed_fraction",
-    "actual_momentum", "actual_main_voltage", "actual_robot_voltage", "actual_robot_current",
-    "payload",
-}  # fmt: skip
-_VECTORS = {"joint_mode": "VECTOR6INT32", "payload_cog": "VECTOR3D", "payload_inertia": "VECTOR6D"}
-_LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}
-_COUNT = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
-
-
-@dataclass(eq=False)
-class _Client:
-    """One RTDE connection."""
-
-    writer: asyncio.StreamWriter
-    names: list[str] = field(default_factory=list)
-    kinds: list[str] = field(default_factory=list)
-    layout: struct.Struct = field(default_factory=lambda: struct.Struct(">"))
-    every: int = 1
-    streaming: bool = False
-    recipes: dict[int, list[str]] = field(default_factory=dict)
-    outputs: int = 0
 
 
 class UrStandIn:
@@ -101,7 +75,7 @@ class UrStandIn:
         self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, rate)
         self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
-        self._clients: list[_Client] = []
+        self._clients: list[Client] = []
         self._connections = Connections()
         self._silent = False
         self._thread: LoopThread | None = None
@@ -203,22 +177,10 @@ class UrStandIn:
                 continue
             for client in self._clients:
                 if client.streaming and self._cycle % client.every == 0:
-                    self._send_outputs(client, t_s)
-
-    def _send_outputs(self, client: _Client, t_s: float) -> None:
-        flat: list[int | float] = []
-        for name, kind in zip(client.names, client.kinds, strict=True):
-            value = self.program.value(name, t_s)
-            if kind in _COUNT:
-                flat.extend(value if isinstance(value, list) else [0] * _COUNT[kind])
-            else:
-                assert not isinstance(value, list)
-                flat.append(value)
-        body = bytes([client.outputs]) + client.layout.pack(*flat)
-        _send(client.writer, DATA, body)
+                    send(client.writer, DATA, client.packet(self.program, t_s))
 
     async def _rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        client = _Client(writer)
+        client = Client(writer)
         self._clients.append(client)
         try:
             while True:
@@ -229,59 +191,25 @@ class UrStandIn:
                     self.program.reach(Stage.CONTROL)
                 await self._may_answer()
                 if command == DATA:
-                    self._take_inputs(client, body)
+                    client.take(self.program, body)
                 else:
-                    _send(writer, command, self._answer(client, command, body))
+                    send(writer, command, self._answer(client, command, body))
         finally:
             self._clients.remove(client)
 
-    def _answer(self, client: _Client, command: int, body: bytes) -> bytes:
+    def _answer(self, client: Client, command: int, body: bytes) -> bytes:
         if command == REQUEST_PROTOCOL_VERSION:
             return b"\x01" if body == b"\x00\x02" else b"\x00"
         if command == GET_VERSION:
             return struct.pack(">4I", *VERSION)
         if command == SETUP_OUTPUTS:
-            return self._outputs(client, body)
+            return client.ask_outputs(body, self._cycle_hz)
         if command == SETUP_INPUTS:
-            return self._inputs(client, body)
+            others = [other for other in self._clients if other is not client]
+            return client.ask_inputs(body, others)
         if command in {START, PAUSE}:
             client.streaming = command == START
         return b"\x01"
-
-    def _outputs(self, client: _Client, body: bytes) -> bytes:
-        (hz,) = struct.unpack_from(">d", body)
-        client.names = [name for name in body[8:].decode().split(",") if name]
-        client.kinds = [_kind(name) for name in client.names]
-        client.every = max(1, round(self._cycle_hz / hz))
-        client.outputs = 1
-        client.layout = struct.Struct(">" + "".join(_LAYOUT[kind] for kind in client.kinds))
-        return b"\x01" + ",".join(client.kinds).encode()
-
-    def _inputs(self, client: _Client, body: bytes) -> bytes:
-        """An input belongs to the client that asked for it first, for as long as it stays."""
-        names = [name for name in body.decode().split(",") if name]
-        taken = {
-            name
-            for other in self._clients
-            if other is not client
-            for recipe in other.recipes.values()
-            for name in recipe
-        }
-        if any(name in taken for name in names):
-            kinds = ["IN_USE" if name in taken else _kind(name) for name in names]
-            return b"\x00" + ",".join(kinds).encode()
-        recipe = len(client.recipes) + 1
-        client.recipes[recipe] = names
-        return bytes([recipe]) + ",".join(_kind(name) for name in names).encode()
-
-    def _take_inputs(self, client: _Client, body: bytes) -> None:
-        names = client.recipes.get(body[0], [])
-        if not all("register" in name for name in names):
-            return  # an external force, which nothing here feels
-        values = struct.unpack(">" + "".join(TYPES[_kind(name)] for name in names), body[1:])
-        # The command last: its parameters must be there when it is seen.
-        for name, value in sorted(zip(names, values, strict=True), key=_command_last):
-            self.program.write(name, value)
 
     async def _dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await self._may_answer()
@@ -329,29 +257,6 @@ def _whole_script(text: str) -> str | None:
         return None if end < 0 else text[: end + 5]
     line, newline, _ = text.partition("\n")
     return line + newline if newline else None
-
-
-def _send(writer: asyncio.StreamWriter, command: int, body: bytes) -> None:
-    if not writer.is_closing():
-        writer.write(HEADER.pack(HEADER.size + len(body), command) + body)
-
-
-def _command_last(pair: tuple[str, int | float]) -> bool:
-    return pair[0] == "input_int_register_0"
-
-
-def _kind(name: str) -> str:
-    if "_int_register_" in name or name in _INT32:
-        return "INT32"
-    if "_double_register_" in name or name in _SCALARS or name.startswith("standard_analog"):
-        return "DOUBLE"
-    if name == "actual_tool_accelerometer":
-        return "VECTOR3D"
-    if name in _UINT32:
-        return "UINT32"
-    if name in _UINT64:
-        return "UINT64"
-    return _VECTORS.get(name, "VECTOR6D")
 
 
 def main() -> None:
