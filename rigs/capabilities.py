@@ -38,11 +38,27 @@ class ArmState(Enum):
     PROTECTIVE_STOP = "protective stop"
     EMERGENCY_STOP = "emergency stop"
     DISCONNECTED = "disconnected"
+    REMOTE_CONTROL_OFF = "remote control off"
+    NOT_RUNNING = "not running"
+    """Switched off, or the program that listens for moves has ended."""
 
     @property
     def healthy(self) -> bool:
         """Whether the arm may be asked to move."""
         return self in {ArmState.READY, ArmState.MOVING}
+
+    @property
+    def advice(self) -> str:
+        """What a person must do about it; no rig unlocks or restarts anything by itself."""
+        return {
+            ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
+            ArmState.EMERGENCY_STOP: (
+                "release the emergency stop and restart the arm at the pendant"
+            ),
+            ArmState.DISCONNECTED: "check power and network of the arm's controller",
+            ArmState.REMOTE_CONTROL_OFF: "switch the pendant to remote control",
+            ArmState.NOT_RUNNING: "switch the arm on at the pendant, then connect again",
+        }.get(self, "look at the arm")
 
 
 @dataclass(frozen=True)

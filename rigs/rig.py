@@ -374,13 +374,8 @@ class Rig:
 
 def _fault(state: ArmState, phase: str) -> ArmFault:
     """What happened, and what a person must do about it; nothing is unlocked from here."""
-    advice = {
-        ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
-        ArmState.EMERGENCY_STOP: "release the emergency stop and restart the arm at the pendant",
-        ArmState.DISCONNECTED: "check power and network of the arm's controller",
-    }.get(state, "look at the arm")
     return ArmFault(
         "arm",
-        f"{state.value} in the phase '{phase}'; the arm stays where it is: {advice}, move it clear "
-        "of the plate, then run the same command to go on",
+        f"{state.value} in the phase '{phase}'; the arm stays where it is: {state.advice}, move "
+        "it clear of the plate, then run the same command to go on",
     )

@@ -1,0 +1,121 @@
+"""ABB Robot Web Services with a bound on every wait, for motion programs on an IRC5 controller.
+
+abb-robot-client 0.4.0 asks without a time-out, so its session gets one here. A request is bounded
+from its last byte to the next one of the answer; answers are a few hundred bytes.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import requests
+from abb_motion_program_exec.abb_motion_program_exec_client import (
+    MotionProgram,
+    MotionProgramExecClient,
+)
+from abb_robot_client.rws import RWS, ABBException
+from requests.adapters import HTTPAdapter
+
+from rigs.arms.pose import from_quaternion
+from rigs.arms.settings import AbbSettings
+from rigs.capabilities import ArmState, Pose
+
+REQUEST_S = 1.0
+"""Connecting, and each wait for bytes of an answer, s."""
+START_REQUESTS = 12
+"""Requests that starting a motion program takes at most, with those of logging in."""
+T = TypeVar("T")
+
+
+class WebError(RuntimeError):
+    """The web services did not answer in time, or refused; the text says which."""
+
+
+class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
+    """An HTTP adapter that never waits without a bound."""
+
+    def send(self, request: Any, **how: Any) -> Any:
+        """The answer to a request. Raises requests.RequestException after `REQUEST_S`."""
+        how["timeout"] = REQUEST_S
+        return super().send(request, **how)
+
+
+@dataclass(frozen=True)
+class WebStatus:
+    """What the web services say of the controller."""
+
+    controller: str
+    """motoron, motoroff, guardstop, emergencystop, ..."""
+    mode: str
+    """AUTO, MANR, ..."""
+    execution: str
+    """running or stopped."""
+
+    @property
+    def state(self) -> ArmState:
+        """The arm's state as far as it is known without a path."""
+        if self.controller.startswith("emergencystop"):
+            return ArmState.EMERGENCY_STOP
+        if self.controller == "guardstop":
+            return ArmState.PROTECTIVE_STOP
+        if self.mode != "AUTO":
+            return ArmState.REMOTE_CONTROL_OFF
+        return ArmState.READY if self.controller == "motoron" else ArmState.NOT_RUNNING
+
+
+class WebServices:
+    """One session of one thread at a time; others wait for it."""
+
+    def __init__(self, settings: AbbSettings) -> None:
+        url = f"http://{settings.host}:{settings.rws_port}"
+        self._rws = RWS(url, settings.username, settings.password)
+        self._rws._session.mount("http://", _Bounded())
+        self._client = MotionProgramExecClient(abb_client=self._rws)
+        self._task = settings.task
+        self._lock = threading.Lock()
+
+    def status(self) -> WebStatus:
+        """State of controller, mode and execution, in three requests. Raises WebError."""
+        return self._ask(
+            lambda: WebStatus(
+                self._rws.get_controller_state(),
+                self._rws.get_operation_mode(),
+                self._rws.get_execution_state().ctrlexecstate,
+            )
+        )
+
+    def flange(self) -> tuple[Pose, tuple[float, ...]]:
+        """The flange's pose in the base frame and the arm's configuration. Raises WebError."""
+        target = self._ask(self._rws.get_robtarget)
+        return from_quaternion(target.trans, target.rot), tuple(target.robconf.tolist())
+
+    def joints_deg(self) -> list[float]:
+        """The six joints, degrees. Raises WebError."""
+        joints: list[float] = self._ask(self._rws.get_jointtarget).robax.tolist()
+        return joints
+
+    def start(self, program: MotionProgram) -> None:
+        """Upload a motion program and start it. Raises WebError."""
+        self._ask(lambda: self._client.execute_motion_program(program, self._task, wait=False))
+
+    def stop(self) -> None:
+        """Stop the program that runs, and the arm with it. Raises WebError."""
+        self._ask(self._client.stop_motion_program)
+
+    def close(self) -> None:
+        """Give the session back."""
+        self._rws._session.close()
+
+    def _ask(self, request: Callable[[], T]) -> T:
+        try:
+            with self._lock:
+                return request()
+        except requests.RequestException as error:
+            raise WebError(f"the controller's web services do not answer: {error}") from None
+        except ABBException as error:
+            raise WebError(f"the controller refused: {error}") from None
+        except Exception as error:  # the client raises bare exceptions for what it does not like
+            raise WebError(str(error)) from None

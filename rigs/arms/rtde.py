@@ -1,0 +1,146 @@
+"""A reader of the Real-Time Data Exchange of Universal Robots (port 30004), every wait bounded.
+
+The driver commands the arm through ur_rtde but does not read poses through it: ur_rtde 1.6.5 skips
+a packet whenever two have arrived, hands out time and pose in separate calls, reads its
+set-up answers without a deadline, and connects again by itself. This reader keeps every packet
+whole, in order, with the host's time of its reception.
+
+Protocol (the maker's RTDE guide, version 2): big-endian `u16 size, u8 command`, then a body.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+PORT = 30004
+HEADER = struct.Struct(">HB")
+TYPES = {"DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6D": "6d"}
+"""RTDE's names of the types that are used here, as `struct` writes them."""
+_LAST_LOOK_S = 0.01
+REQUEST_PROTOCOL_VERSION, SETUP_OUTPUTS, SETUP_INPUTS = 86, 79, 73
+GET_VERSION, START, PAUSE, DATA, TEXT = 118, 83, 80, 85, 77
+
+
+class RtdeError(RuntimeError):
+    """The exchange could not be set up, or has ended; the text says how."""
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One packet of outputs."""
+
+    host_ns: int
+    """Host's monotonic clock when its last byte was read."""
+    values: tuple[float, ...]
+    """Every number of every output, flat, in the order asked for."""
+
+
+class RtdeReader:
+    """One connection that asks for outputs and then only listens.
+
+    Args:
+        host: name or address of the controller.
+        answer_s: how long connecting and each answer may take.
+        silence_s: how long the stream may be silent before it is taken for lost.
+    """
+
+    def __init__(self, host: str, answer_s: float, silence_s: float) -> None:
+        self._host, self._answer_s, self._silence_s = host, answer_s, silence_s
+        self._socket: socket.socket | None = None
+        self._rest = bytearray()
+        self._layout = struct.Struct(">")
+        self.version = (0, 0, 0, 0)
+
+    def open(self, names: Sequence[str], frequency_hz: float) -> None:
+        """Connect and start the stream of the named outputs.
+
+        Raises:
+            RtdeError: no connection, no answer in time, or an output that is not known there.
+        """
+        deadline = time.monotonic() + self._answer_s
+        try:
+            self._socket = socket.create_connection((self._host, PORT), self._answer_s)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            body = self._ask(REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2), deadline)
+            if body != b"\x01":
+                raise RtdeError("the controller does not speak version 2 of RTDE")
+            self.version = struct.unpack(">4I", self._ask(GET_VERSION, b"", deadline)[:16])
+            recipe = struct.pack(">d", frequency_hz) + ",".join(names).encode()
+            kinds = self._ask(SETUP_OUTPUTS, recipe, deadline)[1:].decode().split(",")
+            unknown = [name for name, kind in zip(names, kinds, strict=True) if kind not in TYPES]
+            if unknown:
+                raise RtdeError(f"the controller does not know {', '.join(unknown)}")
+            self._layout = struct.Struct(">" + "".join(TYPES[kind] for kind in kinds))
+            if self._ask(START, b"", deadline) != b"\x01":
+                raise RtdeError("the controller did not start the stream")
+        except (OSError, struct.error, ValueError) as error:
+            self.close()
+            raise RtdeError(f"cannot read from {self._host}:{PORT}: {error}") from None
+        except RtdeError:
+            self.close()
+            raise
+
+    def read(self) -> list[Packet]:
+        """Every packet that has come, at least one.
+
+        Raises:
+            RtdeError: nothing came for `silence_s`, or the connection has ended.
+        """
+        deadline = time.monotonic() + self._silence_s
+        packets: list[Packet] = []
+        try:
+            while not packets:
+                while (message := self._message()) is not None:
+                    command, body = message
+                    if command == DATA and len(body) == 1 + self._layout.size:
+                        values = self._layout.unpack_from(body, 1)
+                        packets.append(Packet(time.monotonic_ns(), values))
+                if not packets:
+                    self._more(deadline)
+        except OSError as error:
+            raise RtdeError(f"the pose stream of {self._host} has ended: {error}") from None
+        return packets
+
+    def close(self) -> None:
+        """Give the connection back; safe to call more than once and from another thread."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that waits in `read`
+            self._socket.close()
+
+    def _ask(self, command: int, body: bytes, deadline: float) -> bytes:
+        assert self._socket is not None
+        self._socket.sendall(HEADER.pack(HEADER.size + len(body), command) + body)
+        while True:
+            while (message := self._message()) is not None:
+                if message[0] == command:
+                    return message[1]
+            self._more(deadline)
+
+    def _message(self) -> tuple[int, bytes] | None:
+        if len(self._rest) < HEADER.size:
+            return None
+        size, command = HEADER.unpack_from(self._rest)
+        if size < HEADER.size:
+            raise ConnectionError("not an RTDE packet")
+        if len(self._rest) < size:
+            return None
+        body = bytes(self._rest[HEADER.size : size])
+        del self._rest[:size]
+        return command, body
+
+    def _more(self, deadline: float) -> None:
+        left = deadline - time.monotonic()
+        if self._socket is None:
+            raise ConnectionError("closed")
+        # A thread that was kept waiting itself still looks once at what has come meanwhile.
+        self._socket.settimeout(max(left, _LAST_LOOK_S))
+        data = self._socket.recv(65536)
+        if not data:
+            raise ConnectionError("the controller closed the connection")
+        self._rest += data

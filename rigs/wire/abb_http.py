@@ -1,0 +1,145 @@
+"""The HTTP of Robot Web Services, version 1: digest authentication, keep-alive, JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import re
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+USER, PASSWORD = "Default User", "robotics"
+REALM = "validusers@robapi.abb"
+_END_S = 5.0
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Status code, and the list that stands under `_embedded._state`."""
+
+    code: int
+    states: list[dict[str, Any]] | None
+
+
+Answer = Callable[[str, str, dict[str, str], bytes], Reply | None]
+"""From method, path, query and body to a reply; None leaves the client waiting."""
+
+
+class HttpServer:
+    """Answers until it is closed; a client that is left waiting waits until then."""
+
+    def __init__(self, host: str, port: int, answer: Answer) -> None:
+        self._server = _Server((host, port), _Handler)
+        self._server.answer = answer
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.02,), daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Cut every connection and give the port back."""
+        self._server.released.set()
+        self._server.shutdown()
+        self._server.cut()
+        self._server.server_close()
+        self._thread.join(_END_S)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+    answer: Answer
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.released = threading.Event()
+        self.nonce = secrets.token_hex(16)
+        self._open: set[socket.socket] = set()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self._open.add(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        self._open.discard(request)
+        super().shutdown_request(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that left in the middle is no error here."""
+
+    def cut(self) -> None:
+        """End every connection."""
+        for request in list(self._open):
+            with contextlib.suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: _Server
+    timeout = 30
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing is logged."""
+
+    def _serve(self) -> None:
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        if not self._is_allowed():
+            self._send(Reply(401, None))
+            return
+        parts = urlsplit(self.path)
+        # The client writes `?action=set?json=1` for some requests.
+        query = dict(parse_qsl(parts.query.replace("?", "&")))
+        path = unquote(parts.path).lstrip("/")
+        reply = self.server.answer(self.command, path, query, body)
+        if reply is None:
+            self.server.released.wait()
+            self.close_connection = True
+            return
+        self._send(reply)
+
+    do_GET = do_POST = do_PUT = do_DELETE = _serve
+
+    def _is_allowed(self) -> bool:
+        """RFC 2617 digest with MD5 and qop=auth, which is what the controller asks for."""
+        header = self.headers.get("Authorization", "")
+        found = re.findall(r'(\w+)=(?:"([^"]*)"|([^\s,]+))', header)
+        sent = {name: quoted or plain for name, quoted, plain in found}
+        if sent.get("nonce") != self.server.nonce or sent.get("username") != USER:
+            return False
+        secret = _md5(f"{USER}:{REALM}:{PASSWORD}")
+        request = _md5(f"{self.command}:{sent.get('uri')}")
+        parts = (
+            secret,
+            sent["nonce"],
+            sent.get("nc"),
+            sent.get("cnonce"),
+            sent.get("qop"),
+            request,
+        )
+        return sent.get("response") == _md5(":".join(map(str, parts)))
+
+    def _send(self, reply: Reply) -> None:
+        data = b""
+        if reply.states is not None:
+            data = json.dumps({"_embedded": {"_state": reply.states}}).encode()
+        self.send_response(reply.code)
+        if reply.code == 401:
+            challenge = f'Digest realm="{REALM}", nonce="{self.server.nonce}", qop="auth"'
+            self.send_header("WWW-Authenticate", challenge)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def _md5(text: str) -> str:
+    return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()

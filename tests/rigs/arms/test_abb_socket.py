@@ -1,0 +1,170 @@
+"""The driver of the RAPID socket server on its stand-in: what it can do, and what it cannot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rigs.arms import abb_socket as driver
+from rigs.arms import build_arm
+from rigs.arms.abb_socket import AbbSocketArm
+from rigs.arms.guard import SpeedError
+from rigs.arms.pose import distance_mm
+from rigs.arms.rapid_socket import Command, RapidError, RapidSocket
+from rigs.arms.settings import AbbSocketSettings
+from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from rigs.wire.abb_socket import HOME, RapidStandIn
+from rigs.wire.faults import Fault, Kind, Stage
+from tests.rigs.loopback import own_address, until
+
+BUSY_S = 3.0
+LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
+MakePair = Callable[..., tuple[AbbSocketArm, RapidStandIn]]
+
+
+def at(y_mm: float) -> Pose:
+    return Pose((400.0, y_mm, 300.0), HOME.rotvec_deg)
+
+
+SLIDE = [Segment(at(15.0), 1.6)]
+
+
+def settings(host: str, **more: Any) -> AbbSocketSettings:
+    tool = {"tcp_mm": (0, 0, 120)}
+    return AbbSocketSettings(**{"host": host, "limits": LIMITS, "tool": tool, **more})
+
+
+@pytest.fixture
+def pair() -> Iterator[MakePair]:
+    """Makes a stand-in and the driver on it; both are closed after the test."""
+    with ExitStack() as stack:
+
+        def make(connected: bool = True, **how: Any) -> tuple[AbbSocketArm, RapidStandIn]:
+            robot = stack.enter_context(RapidStandIn(own_address(), **how))
+            arm = AbbSocketArm(settings(robot.host))
+            stack.callback(arm.close)
+            if connected:
+                arm.connect()
+            return arm, robot
+
+        yield make
+
+
+def fails(action: Callable[[], object], within_s: float, match: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(ArmFault, match=match):
+        action()
+    assert time.monotonic() - began < within_s + BUSY_S
+
+
+@pytest.mark.parametrize("speed", [1.6, pytest.param(6.0, id="6.0, ten times as fast as 0.6")])
+def test_a_slide_in_pieces_is_at_its_speed_where_they_run_into_each_other(
+    pair: MakePair, speed: float
+) -> None:
+    """Nothing here can make a slow slide quick: its clock is the host's."""
+    arm, _ = pair()
+    arm.read_poses()
+    arm.start([Segment(at(5.0), speed)])
+    until(lambda: arm.progress().done, 20.0)
+    (span,) = arm.progress().finished
+    chunk = arm.read_poses()
+    assert len(chunk) >= 5 / speed / 0.25
+    margin = (span[1] - span[0]) // 20
+    inside = (chunk.t_ns >= span[0] + margin) & (chunk.t_ns <= span[1] - margin)
+    t_s, xyz = (chunk.t_ns[inside] - span[0]) / 1e9, chunk.xyz_mm[inside]
+    assert np.polyfit(t_s, xyz[:, 1], 1)[0] == pytest.approx(speed, rel=0.02)
+    assert np.ptp(xyz[:, [0, 2]], axis=0).max() < 0.05
+    assert arm.pose().xyz_mm == pytest.approx(at(5.0).xyz_mm, abs=1e-3)
+
+
+def test_it_is_an_arm_that_sets_its_tool(pair: MakePair) -> None:
+    arm, robot = pair()
+    assert isinstance(build_arm(settings("127.0.0.1")), Arm)
+    assert arm.state() is ArmState.READY
+    assert distance_mm(arm.pose(), HOME) < 1e-3
+    assert robot.tool.xyz_mm == (0, 0, 120)
+    assert abs(arm.now_ns() - time.monotonic_ns()) < 1e9
+    assert len(arm.read_pulses()) == 0
+
+
+def test_segments_follow_each_other_and_guards_hold(pair: MakePair) -> None:
+    arm, robot = pair()
+    with pytest.raises(SpeedError):
+        arm.start([Segment(at(5.0), 51.0)])
+    with pytest.raises(RigError, match="empty"):
+        arm.start([])
+    assert not robot.moving()
+    arm.start([Segment(at(3.0), 20.0), Segment(at(0.0), 20.0)])
+    with pytest.raises(RigError, match="still moving"):
+        arm.start(SLIDE)
+    until(lambda: arm.progress().done, 5.0)
+    assert len(arm.progress().finished) == 2
+
+
+def test_a_stop_waits_for_one_piece_and_no_more(pair: MakePair) -> None:
+    arm, robot = pair()
+    arm.start(SLIDE)
+    until(lambda: robot.pose().xyz_mm[1] > 1.0, 5.0)
+    began = robot.pose().xyz_mm[1]
+    arm.stop()
+    assert not robot.moving()
+    assert robot.pose().xyz_mm[1] - began < 3 * 1.6 * 0.25  # three pieces, on a busy machine
+    assert arm.progress().finished == ()
+    assert arm.state() is ArmState.READY
+
+
+@pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE, Kind.PROTECTIVE_STOP])
+def test_a_move_that_is_not_answered_is_a_fault(
+    pair: MakePair, monkeypatch: pytest.MonkeyPatch, kind: Kind
+) -> None:
+    monkeypatch.setattr(driver, "OVERTIME_S", 1.0)
+    arm, robot = pair(faults=[Fault(kind, Stage.MOVING, after_mm=0.1)])
+    arm.start(SLIDE)
+    until(lambda: arm.state() is ArmState.DISCONNECTED, 2.0 + BUSY_S)
+    until(lambda: arm.progress().done, 1.0)
+    fails(lambda: arm.start(SLIDE), 0.1, "disconnected")
+    arm.stop()
+    robot.restore()
+    arm.recover()
+    assert arm.state() is ArmState.READY
+
+
+@pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
+def test_a_link_lost_while_connecting_or_idle(pair: MakePair, kind: Kind) -> None:
+    arm, robot = pair(connected=False, faults=[Fault(kind, Stage.CONNECTING)])
+    fails(arm.connect, 2 * driver.ANSWER_S, "the server takes one client")
+    robot.restore()
+    arm.connect()
+    robot.happen(kind)
+    fails(arm.pose, driver.ANSWER_S, "look at it, then connect again")
+    assert arm.state() is ArmState.DISCONNECTED
+
+
+def test_a_second_client_waits_and_is_told_why(pair: MakePair) -> None:
+    arm, robot = pair()
+    second = AbbSocketArm(settings(robot.host))
+    fails(second.connect, 2 * driver.ANSWER_S, "the server takes one client")
+    arm.close()
+    second.connect()
+    second.close()
+
+
+def test_an_address_where_nothing_listens_is_a_fault() -> None:
+    fails(AbbSocketArm(settings(own_address())).connect, driver.ANSWER_S, "no connection")
+
+
+def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
+    _, robot = pair(connected=False)
+    link = RapidSocket(robot.host, robot.port, 1.0)
+    try:
+        assert "RAPID socket server" in link.info(1.0)
+        assert len(link.ask(Command.JOINTS, within_s=1.0)) == 6
+        with pytest.raises(RapidError, match="refused MOVE_JOINTS"):
+            link.ask(Command.MOVE_JOINTS, (0.0,) * 6, within_s=1.0)
+    finally:
+        link.close()
