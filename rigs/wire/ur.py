@@ -40,7 +40,7 @@ VERSION = (5, 11, 1, 108318)
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
-_STALL_S = 0.1
+_STALL_S = 0.02
 """A stand-in that was kept from running this long must not blame its client for it."""
 
 
