@@ -17,7 +17,8 @@ demo: $(DONE)
 	$(BIN)/sliplab demo
 
 test: $(DONE)
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime'
+	$(BIN)/python -m pytest -m realtime
 
 lint: $(DONE)
 	$(BIN)/ruff check .

@@ -56,7 +56,10 @@ def lacking() -> str:
 
 
 LACKING = lacking()
-pytestmark = pytest.mark.skipif(bool(LACKING), reason=f"not installed: {LACKING}")
+pytestmark = [
+    pytest.mark.skipif(bool(LACKING), reason=f"not installed: {LACKING}"),
+    pytest.mark.realtime,
+]
 
 
 @dataclass

@@ -19,6 +19,8 @@ from rigs.sync_port import TRIES, SyncBoxFault, SyncBoxSettings
 from rigs.sync_train import Train
 from rigs.wire.sync_box import PtySyncBox
 
+pytestmark = pytest.mark.realtime
+
 SEED = 0xACE1
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 ANSWER_S, SILENCE_S = 0.3, 0.4

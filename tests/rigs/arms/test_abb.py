@@ -23,6 +23,8 @@ from rigs.wire.abb_rws import HOME, AbbStandIn
 from rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.loopback import own_address, until
 
+pytestmark = pytest.mark.realtime
+
 BUSY_S = 3.0
 PORT, EGM_PORT = 8080, 6510
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}

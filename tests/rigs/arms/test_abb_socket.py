@@ -22,6 +22,8 @@ from rigs.wire.abb_socket import HOME, RapidStandIn
 from rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.loopback import own_address, until
 
+pytestmark = pytest.mark.realtime
+
 BUSY_S = 3.0
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 MakePair = Callable[..., tuple[AbbSocketArm, RapidStandIn]]

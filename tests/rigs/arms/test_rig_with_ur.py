@@ -16,6 +16,8 @@ from rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.arms.conftest import MakeArm, MakeRobot
 from tests.rigs.loopback import until
 
+pytestmark = pytest.mark.realtime
+
 LIMITS: dict[str, Any] = {
     "low_mm": (-20, -20, -30),
     "high_mm": (20, 20, 5),

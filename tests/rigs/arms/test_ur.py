@@ -18,6 +18,8 @@ from storage.streams import PoseChunk
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import own_address, until
 
+pytestmark = pytest.mark.realtime
+
 DOWN = HOME.rotvec_deg
 
 

@@ -25,6 +25,8 @@ from rigs.wire.ur import HOME
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import until
 
+pytestmark = pytest.mark.realtime
+
 BUSY_S = 3.0
 """What a loaded machine may add to a bound."""
 TARGET = Pose((400.0, 15.0, 300.0), HOME.rotvec_deg)
