@@ -69,6 +69,7 @@ class BaslerCamera:
         self._grab: Grab | None = None
         self._running = False
         self._ends: dict[int, int] = {}
+        self._chunks: set[str] = set()
         self._shape = (0, 0)
         from pypylon import genicam
 
@@ -141,18 +142,17 @@ class BaslerCamera:
     def _chunk(self, name: str) -> bool:
         """Switch a chunk on if the camera has it."""
         nodes = self._nodes
-        # the selector first: some have chunk mode and not one chunk, and then every grab fails
-        if not nodes.has("ChunkModeActive") or self._nodes_lack_chunks():
+        if not nodes.has("ChunkModeActive"):
             return False
         nodes.put(True, "ChunkModeActive")
         if not nodes.offers("ChunkSelector", name):
+            # pylon's emulation has the mode and not one chunk: left on, no grab would begin
+            nodes.put(bool(self._chunks), "ChunkModeActive")
             return False
         nodes.put(name, "ChunkSelector")
         nodes.put(True, "ChunkEnable")
+        self._chunks.add(name)
         return True
-
-    def _nodes_lack_chunks(self) -> bool:
-        return self._device.GetNodeMap().GetNode("ChunkSelector") is None
 
     def _listen(self) -> None:
         """Take note of every end of an exposure: frame id and time, ns."""

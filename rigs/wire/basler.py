@@ -101,12 +101,12 @@ class LossyDevice:
         self._mute = True
 
     def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
-        """The next result that does not get lost; with nothing left, as the device has it."""
-        while True:
-            result = self._device.RetrieveResult(timeout_ms, handling)
-            if not result.IsValid():
-                return result
-            if not (self._drop or self._mute):
-                return result
-            self._drop = max(self._drop - 1, 0)
-            result.Release()
+        """The next result, or an empty one in place of one that gets lost."""
+        from pypylon import pylon
+
+        result = self._device.RetrieveResult(timeout_ms, handling)
+        if not result.IsValid() or not (self._drop or self._mute):
+            return result
+        self._drop = max(self._drop - 1, 0)
+        result.Release()
+        return pylon.GrabResult()
