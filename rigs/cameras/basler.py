@@ -25,6 +25,7 @@ from storage.streams import ClockReads, FrameChunk, Json
 TRIGGER_READY_MS = 1000
 """How long a software trigger waits for the camera to be ready for it, ms."""
 _LEAST_BUFFERS = 8
+_END_OF_EXPOSURE = "EventExposureEndData"
 # command, value and ticks a second of the clock, by family; None: nanoseconds
 _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue", None),
@@ -70,6 +71,7 @@ class BaslerCamera:
         self._running = False
         self._ends: dict[int, int] = {}
         self._chunks: set[str] = set()
+        self._listener: Any = None
         self._shape = (0, 0)
         from pypylon import genicam
 
@@ -166,9 +168,10 @@ class BaslerCamera:
                     camera.EventExposureEndTimestamp.Value
                 )
 
-        self._listener = Listener()  # pylon keeps no reference
+        # pylon keeps no reference, and must be told before the listener goes
+        self._listener = Listener()
         self._device.RegisterCameraEventHandler(
-            self._listener, "EventExposureEndData", 1, pylon.RegistrationMode_Append,
+            self._listener, _END_OF_EXPOSURE, 1, pylon.RegistrationMode_Append,
             pylon.Cleanup_None, pylon.CameraEventAvailability_Mandatory,
         )  # fmt: skip
         self._nodes.put("ExposureEnd", "EventSelector")
@@ -328,6 +331,10 @@ class BaslerCamera:
         """Give the device back; safe at any time and more than once."""
         with suppress(RigError):
             self.stop()
+        if self._listener is not None:
+            with suppress(self._genicam.GenericException):
+                self._device.DeregisterCameraEventHandler(self._listener, _END_OF_EXPOSURE)
+                self._listener = None
         with suppress(self._genicam.GenericException):
             self._device.Close()
 

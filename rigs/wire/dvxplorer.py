@@ -100,6 +100,11 @@ class DvxplorerServer:
         """Go on after a stall."""
         self._pipe.send("resume")
 
+    @property
+    def answered(self) -> bool:
+        """Whether it has something to say, so that `finish` need not wait."""
+        return self._pipe.poll(0)
+
     def finish(self, timeout_s: float) -> Sent:
         """What was sent, once all of it has left. Raises ServerError."""
         sent: Sent = self._expect("sent", timeout_s)
