@@ -6,7 +6,7 @@ Events are made before the clock runs. One run, for it is long.
 
 frames_lost, events_lost, pulses_lost: sent or exposed, and not in the trial's files. The emulated
 camera slows down where a real one would lose frames, so `frames_per_s` stands beside them.
-memory_growth_mb: of this process from the first fifth of the run to its most.
+memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all.
 loop_max_ms: the longest time between two looks of the loop that reads and writes.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,
 over 100. encode_s_per_trial: encoding the run's spool when the trial ends.
@@ -146,6 +146,7 @@ def _tail(trial: TrialWriter, events: DvxplorerCamera, wanted: int, pulses: int)
         if (counts.events, counts.pulses) == (wanted, pulses):
             break
         idle.wait(POLL_S)
+    events.stop()
     trial.add_events(events.read())
     trial.add_event_pulses(events.read_pulses())
 

@@ -18,7 +18,7 @@ import numpy as np
 from rigs.cameras.grabbing import Grab, GrabCounts, GrabSettings
 from rigs.cameras.nodes import DEVICE, Nodes
 from rigs.cameras.settings import BaslerSettings
-from rigs.cameras.stamps import Abilities, Stamping, choose
+from rigs.cameras.stamps import Abilities, choose
 from rigs.capabilities import RigError
 from storage.streams import ClockReads, FrameChunk, Json
 
@@ -162,7 +162,7 @@ class BaslerCamera:
 
         ends = self._ends
 
-        class Listener(pylon.CameraEventHandler):  # type: ignore[misc]
+        class Listener(pylon.CameraEventHandler):
             def OnCameraEvent(self, camera: Any, user: int, node: Any) -> None:
                 ends[int(camera.EventExposureEndFrameID.Value)] = int(
                     camera.EventExposureEndTimestamp.Value

@@ -177,7 +177,7 @@ class Grab:
     def _run(self) -> None:
         empty = 0
         try:
-            while not (self._stopping.is_set() and empty >= _DRAIN_ROUNDS):
+            while self._waiting or empty < _DRAIN_ROUNDS or not self._stopping.is_set():
                 if not self._room():
                     continue
                 if self._device.IsCameraDeviceRemoved():

@@ -262,7 +262,7 @@ def _send(
     _await(pipe, lambda: events.getClientCount() > 0 and triggers.getClientCount() > 0)
     began = time.monotonic()
     first_us = packets[0].end_us if packets else 0
-    counts = [0, 0]
+    sent_events = sent_pulses = 0
     for number, packet in enumerate(packets):
         if number == stall_after:
             pipe.send(("stalled", None))
@@ -275,10 +275,10 @@ def _send(
             events.writeEvents(packet.store)
         if packet.pulses:
             triggers.writeTriggers(packet.triggers)
-        counts[0] += packet.events
-        counts[1] += packet.pulses
+        sent_events += packet.events
+        sent_pulses += packet.pulses
     _await(pipe, lambda: not (events.getQueuedPacketCount() or triggers.getQueuedPacketCount()))
-    return Sent(*counts, len(packets), time.monotonic() - began)
+    return Sent(sent_events, sent_pulses, len(packets), time.monotonic() - began)
 
 
 def _await(pipe: Connection, done: Callable[[], bool]) -> None:
