@@ -112,6 +112,8 @@ class DvxplorerCamera:
         Raises:
             RigError: the camera is gone.
         """
+        if not self._thread.is_alive():
+            raise self._fault or RigError(DEVICE, "it is closed; open it again")
         with self._lock:
             self._forget()
             self._filter = self._new_filter()

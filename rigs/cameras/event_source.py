@@ -7,10 +7,8 @@ camera gives both.
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Protocol, TypeVar
@@ -130,11 +128,8 @@ def _open_streams(settings: NetworkStream) -> EventSource:
     inputs = []
     for port in (settings.events_port, settings.triggers_port):
         try:
-            # the library's own connect has no bound of its own
-            with suppress(TimeoutError):
-                socket.create_connection((settings.host, port), OPEN_S / 4).close()
             inputs.append(dv.io.NetworkReader(settings.host, port))
-        except (OSError, RuntimeError) as error:
+        except RuntimeError as error:
             raise RigError(DEVICE, f"{settings.host}:{port}: {error}") from None
     events, triggers = inputs
     resolution = events.getEventResolution()

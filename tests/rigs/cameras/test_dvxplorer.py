@@ -139,6 +139,8 @@ def test_a_cut_connection_is_an_error_after_what_came(until: Until) -> None:
             camera.read()
         with pytest.raises(RigError, match="connection is gone"):
             camera.read_pulses()
+        with pytest.raises(RigError, match="connection is gone"):
+            camera.start()
 
 
 def test_nobody_listening_is_named() -> None:
@@ -202,6 +204,13 @@ def test_what_came_before_the_start_is_dropped_and_after_the_stop_too(until: Unt
         until(lambda: camera.counts.before == 1)
         assert camera.read().t_us.tolist() == [4, 5]
         assert len(camera.read()) == 0
+
+
+def test_a_closed_camera_does_not_start() -> None:
+    with fed() as (camera, _):
+        camera.close()
+        with pytest.raises(RigError, match="open it again"):
+            camera.start()
 
 
 def test_gaps_are_counted(until: Until) -> None:
