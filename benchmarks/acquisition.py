@@ -7,6 +7,7 @@ Events are made before the clock runs. One run, for it is long.
 frames_lost, events_lost, pulses_lost: sent or exposed, and not in the trial's files. The emulated
 camera slows down where a real one would lose frames, so `frames_per_s` stands beside them.
 memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all.
+cores: processor time of this process, all drivers, pylon's emulation and writing, over time.
 loop_max_ms: the longest time between two looks of the loop that reads and writes.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,
 over 100. encode_s_per_trial: encoding the run's spool when the trial ends.
@@ -87,7 +88,8 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
             events.start()
             frames.start()
             server.go()
-            memory, pauses, took_s = _loop(trial, frames, events, server, seconds)
+            memory, pauses, rates = _loop(trial, frames, events, server, seconds)
+            frames.stop()
             sent = server.finish(TAIL_S)
             _tail(trial, events, sent.events, sent.pulses)
             trial.add_frames(frames.read())
@@ -106,8 +108,8 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
         "events_lost": sent.events - rows["events/t"],
         "pulses_lost": sent.pulses - rows["event_pulses/t"],
         "frames_late": counts.late,
-        "frames_per_s": counts.grabbed / took_s,
         "m_events_per_s": sent.events / sent.seconds / 1e6,
+        **rates,
         "memory_growth_mb": max(0.0, max(memory) - max(early)),
         "loop_max_ms": max(pauses) * 1e3,
         "encode_s_per_trial": encode_s,
@@ -120,9 +122,10 @@ def _loop(
     events: DvxplorerCamera,
     server: DvxplorerServer,
     seconds: float,
-) -> tuple[list[float], list[float], float]:
-    """Read and write as a rig does: memory at every look, time between looks, time in all."""
+) -> tuple[list[float], list[float], Figures]:
+    """Read and write as a rig does: memory at every look, time between looks, and rates."""
     memory, pauses, idle = [], [], threading.Event()
+    used = time.process_time()
     began = last = time.perf_counter()
     while last - began < seconds or not server.answered:
         trial.add_events(events.read())
@@ -133,8 +136,11 @@ def _loop(
         now = time.perf_counter()
         pauses.append(now - last)
         last = now
-    frames.stop()
-    return memory, pauses, time.perf_counter() - began
+    rates = {
+        "frames_per_s": frames.counts.grabbed / (last - began),
+        "cores": (time.process_time() - used) / (last - began),
+    }
+    return memory, pauses, rates
 
 
 def _tail(trial: TrialWriter, events: DvxplorerCamera, wanted: int, pulses: int) -> None:
