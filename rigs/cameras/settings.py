@@ -35,7 +35,7 @@ class BaslerSettings(StrictModel):
     """Number of the input that is wired to the sync box's code; its level comes as a chunk."""
     exposure_line: str | None = None
     """Name of the output that tells the sync box of exposures; None where it is not wired."""
-    back_pressure_s: float = Field(default=2.0, ge=0.1, le=60)
+    back_pressure_s: float = Field(default=5.0, ge=0.1, le=60)
     """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
     late_s: float = Field(default=0.1, gt=0, le=10)
     """A frame that arrives by this much after its time counts as late, seconds."""

@@ -13,6 +13,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -191,10 +192,11 @@ def _serve(
         if pipe.recv() == "go":
             pipe.send(("sent", _send(pipe, packets, writers, realtime, stall_after)))
             pipe.recv()  # ends when the other side closes
-    except EOFError:
+    except (EOFError, ConnectionError):
         status = 0
     except Exception as error:
-        pipe.send(("failed", repr(error)))
+        with suppress(OSError):
+            pipe.send(("failed", repr(error)))
     os._exit(status)
 
 
