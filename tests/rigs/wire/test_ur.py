@@ -19,6 +19,8 @@ from rigs.wire.faults import Kind
 from rigs.wire.ur import HOME, UrStandIn
 from tests.rigs.loopback import own_address, until
 
+pytestmark = pytest.mark.realtime
+
 CLIENT_S = 30.0
 HEAD = """
 import json, sys, time
@@ -115,8 +117,6 @@ def test_the_watchdog_ends_the_program_of_a_client_that_went_silent(robot: UrSta
         robot,
         """
 import os
-
-pytestmark = pytest.mark.realtime
 control = RTDEControlInterface(host)
 control.setWatchdog(5.0)
 control.moveL([0.4, 0.05, 0.3, 3.141592653589793, 0.0, 0.0], 0.001, 0.5, True)
