@@ -50,12 +50,7 @@ PROMISED = {
 }  # fmt: skip
 
 
-REALTIME = pytest.mark.realtime
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=REALTIME if name == "acquisition" else ()) for name in TINY]
-)
+@pytest.mark.parametrize("name", TINY)
 def test_a_benchmark_gives_what_is_promised(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
