@@ -29,6 +29,9 @@ Floats = NDArray[np.float64]
 
 MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
+MIN_EITHER = 0.75
+"""A device loses pulses or adds some; where both trains are full of strangers the place is wrong,
+or a clock jumped by whole ticks, after which half of the pulses meet others."""
 BEND_PPM_S = 2.0
 """By how much a clock's drift may change in a second without being taken for a jump; a crystal that
 warms up by 10 K in a minute makes 0.4."""
@@ -161,6 +164,13 @@ def fit_clock(
     stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
     if stray is not None:
         raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
+    shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
+    if max(shares) < MIN_EITHER:
+        raise ClockRefused(
+            "no_match",
+            f"only {shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses "
+            f"fit (of one of them at least {MIN_EITHER:.0%}): a clock jumped, or not these pulses",
+        )
     return _fit(match, line, x, y, device_0, reference_0)
 
 
