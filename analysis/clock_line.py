@@ -26,7 +26,7 @@ _BLOCK_PULSES = 12
 _CHANCE = 1e-4
 """How often a straight clock is given more pieces than it needs."""
 _RUNS = (8, 16, 32)
-_DRAWS = 8192
+_DRAWS = 4096
 
 
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
