@@ -9,7 +9,7 @@ be wrong: the 95 % quantile of the largest error anywhere between the first and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,12 @@ class ClockLine:
     sudden: float
     straightened: bool
 
-    @property
+    @cached_property
+    def residual_p95(self) -> float:
+        """95th percentile of the absolute residuals of the pulses on the line, ns."""
+        return float(np.quantile(np.abs(self.residuals[self.inside]), 0.95))
+
+    @cached_property
     def slopes(self) -> Floats:
         """Slope of each piece, (k,)."""
         result: Floats = np.diff(self.values) / np.diff(self.knots)

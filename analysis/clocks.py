@@ -204,7 +204,7 @@ def _fit(
         pulses_missed=int(in_span.sum()) - px.size,
         pulses_spurious=x.size - px.size,
         residual_median_ns=float(np.median(residuals)),
-        residual_p95_ns=float(np.quantile(residuals, 0.95)),
+        residual_p95_ns=line.residual_p95,
         residual_max_ns=float(residuals.max()),
         offset_ns=clock.to_reference(middle_ns) - middle_ns,
         drift_ppm=float(line.values[-1] - line.values[0]) / run * 1e6,
@@ -271,7 +271,7 @@ def _gate_share(x: Floats, y: Floats, match: Match) -> None:
 def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
     """Refuse a line that is too steep, that bends like no clock, or on which too little lies."""
     steepest = float(line.slopes[np.abs(line.slopes).argmax()]) * 1e6
-    p95 = float(np.quantile(np.abs(line.residuals[line.inside]), 0.95))
+    p95 = line.residual_p95
     if p95 > 3 * jitter_ns or line.inside.mean() < MIN_MATCHED:
         raise ClockRefused(
             "residuals",

@@ -15,6 +15,7 @@ from rigs.scene import pieces as of
 from rigs.scene.crossings import solve
 from rigs.scene.edges import CUT, FAR, TAIL
 from rigs.scene.pixel_lanes import STRIDE
+from rigs.scene.smooth import logarithm
 
 X, Y, TARGET, TIME, LOW, HIGH, FINE, HEAD, STEP, GOOD, SINCE, INVERSE = (
     STRIDE * k for k in range(12)
@@ -27,16 +28,13 @@ C = 12 * STRIDE
 """First of the step's twelve coefficients."""
 WAIT_FIELDS = 24
 STEP_FIELDS = 14
-BEGIN, END, LAST, LEVEL, RISE, LANE, SCALE_A, SCALE_B, NEXT, _SHARE, _POWER = (
-    STRIDE * k for k in range(24, 35)
-)
+BEGIN, END, LAST, LEVEL, RISE, LANE, SCALE_A, SCALE_B, NEXT = (STRIDE * k for k in range(24, 33))
 """Of every pixel that fires: distances at both ends of the piece; rim distance of the last event
 before; reference level; what an event adds to it; lane in the pixels' tile; slopes of time over
 distance at both ends; rim distance of the next event."""
-FIRE_FIELDS = 35
+FIRE_FIELDS = 33
 _ROUNDS = 6
 _TICK = float(1 << 25)  # a nanosecond in a packed event
-_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,9 +85,8 @@ def guess(fire, n, piece, pace):  # type: ignore[no-untyped-def]
 def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
     """After an event at TARGET: the new reference level, and the rim distance of the next event.
 
-    As `edges.rim_of`, with a logarithm that has no branches (that of fdlibm, below 1 ulp).
+    As `edges.rim_of`, with a logarithm that has no branches.
     """
-    bits = fire.view(np.int64)
     rounding = 1e-9 * contrast
     scale = (1.0 - 2.0 * TAIL) / contrast
     for j in range(n):
@@ -97,26 +94,7 @@ def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
         fire[LEVEL + j] = level
         level += fire[RISE + j]
         share = TAIL + min(max(level, 0.0), contrast) * scale
-        fire[_SHARE + j] = (1.0 - share) / share
-        fire[NEXT + j] = level
-    for j in range(n):
-        whole = bits[_SHARE + j] + (0x3FF0000000000000 - 0x3FE6A09E00000000)
-        bits[_SHARE + j] = (whole & 0x000FFFFFFFFFFFFF) + 0x3FE6A09E00000000
-        fire[_POWER + j] = np.float64((whole >> 52) - 1023)
-    for j in range(n):
-        f, k = fire[_SHARE + j] - 1.0, fire[_POWER + j]
-        s = f / (2.0 + f)
-        z = s * s
-        w = z * z
-        even = w * (3.999999999940941908e-01 + w * (
-            2.222219843214978396e-01 + w * 1.531383769920937332e-01
-        ))  # fmt: skip
-        odd = z * (6.666666666666735130e-01 + w * (
-            2.857142874366239149e-01 + w * (1.818357216161805012e-01 + w * 1.479819860511658591e-01)
-        ))  # fmt: skip
-        half = 0.5 * f * f
-        log = k * _LN2_HIGH - ((half - (s * (half + (even + odd)) + k * _LN2_LOW)) - f)
-        level = fire[NEXT + j]
+        log = logarithm((1.0 - share) / share)
         low = CUT * edge if level >= -rounding else FAR
         high = -CUT * edge if level <= contrast + rounding else -FAR
         rim = edge * log

@@ -1,6 +1,6 @@
-"""Exponential and logarithm without branches, so that tips can be computed side by side.
+"""Exponential and logarithm without branches, for what is computed side by side: tips, pixels.
 
-A call of the mathematics library inside a loop keeps it from being computed several tips at a
+A call of the mathematics library inside a loop keeps it from being computed several lanes at a
 time. These two are plain arithmetic, right to a few units in the last place, and give the same
 bits on every processor.
 """
