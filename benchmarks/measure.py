@@ -20,6 +20,7 @@ RUNS = 5
 PACKAGES = (
     "sliplab", "numpy", "scipy", "numba", "h5py", "hdf5plugin", "av",
     "opencv-contrib-python-headless", "torch", "sinabs", "prefect",
+    "pypylon", "dv-processing",
 )  # fmt: skip
 
 Figures = dict[str, float]
@@ -75,6 +76,12 @@ def peak_mb() -> float:
     """
     peak = _from_file("/proc/self/status", "VmHWM")
     return float(peak.split()[0]) * 1024 / 1e6 if peak else float("nan")
+
+
+def resident_mb() -> float:
+    """The memory that this process holds now, MB; NaN where the system does not tell."""
+    held = _from_file("/proc/self/status", "VmRSS")
+    return float(held.split()[0]) * 1024 / 1e6 if held else float("nan")
 
 
 def versions() -> dict[str, str]:

@@ -18,6 +18,13 @@ TINY: dict[str, dict[str, Any]] = {
     "scene": {"length_mm": 1.0, "runs": 1, "trials": 0, "grid": 8},
     "clocks": {"trains": 3},
     "labels": {"frames": 5, "runs": 1},
+    "acquisition": {
+        "seconds": 0.5,
+        "events_per_s": 100_000,
+        "size": 96,
+        "pictures": 4,
+        "saturating": 20,
+    },
 }
 PROMISED = {
     "storage": {
@@ -32,6 +39,10 @@ PROMISED = {
     "clocks": {
         "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
         "index_worst_error_us", "nearest_worst_error_us", "pyxdf_worst_error_us",
+    },
+    "acquisition": {
+        "frames_lost", "events_lost", "pulses_lost", "memory_growth_mb", "saturation_x_realtime",
+        "encode_s_per_trial",
     },
     "labels": {
         "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
@@ -60,6 +71,9 @@ def test_a_benchmark_gives_what_is_promised(
         assert low <= value <= high
     assert set(found["machine"]) == {"cpu", "cores", "memory_gb", "os"}
     assert found["versions"].keys() >= {"python", "sliplab", "numpy"}
+    if name == "acquisition":
+        lost = [found["figures"][f"{what}_lost"] for what in ("frames", "events", "pulses")]
+        assert lost == [0, 0, 0]
     if name == "clocks":
         assert (found["figures"]["accepted_share"], found["figures"]["wrong_accepted"]) == (1, 0)
 

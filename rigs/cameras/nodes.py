@@ -1,0 +1,79 @@
+"""Reading and writing a GenICam camera's settings by name, where they are there at all.
+
+Names differ between families (`ExposureTime`, `ExposureTimeAbs`); SFNC 2 names come first.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rigs.capabilities import RigError
+
+DEVICE = "frame camera"
+
+
+class Nodes:
+    """The node map of an open camera.
+
+    Args:
+        node_map: what `GetNodeMap` of pypylon's device gives.
+    """
+
+    def __init__(self, node_map: Any) -> None:
+        from pypylon import genicam
+
+        self._map, self._genicam = node_map, genicam
+
+    def has(self, name: str) -> bool:
+        """Whether a setting is there and may be written now."""
+        node = self._map.GetNode(name)
+        return node is not None and bool(self._genicam.IsWritable(node))
+
+    def offers(self, name: str, choice: str) -> bool:
+        """Whether a setting can be set and `choice` is one of its values."""
+        return self.has(name) and choice in self._map.GetNode(name).Symbolics
+
+    def get(self, name: str) -> Any:
+        """The value of a setting.
+
+        Raises:
+            RigError: it is not there, or the camera is gone.
+        """
+        try:
+            return self._map.GetNode(name).Value
+        except (self._genicam.GenericException, AttributeError) as error:
+            raise RigError(DEVICE, f"{name} cannot be read: {_short(error)}") from None
+
+    def limit(self, name: str, which: str) -> int:
+        """`Min`, `Max` or `Inc` of a whole number."""
+        try:
+            return int(getattr(self._map.GetNode(name), which))
+        except (self._genicam.GenericException, AttributeError) as error:
+            raise RigError(DEVICE, f"{name} has no {which}: {_short(error)}") from None
+
+    def put(self, value: Any, *names: str) -> None:
+        """Set every one of `names` that is there.
+
+        Raises:
+            RigError: none is there, or the camera refuses the value.
+        """
+        found = [name for name in names if self.has(name)]
+        if not found:
+            raise RigError(DEVICE, f"this camera has no {' or '.join(names)} to set")
+        for name in found:
+            try:
+                self._map.GetNode(name).Value = value
+            except self._genicam.GenericException as error:
+                raise RigError(DEVICE, f"{name} = {value}: {_short(error)}") from None
+
+    def execute(self, name: str) -> None:
+        """Give a command. Raises RigError."""
+        try:
+            self._map.GetNode(name).Execute()
+        except (self._genicam.GenericException, AttributeError) as error:
+            raise RigError(DEVICE, f"{name} failed: {_short(error)}") from None
+
+
+def _short(error: Exception) -> str:
+    """GenICam's text without the place in its source."""
+    return str(error).split(" : ")[0].strip() or type(error).__name__

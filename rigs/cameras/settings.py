@@ -1,0 +1,81 @@
+"""What a rig file says of the real cameras; the drivers ask the device for everything else."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from protocols.yaml_file import StrictModel
+
+FrameTrigger = Literal["hardware", "software", "free run"]
+Readout = Literal[
+    "constant 100", "constant 200", "constant 500", "constant 1000",
+    "variable 2000", "variable 5000", "variable 10000", "variable 15000",
+]  # fmt: skip
+"""Read-outs that lose nothing of themselves, by their names in dv-processing 2.0.4."""
+
+
+class BaslerSettings(StrictModel):
+    """The camera that looks through the plate."""
+
+    serial: str | None = None
+    """Serial number; the first camera found where none is given."""
+    px_per_mm: float = Field(gt=0, le=1000)
+    """Pixels for a millimetre of the plate."""
+    exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
+    """Exposure, microseconds; the camera may round it, and what it says then counts."""
+    rate_hz: float = Field(default=100.0, gt=0, le=1000)
+    """Frames a second: its own rate in free run, else the most that the triggers ask for."""
+    trigger: FrameTrigger = "hardware"
+    """`hardware`: a rising edge on `trigger_line`. `software`: the host asks for each frame."""
+    trigger_line: str = "Line1"
+    """Name of the input that is wired to the sync box's ticks."""
+    sync_line: int | None = Field(default=None, ge=1, le=8)
+    """Number of the input that is wired to the sync box's code; its level comes as a chunk."""
+    exposure_line: str | None = None
+    """Name of the output that tells the sync box of exposures; None where it is not wired."""
+    back_pressure_s: float = Field(default=5.0, ge=0.1, le=60)
+    """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
+    late_s: float = Field(default=0.1, gt=0, le=10)
+    """A frame that arrives by this much after its time counts as late, seconds."""
+    stall_s: float = Field(default=1.0, ge=0.2, le=60)
+    """A running camera that gives no frame for so long is a fault, seconds."""
+
+
+class UsbCamera(StrictModel):
+    """A camera on this computer."""
+
+    kind: Literal["usb"] = "usb"
+    serial: str | None = None
+    """Serial number; the first camera found where none is given."""
+    readout: Readout = "constant 1000"
+    """Scans a second; at a constant rate every pixel's time is regular (docs/clocks.md)."""
+    contrast_on: int | None = Field(default=None, ge=0, le=255)
+    """Contrast threshold of brighter events, the camera's unit; None leaves its own."""
+    contrast_off: int | None = Field(default=None, ge=0, le=255)
+    """Contrast threshold of darker events, the camera's unit; None leaves its own."""
+
+
+class NetworkStream(StrictModel):
+    """Two streams of dv-processing on the network, one of events and one of triggers."""
+
+    kind: Literal["network"] = "network"
+    host: str = "127.0.0.1"
+    """Address of the computer that serves them."""
+    events_port: int = Field(ge=1, le=65_535)
+    triggers_port: int = Field(ge=1, le=65_535)
+
+
+class DvxplorerSettings(StrictModel):
+    """The event camera inside the sensor."""
+
+    source: Annotated[UsbCamera | NetworkStream, Field(discriminator="kind")] = UsbCamera()
+    noise_filter_us: int | None = Field(default=None, ge=1, le=1_000_000)
+    """Drop events without a neighbour within so many microseconds; None keeps all of them."""
+    buffer_mb: float = Field(default=512.0, ge=1, le=65_536)
+    """Memory for events that nobody has read yet, megabytes (13 bytes an event)."""
+    gap_s: float = Field(default=0.05, gt=0, le=60)
+    """Silence between two events, on the camera's clock, that counts as a gap, seconds."""
+    stall_s: float = Field(default=1.0, ge=0.1, le=60)
+    """A running camera that sends neither event nor trigger for so long is a fault, seconds."""

@@ -1,0 +1,291 @@
+"""A DVXplorer without a camera: a process that serves events and triggers on the network.
+
+It writes with dv-processing's own `NetworkWriter` (2.0.4), one port for events and one for
+triggers, and says at its end what it sent, so that both ends can be compared. It is a process of
+its own for two reasons: writer and reader in one process can wait for each other when they close,
+and a writer that is taken down may wait for ever, so the process ends without taking it down.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from rigs.cameras.settings import DvxplorerSettings, NetworkStream
+from rigs.scene.events import EventOptics, MarkerSensor
+from storage.streams import I64, EventChunk
+
+Packet = tuple[EventChunk, I64]
+"""Events, and the rising edges that came with them, us of the camera's clock."""
+Source = Callable[[], Iterable[Packet]]
+READY_S = 180.0
+"""The longest that it takes to make all packets, s."""
+CLIENT_S = 30.0
+"""The longest that it waits for its client, and for what is queued to leave, s."""
+_LOOK_S = 0.001
+_TRIES = 5
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What a server has sent."""
+
+    events: int
+    pulses: int
+    packets: int
+    seconds: float
+
+
+class ServerError(RuntimeError):
+    """The serving process failed or did not answer in time."""
+
+
+class DvxplorerServer:
+    """A process that makes packets, and sends them when told to.
+
+    Args:
+        source: makes the packets; it is called in the process, so it must be a module's function
+            or a `functools.partial` of one.
+        realtime: send each packet when its last event is due; else as fast as it goes.
+        stall_after: packets after which it falls silent until `resume`.
+        size: columns and rows that the stream claims.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        realtime: bool = True,
+        stall_after: int | None = None,
+        size: tuple[int, int] = (640, 480),
+    ) -> None:
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, source, realtime, stall_after, size), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            self.events_port, self.triggers_port = self._expect("ready", READY_S)
+        except ServerError:
+            self.close()
+            raise
+
+    @property
+    def settings(self) -> DvxplorerSettings:
+        """Settings of a driver that listens to this server."""
+        return DvxplorerSettings(
+            source=NetworkStream(events_port=self.events_port, triggers_port=self.triggers_port)
+        )
+
+    def go(self) -> None:
+        """Send, once both streams have a client."""
+        self._pipe.send("go")
+
+    def await_stall(self, timeout_s: float) -> None:
+        """Return when it has fallen silent as it was asked to. Raises ServerError."""
+        self._expect("stalled", timeout_s)
+
+    def resume(self) -> None:
+        """Go on after a stall."""
+        self._pipe.send("resume")
+
+    @property
+    def answered(self) -> bool:
+        """Whether it has something to say, so that `finish` need not wait."""
+        return self._pipe.poll(0)
+
+    def finish(self, timeout_s: float) -> Sent:
+        """What was sent, once all of it has left. Raises ServerError."""
+        sent: Sent = self._expect("sent", timeout_s)
+        return sent
+
+    def close(self) -> None:
+        """End the process, whatever it does; the streams break."""
+        self._process.kill()
+        self._process.join(CLIENT_S)
+        self._pipe.close()
+
+    def __enter__(self) -> DvxplorerServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _expect(self, wanted: str, timeout_s: float) -> Any:
+        try:
+            if not self._pipe.poll(timeout_s):
+                raise ServerError(f"the server has not said '{wanted}' within {timeout_s:g} s")
+            said, value = self._pipe.recv()
+        except (EOFError, OSError):
+            raise ServerError(f"the server has ended before it said '{wanted}'") from None
+        if said != wanted:
+            raise ServerError(f"the server said '{said}' instead of '{wanted}': {value}")
+        return value
+
+
+def arrays(chunk: EventChunk, pulses_us: I64, packet_us: int) -> Iterator[Packet]:
+    """Packets of `packet_us` from arrays in order of time; pulses go with the events' times.
+
+    A span without events has a packet all the same, for its pulses.
+    """
+    every = np.concatenate([chunk.t_us[[0, -1]] if len(chunk) else [], pulses_us]).astype(np.int64)
+    if not len(every):
+        return
+    edges = np.arange(every.min(), every.max() + packet_us + 1, packet_us)
+    rows, marks = np.searchsorted(chunk.t_us, edges), np.searchsorted(pulses_us, edges)
+    for k in range(len(edges) - 1):
+        part = slice(rows[k], rows[k + 1])
+        events = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+        yield events, pulses_us[marks[k] : marks[k + 1]]
+
+
+def scene(seconds: float, seed: int = 1) -> Iterator[Packet]:
+    """Packets of seven markers that are pushed to and fro under steady contact; a pulse in 10 ms.
+
+    Simulated: normal force 0.3 N on a tip, tangential 0.1 N once a second.
+    """
+    optics = EventOptics()
+    ring = 5.6 * np.exp(2j * np.pi * np.arange(6) / 6)
+    places = np.concatenate(([0j], ring))
+    sensor = MarkerSensor(optics, np.stack((places.real, places.imag), axis=-1), seed)
+
+    def load(t_ns: I64) -> np.ndarray[Any, np.dtype[np.float64]]:
+        push = 0.1 * np.sin(2 * np.pi * t_ns / 1e9)
+        still = np.zeros_like(push)
+        # per tip: tangential x and y, normal
+        columns = [push, still, np.full_like(push, 0.3)] * len(places)
+        return np.ascontiguousarray(np.stack(columns, axis=-1))
+
+    sensor.reset(load(np.zeros(1, np.int64))[0], seed)
+    for begin in range(0, round(seconds * 1e9), optics.block_ns):
+        t_ns = np.arange(begin, begin + optics.block_ns + 1, 1_000_000)
+        when, x, y, p = sensor.sense(load(t_ns), t_ns)
+        pulses = np.arange(-(-begin // 10**7) * 10**7, begin + optics.block_ns, 10**7) // 1000
+        yield EventChunk(x, y, p, when // 1000), pulses
+
+
+def _serve(
+    pipe: Connection,
+    source: Source,
+    realtime: bool,
+    stall_after: int | None,
+    size: tuple[int, int],
+) -> None:
+    """The process; it never returns, for taking a writer down may wait for ever."""
+    status = 1
+    try:
+        packets = [_made(*packet) for packet in source()]
+        writers, ports = _open_writers(size)
+        pipe.send(("ready", ports))
+        if pipe.recv() == "go":
+            pipe.send(("sent", _send(pipe, packets, writers, realtime, stall_after)))
+            pipe.recv()  # ends when the other side closes
+    except (EOFError, ConnectionError):
+        status = 0
+    except Exception as error:
+        with suppress(OSError):
+            pipe.send(("failed", repr(error)))
+    os._exit(status)
+
+
+@dataclass(frozen=True)
+class _Made:
+    store: Any
+    triggers: Any
+    events: int
+    pulses: int
+    end_us: int
+
+
+def _made(chunk: EventChunk, pulses_us: I64) -> _Made:
+    import dv_processing as dv
+
+    store = dv.EventStore()
+    columns = (chunk.t_us, chunk.x, chunk.y, chunk.p.astype(bool))
+    # the quickest way in; there is none for whole arrays
+    deque(map(store.push_back, *(column.tolist() for column in columns)), maxlen=0)
+    rising = dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
+    triggers = dv.TriggerPacket.TriggersVector(
+        [dv.Trigger(at, rising) for at in pulses_us.tolist()]
+    )
+    ends = [int(times[-1]) for times in (chunk.t_us, pulses_us) if len(times)]
+    return _Made(store, triggers, len(chunk), len(pulses_us), max(ends, default=0))
+
+
+def _open_writers(size: tuple[int, int]) -> tuple[tuple[Any, Any], tuple[int, int]]:
+    """Writers of events and of triggers on ports that are free, and the ports."""
+    import dv_processing as dv
+
+    streams = (
+        dv.io.Stream.EventStream(0, "events", "stand-in", size),
+        dv.io.Stream.TriggerStream(0, "triggers", "stand-in"),
+    )
+    for attempt in range(_TRIES):
+        ports = _free_port(), _free_port()
+        try:
+            events, triggers = (
+                dv.io.NetworkWriter("127.0.0.1", port, stream)
+                for port, stream in zip(ports, streams, strict=True)
+            )
+            return (events, triggers), ports
+        except RuntimeError:
+            if attempt == _TRIES - 1:
+                raise
+    raise AssertionError
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def _send(
+    pipe: Connection,
+    packets: list[_Made],
+    writers: tuple[Any, Any],
+    realtime: bool,
+    stall_after: int | None,
+) -> Sent:
+    events, triggers = writers
+    _await(pipe, lambda: events.getClientCount() > 0 and triggers.getClientCount() > 0)
+    began = time.monotonic()
+    first_us = packets[0].end_us if packets else 0
+    sent_events = sent_pulses = 0
+    for number, packet in enumerate(packets):
+        if number == stall_after:
+            pipe.send(("stalled", None))
+            pipe.recv()
+        wait = began + (packet.end_us - first_us) / 1e6 - time.monotonic()
+        # nothing is said meanwhile: this only lets time pass, and notices the other side's end
+        if realtime and wait > 0 and pipe.poll(wait):
+            pipe.recv()
+        if packet.events:
+            events.writeEvents(packet.store)
+        if packet.pulses:
+            triggers.writeTriggers(packet.triggers)
+        sent_events += packet.events
+        sent_pulses += packet.pulses
+    _await(pipe, lambda: not (events.getQueuedPacketCount() or triggers.getQueuedPacketCount()))
+    return Sent(sent_events, sent_pulses, len(packets), time.monotonic() - began)
+
+
+def _await(pipe: Connection, done: Callable[[], bool]) -> None:
+    end = time.monotonic() + CLIENT_S
+    while not done():
+        if time.monotonic() > end:
+            raise TimeoutError(f"the client has done nothing for {CLIENT_S:g} s")
+        pipe.poll(_LOOK_S)
