@@ -50,7 +50,12 @@ PROMISED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", TINY)
+REALTIME = pytest.mark.realtime
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=REALTIME if name == "acquisition" else ()) for name in TINY]
+)
 def test_a_benchmark_gives_what_is_promised(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

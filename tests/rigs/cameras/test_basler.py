@@ -18,7 +18,7 @@ from rigs.capabilities import FrameCamera, RigError
 from rigs.wire.basler import LossyDevice, fail_buffers, scene_frames, show, unplug, write_frames
 from storage.streams import FrameChunk
 
-pytestmark = pytest.mark.usefixtures("pylon_emulation")
+pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]
 FREE: dict[str, Any] = {"trigger": "free run", "px_per_mm": 20.0}
 WIRED = FREE | {"exposure_line": "Line2"}

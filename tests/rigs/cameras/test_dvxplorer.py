@@ -19,6 +19,8 @@ from rigs.capabilities import EventCamera, RigError
 from rigs.wire.dvxplorer import DvxplorerServer, Sent, arrays, scene
 from storage.streams import I64, EventChunk
 
+pytestmark = pytest.mark.realtime
+
 Until = Callable[[Callable[[], bool]], None]
 
 

@@ -15,7 +15,7 @@ from rigs.cameras.grabbing import NO_ID, Grab, GrabSettings
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import RigError
 
-pytestmark = pytest.mark.usefixtures("pylon_emulation")
+pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]
 CHUNKS = GrabSettings(
     stamping=Stamping("chunk", "hardware trigger"),
