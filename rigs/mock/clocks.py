@@ -39,6 +39,22 @@ class TrialClocks:
     sync_box_ppb: int
     """The sync box counts from its own start: it has a drift and no offset."""
 
+    def after(self, past_ns: int) -> TrialClocks:
+        """The same clocks when `past_ns` of true time have passed, with that moment as time 0."""
+        return replace(
+            self,
+            arm=shifted(self.arm, past_ns),
+            event_camera=shifted(self.event_camera, past_ns),
+            frame_camera=shifted(self.frame_camera, past_ns),
+        )
+
+
+def shifted(clock: ClockMap, past_ns: int) -> ClockMap:
+    """`clock`, with the moment that was `past_ns` as time 0."""
+    return ClockMap(
+        tuple(time - past_ns for time in clock.device_ns), clock.reference_ns, clock.drift
+    )
+
 
 def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClocks:
     """Drifts that belong to the rig's seed, offsets that belong to the trial's."""

@@ -30,7 +30,7 @@ from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.capabilities import Pose
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.loop import Connections, LoopThread
-from rigs.wire.motion import ControllerClock, Motion, StraightMotion
+from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
 from rigs.wire.ur_client import Client, send
 from rigs.wire.ur_program import Safety, UrProgram
 
@@ -56,6 +56,7 @@ class UrStandIn:
         faults: what will go wrong.
         reach_mm: poses further from the base are outside its safety limits.
         joints_deg: what `actual_q` says.
+        clock: the controller's; one of its own, at `rate`, if left out.
     """
 
     def __init__(
@@ -68,11 +69,12 @@ class UrStandIn:
         faults: Sequence[Fault] = (),
         reach_mm: float = 850.0,
         joints_deg: Sequence[float] = JOINTS_DEG,
+        clock: CycleClock | None = None,
     ) -> None:
         self.host, self._cycle_hz = host, cycle_hz
         self.motion = motion or StraightMotion(HOME)
-        self.clock = ControllerClock(time.monotonic, rate)
-        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, rate)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate)
         self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
