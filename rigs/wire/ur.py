@@ -121,6 +121,13 @@ class UrStandIn:
         self._silent = False
         self._thread.call(self._listen)
 
+    def restore(self) -> None:
+        """A person has put everything right: safety, remote control and link."""
+        self.unlock()
+        self.set_remote(True)
+        if self._silent:
+            self.restore_link()
+
     def set_remote(self, on: bool) -> None:
         """A person turns remote control on (or off, without ending the program)."""
         self._inside(lambda: setattr(self.program, "remote", on))
