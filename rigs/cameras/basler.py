@@ -250,8 +250,8 @@ class BaslerCamera:
             late_ns=round(settings.late_s * 1e9),
             sync_bit=(settings.sync_line or 1) - 1 if wired else None,
             queue=half,
+            first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
             stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
-            stall_from_start=settings.trigger == "free run",
         )
         self._grab, self._running = Grab(self._device, told, self._ends), True
 

@@ -39,8 +39,11 @@ class BaslerSettings(StrictModel):
     """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
     late_s: float = Field(default=0.1, gt=0, le=10)
     """A frame that arrives by this much after its time counts as late, seconds."""
+    first_frame_s: float = Field(default=5.0, ge=0.2, le=60)
+    """In free run, no frame for so long after the start is a fault, seconds: a camera and pylon
+    need time to set up buffers. Triggered, it may wait for ever for its first trigger."""
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
-    """A running camera that gives no frame for so long is a fault, seconds."""
+    """Silence for so long after the first frame is a fault, seconds."""
 
 
 class UsbCamera(StrictModel):
