@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from rigs.cameras.event_source import DEVICE, EventSource, open_source
+from rigs.cameras.health import dvxplorer_health
 from rigs.cameras.settings import DvxplorerSettings
-from rigs.capabilities import RigError
+from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
@@ -110,6 +111,16 @@ class DvxplorerCamera:
             "settings": self.settings.model_dump(mode="json"),
             "counts": asdict(self.counts),
         }
+
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, streaming or not.
+
+        Raises:
+            RigError: the camera is gone, or does not answer.
+        """
+        if self._closed:
+            raise RigError(DEVICE, "it is closed; open it again")
+        return dvxplorer_health(self._source, self.settings)
 
     def start(self) -> None:
         """Begin to stream; what came before is dropped. Returns within `SETTLE_S`.

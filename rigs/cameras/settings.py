@@ -19,6 +19,7 @@ Readout = Literal[
 class BaslerSettings(StrictModel):
     """The camera that looks through the plate."""
 
+    driver: Literal["basler"] = "basler"
     serial: str | None = None
     """Serial number; the first camera found where none is given."""
     px_per_mm: float = Field(gt=0, le=1000)
@@ -73,6 +74,7 @@ class NetworkStream(StrictModel):
 class DvxplorerSettings(StrictModel):
     """The event camera inside the sensor."""
 
+    driver: Literal["dvxplorer"] = "dvxplorer"
     source: Annotated[UsbCamera | NetworkStream, Field(discriminator="kind")] = UsbCamera()
     noise_filter_us: int | None = Field(default=None, ge=1, le=1_000_000)
     """Drop events without a neighbour within so many microseconds; None keeps all of them."""
