@@ -1,4 +1,28 @@
 """Drivers of the real cameras: Basler through pylon, DVXplorer through dv-processing.
 
-Neither library is loaded before a camera is opened, so that a simulated rig needs none of them.
+`build_frame_camera` and `build_event_camera` are the way in; the settings are in
+`rigs.cameras.settings`. Neither library is loaded before a camera is opened, so that a simulated
+rig needs none of them.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
+    from rigs.capabilities import EventCamera, FrameCamera
+
+
+def build_frame_camera(settings: BaslerSettings) -> FrameCamera:
+    """The frame camera that `settings` describe, open and not grabbing yet. Raises RigError."""
+    from rigs.cameras.basler import BaslerCamera
+
+    return BaslerCamera(settings)
+
+
+def build_event_camera(settings: DvxplorerSettings) -> EventCamera:
+    """The event camera that `settings` describe, open and not streaming yet. Raises RigError."""
+    from rigs.cameras.dvxplorer import DvxplorerCamera
+
+    return DvxplorerCamera(settings)

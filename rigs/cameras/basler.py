@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from rigs.cameras.grabbing import Grab, GrabCounts, GrabSettings
+from rigs.cameras.health import basler_health
 from rigs.cameras.nodes import DEVICE, Nodes
 from rigs.cameras.settings import BaslerSettings
 from rigs.cameras.stamps import Abilities, choose
-from rigs.capabilities import RigError
+from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import ClockReads, FrameChunk, Json
 
 TRIGGER_READY_MS = 1000
@@ -196,6 +197,20 @@ class BaslerCamera:
             "counts": vars(self.counts) | {"lost": self.counts.lost},
         }
 
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, grabbing or not.
+
+        Raises:
+            RigError: the camera is gone.
+        """
+        return basler_health(self._device, self._nodes, self.stamping, self._shape, self._buffers)
+
+    @property
+    def _buffers(self) -> int:
+        """Of pylon; as many frames fit into the queue."""
+        half = math.ceil(self.settings.rate_hz * self.settings.back_pressure_s / 2)
+        return max(half, _LEAST_BUFFERS)
+
     def set_region(self, width_px: int, height_px: int) -> None:
         """Read out a centred region only.
 
@@ -234,10 +249,9 @@ class BaslerCamera:
         if self._running:
             raise RigError(DEVICE, "it grabs already; stop first")
         settings = self.settings
-        half = max(math.ceil(settings.rate_hz * settings.back_pressure_s / 2), _LEAST_BUFFERS)
         self._ends.clear()
         try:
-            self._device.MaxNumBuffer.Value = half
+            self._device.MaxNumBuffer.Value = self._buffers
             self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
         except self._genicam.GenericException as error:
             raise RigError(DEVICE, f"it does not begin to grab: {error}") from None
@@ -249,9 +263,9 @@ class BaslerCamera:
             period_ns=0 if settings.trigger == "software" else round(1e9 / settings.rate_hz),
             late_ns=round(settings.late_s * 1e9),
             sync_bit=(settings.sync_line or 1) - 1 if wired else None,
-            queue=half,
+            queue=self._buffers,
+            first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
             stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
-            stall_from_start=settings.trigger == "free run",
         )
         self._grab, self._running = Grab(self._device, told, self._ends), True
 

@@ -5,6 +5,7 @@ Names differ between families (`ExposureTime`, `ExposureTimeAbs`); SFNC 2 names 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from rigs.capabilities import RigError
@@ -43,6 +44,15 @@ class Nodes:
             return self._map.GetNode(name).Value
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} cannot be read: {_short(error)}") from None
+
+    def peek(self, *names: str) -> Any:
+        """The value of the first of `names` that can be read now; None where none can."""
+        for name in names:
+            node = self._map.GetNode(name)
+            if node is not None and self._genicam.IsReadable(node):
+                with suppress(self._genicam.GenericException):
+                    return node.Value
+        return None
 
     def limit(self, name: str, which: str) -> int:
         """`Min`, `Max` or `Inc` of a whole number."""

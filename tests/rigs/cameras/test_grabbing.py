@@ -25,8 +25,8 @@ CHUNKS = GrabSettings(
     late_ns=100_000_000,
     sync_bit=2,
     queue=100,
+    first_ns=0,
     stall_ns=0,
-    stall_from_start=False,
 )
 
 
