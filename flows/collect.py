@@ -61,7 +61,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
             try:
                 with stopping.signals():  # Prefect has handlers of its own inside a flow
                     rig.connect()
-                    size = MOCK_BATCH if wanted.rig.simulated else 1
+                    size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
                     for start in range(0, len(trials), size):
                         take_trials(Parcel(session), Parcel(trials[start : start + size]))
             finally:

@@ -59,7 +59,7 @@ def make_order(
     rig_file, rig_text = load_rig_file(rig)
     check_plan(rig_file, plan, str(rig))
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
-        raise InputError(rig, "mock.plate", None, f"is needed: {protocol} moves a sliding plate")
+        raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
     begun = None
     if (store / "store.json").exists():
@@ -115,7 +115,7 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
         "rig": order.rig.name,
         "rig_hash": rig_hash(order.rig_text),
         "simulated": order.rig.simulated,
-        "scene_level": order.rig.mock.scene.level if order.rig.simulated else None,
+        "scene_level": order.rig.scene.scene.level if order.rig.simulated else None,
         "enabled": list(order.enable),
     }
     campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)

@@ -206,6 +206,9 @@ class FrameCamera(Protocol):
 class SyncBox(Protocol):
     """Ticks at a fixed rate: triggers frames, and sends a pulse on each tick with a code bit 1."""
 
+    def connect(self) -> None:
+        """See that a box answers; anew after a fault. Raises RigError."""
+
     def start(self, rate_hz: float, seed: int, code: Code) -> None:
         """Begin ticks and a code of `rigs.pulse_code` from `seed`, 1 to 65,535."""
 

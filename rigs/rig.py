@@ -84,6 +84,7 @@ class Rig:
         timing: which signal reaches which device, and so what else has to be read.
         touch_mm: how deep the centre papilla is when touching off notices it.
         simulation: the world behind a simulated rig, None on a real one.
+        ending: called last when the rig is closed.
     """
 
     name: str
@@ -100,9 +101,11 @@ class Rig:
     plate: Plate | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
+    ending: tuple[Callable[[], None], ...] = ()
 
     def connect(self) -> None:
-        """Connect the arm; cameras connect when they are built. Raises ArmFault."""
+        """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
+        self.sync.connect()
         self.arm.connect()
 
     def close(self) -> None:
@@ -115,6 +118,8 @@ class Rig:
         for device in (self.arm, self.events, self.frames, self.sync):
             with suppress(RigError):
                 device.close()
+        for end in self.ending:
+            end()
 
     def run_trial(
         self,

@@ -16,6 +16,7 @@ from protocols.program import Move
 from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
 from protocols.timing import Timing
 from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from rigs.devices import DeviceSettings
 from rigs.mock.promises import check_promises
 from rigs.mock.settings import MockSettings
 from rigs.rig_inheritance import read_rig, rig_path
@@ -129,7 +130,9 @@ class RigFile(StrictModel):
     rig: Literal[1]
     """Version of the file format."""
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,47}$")]
-    driver: Literal["mock"]
+    driver: Literal["mock", "devices", "loopback"]
+    """`mock`: simulated devices in this program, as fast as it goes. `devices`: the real ones.
+    `loopback`: the real drivers in real time, with stand-ins that show the simulated scene."""
     poll: PositiveSeconds
     """How often streams are read and stop requests looked at."""
     sensor: str = Field(min_length=1, max_length=40)
@@ -141,7 +144,44 @@ class RigFile(StrictModel):
     estimates: Estimates
     timing: Timing = Timing()
     """Which signal reaches which device, and how good their clocks are."""
-    mock: MockSettings
+    devices: DeviceSettings | None = None
+    """Which drivers reach the devices; not for `mock`."""
+    mock: MockSettings | None = None
+    """The simulated scene and devices; not for `devices`."""
+
+    @model_validator(mode="after")
+    def _has_its_sections(self) -> RigFile:
+        wanted = {
+            "mock": self.driver != "devices",
+            "devices": self.driver != "mock",
+        }
+        for name, needed in wanted.items():
+            found = getattr(self, name)
+            if needed and found is None:
+                raise KeyedError(name, None, f"is needed by driver: {self.driver}")
+            if not needed and found is not None:
+                raise KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
+        if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
+            raise KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
+        return self
+
+    @model_validator(mode="after")
+    def _loopback_can_show_it(self) -> RigFile:
+        if self.driver != "loopback" or self.mock is None or self.devices is None:
+            return self
+        exposure_us = self.mock.frame_camera.exposure_us
+        for key, value, right in (
+            (
+                "devices.frame_camera.exposure_us",
+                self.devices.frame_camera.exposure_us,
+                exposure_us,
+            ),
+            ("timing.frames", self.timing.frames, "hardware trigger"),
+            ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
+        ):
+            if value != right:
+                raise KeyedError(key, value, f"must be {right}: that is what stand-ins show")
+        return self
 
     @model_validator(mode="after")
     def _poll_is_short(self) -> RigFile:
@@ -152,6 +192,8 @@ class RigFile(StrictModel):
     @model_validator(mode="after")
     def _scales_agree(self) -> RigFile:
         """The simulated camera draws at the scale that the rig file promises."""
+        if self.mock is None:
+            return self
         told, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
         if told != drawn:
             raise KeyedError(
@@ -164,23 +206,40 @@ class RigFile(StrictModel):
     @model_validator(mode="after")
     def _promises_are_kept(self) -> RigFile:
         """The simulated clocks are no worse than `timing` says."""
-        check_promises(self.mock, self.timing)
+        if self.mock is not None:
+            check_promises(self.mock, self.timing)
         return self
 
     @property
     def simulated(self) -> bool:
         """Whether everything that comes from this rig is a simulation."""
+        return self.driver != "devices"
+
+    @property
+    def in_virtual_time(self) -> bool:
+        """Whether its time runs as fast as it can, and not with the clock on the wall."""
         return self.driver == "mock"
+
+    @property
+    def scene(self) -> MockSettings:
+        """The simulated scene and devices.
+
+        Raises:
+            ValueError: a real rig has none.
+        """
+        if self.mock is None:
+            raise ValueError(f"the rig {self.name} is real: there is no simulated scene")
+        return self.mock
 
     @property
     def has_plate(self) -> bool:
         """Whether the plate hangs on a slider that can be raised, released and caught."""
-        return self.driver == "mock"
+        return self.simulated or (self.devices is not None and self.devices.plate is not None)
 
     @property
     def frame_source(self) -> str:
         """``video`` or ``tracks``: what the outside camera hands over."""
-        return self.mock.frame_camera.level
+        return self.mock.frame_camera.level if self.mock is not None else "video"
 
     def frame_bytes(self, with_plate: bool) -> float:
         """What one frame is expected to take on disk, with or without the plate's marker."""

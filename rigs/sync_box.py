@@ -17,7 +17,8 @@ from protocols.timing import Code
 from rigs.capabilities import RigError
 from rigs.pulse_code import SEEDS
 from rigs.sync_line import LEAST_HZ, MOST_HZ
-from rigs.sync_port import DEVICE, SyncBoxFault, SyncBoxSettings, SyncPort, began_anew
+from rigs.sync_port import DEVICE, SyncBoxFault, SyncPort, began_anew
+from rigs.sync_settings import SyncBoxSettings
 from rigs.sync_train import Losses, Train
 from storage.streams import ClockReads, PulseChunk
 

@@ -7,18 +7,22 @@ rig needs none of them.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
     from rigs.capabilities import EventCamera, FrameCamera
 
 
-def build_frame_camera(settings: BaslerSettings) -> FrameCamera:
-    """The frame camera that `settings` describe, open and not grabbing yet. Raises RigError."""
+def build_frame_camera(settings: BaslerSettings, device: Any = None) -> FrameCamera:
+    """The frame camera that `settings` describe, open and not grabbing yet. Raises RigError.
+
+    Args:
+        device: pylon's camera behind the driver; searched for where None.
+    """
     from rigs.cameras.basler import BaslerCamera
 
-    return BaslerCamera(settings)
+    return BaslerCamera(settings, device)
 
 
 def build_event_camera(settings: DvxplorerSettings) -> EventCamera:

@@ -66,7 +66,7 @@ class BaslerCamera:
     """
 
     def __init__(self, settings: BaslerSettings, device: Any = None) -> None:
-        self.settings, self.px_per_mm = settings, settings.px_per_mm
+        self.settings, self.px_per_mm = settings, settings.px_per_mm or math.nan
         self._device = device if device is not None else find_camera(settings.serial)
         self._grab: Grab | None = None
         self._running = False

@@ -28,7 +28,8 @@ class Nodes:
     def has(self, name: str) -> bool:
         """Whether a setting is there and may be written now."""
         node = self._map.GetNode(name)
-        return node is not None and bool(self._genicam.IsWritable(node))
+        writable = {self._genicam.RW, self._genicam.WO}
+        return node is not None and node.GetAccessMode() in writable
 
     def offers(self, name: str, choice: str) -> bool:
         """Whether a setting can be set and `choice` is one of its values."""

@@ -22,8 +22,8 @@ class BaslerSettings(StrictModel):
     driver: Literal["basler"] = "basler"
     serial: str | None = None
     """Serial number; the first camera found where none is given."""
-    px_per_mm: float = Field(gt=0, le=1000)
-    """Pixels for a millimetre of the plate."""
+    px_per_mm: float | None = Field(default=None, gt=0, le=1000)
+    """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
     exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
     """Exposure, microseconds; the camera may round it, and what it says then counts."""
     rate_hz: float = Field(default=100.0, gt=0, le=1000)

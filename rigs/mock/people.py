@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 from protocols.program import PlateAction
-from rigs.capabilities import ArmState, RigError
+from rigs.capabilities import ArmState
 from rigs.mock.world import World
-
-_MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
+from rigs.people import mass_of
 
 
 class VirtualClock:
@@ -75,10 +73,7 @@ class SimulatedOperator:
         """
         self.asked.append(Asked(task, prompt, expected))
         if task == "changeover":
-            match = _MASS.fullmatch(expected)
-            if match is None or float(match[1]) <= 0.0:
-                raise RigError("operator", f"cannot mount {expected!r}; expected such as 0.205 kg")
-            self._world.mass_kg = float(match[1]) * (0.001 if match[2] == "g" else 1.0)
+            self._world.mass_kg = mass_of(expected)
         elif task == "protective_stop":
             self._world.arm_state = ArmState.READY
         return True

@@ -54,6 +54,9 @@ class MockSyncBox:
         self._bits: U8 = np.zeros(0, np.uint8)
         self._reports = _PulseFaults(self._world, self, "sync_box")
 
+    def connect(self) -> None:
+        """It is there."""
+
     def start(
         self, rate_hz: float, seed: int, code: Code = "lfsr", at_ns: int | None = None
     ) -> None:

@@ -97,7 +97,9 @@ class World:
         settings = self.settings
         self.seed = seed
         self.faults = FaultBook(settings.faults, self.trials)
-        clocks = trial_clocks(settings.clocks, settings.seed, settings.seed if self._run_on else seed)
+        clocks = trial_clocks(
+            settings.clocks, settings.seed, settings.seed if self._run_on else seed
+        )
         if self._run_on:
             clocks = clocks.after(self.past_ns)
         self.clocks: TrialClocks = with_faults(clocks, self.faults)

@@ -30,8 +30,8 @@ from rigs.mock.sync import MockSyncBox
 from rigs.mock.truth import truth_of
 from rigs.mock.world import World, start_pose
 from rigs.pulse_code import code_bits
-from rigs.wire.dvxplorer import LiveDvxplorer
 from rigs.wire.faults import Kind
+from rigs.wire.live_dvxplorer import LiveDvxplorer
 from rigs.wire.motion_path import MotionPath
 from rigs.wire.standing_arm import StandingArm, standing_arm
 from rigs.wire.sync_box import PtySyncBox, Train
@@ -280,4 +280,3 @@ class Theatre:
         except KeyError:
             raise RigError(device, f"no stand-in can show '{kind}' of it") from None
         what()
-

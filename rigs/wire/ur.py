@@ -74,7 +74,9 @@ class UrStandIn:
         self.host, self._cycle_hz = host, cycle_hz
         self.motion = motion or StraightMotion(HOME)
         self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
-        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate)
+        self.program = UrProgram(
+            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate
+        )
         self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
