@@ -108,6 +108,9 @@ def collect(
     rig: RigOption,
     store: StoreOption,
     enable: EnableOption = None,
+    trials: Annotated[
+        int | None, typer.Option("--trials", min=1, help="Take so many of the missing, no more.")
+    ] = None,
     campaign: Annotated[
         str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
     ] = None,
@@ -131,6 +134,7 @@ def collect(
         enable=tuple(enable or ()),
         campaign=campaign,
         bench=Bench(operator, temperature, humidity, note),
+        most=trials,
     )
     for warning in order.plan.warnings():
         console.say(f"note: {warning}")
@@ -142,7 +146,7 @@ def collect(
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
     _finish(result, f"collected into {store}", as_json)
-    if result["missing"]:
+    if result["missing"] > result["left_out"]:
         raise typer.Exit(console.FAILED)
 
 

@@ -53,7 +53,8 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
         rig = build_rig(wanted.rig)
         rig.should_stop = stopping.requested
         session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.bench.operator)
-        trials = pending_trials(wanted.plan, campaign)
+        pending = pending_trials(wanted.plan, campaign)
+        trials = wanted.wanted(campaign)
         campaign.add_bench_record(_bench_record(wanted))
         simulated = "simulated " if wanted.rig.simulated else ""
         with console.bar(f"collect {wanted.campaign} ({simulated}trials)", len(trials)) as bar:
@@ -70,6 +71,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
             **campaign_counts(wanted, campaign),
             "taken": session.taken,
             "retaken": session.retaken,
+            "left_out": len(pending) - len(trials),
         }
 
 
@@ -95,4 +97,4 @@ def collect(order: Order) -> dict[str, Any]:
         check_disk([order])
         return run(collect_flow, Parcel(order))
     campaign = describe_campaign(store, order)
-    return {**campaign_counts(order, campaign), "taken": 0, "retaken": 0}
+    return {**campaign_counts(order, campaign), "taken": 0, "retaken": 0, "left_out": 0}

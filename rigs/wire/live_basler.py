@@ -8,6 +8,7 @@ emulation does not have, are the scene's. What pylon loses on the way is lost he
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -16,10 +17,21 @@ from rigs.cameras.basler import find_camera
 from rigs.wire.basler import emulate
 from storage.streams import U8, FrameChunk
 
-READY_MS = 2_000
-"""The longest that the emulated camera takes to be ready for the next trigger, ms."""
+TRIES = 3
+MISSED_S = 0.2
+"""A trigger whose picture has not come by then was missed, s."""
+LOOK_S = 0.001
+LOOK_MS = 100
+READY_S = 2.0
+"""The longest that the emulated camera takes to be ready for the next trigger, s."""
+EXPOSURE_US = 100.0
+"""Of the emulated camera; the scene's own is in its pictures."""
 FEED_S = 5.0
 """The longest that the feeding thread takes to end, s."""
+
+
+_Frame = tuple[U8, int, int, int]
+"""Picture, number, middle of the exposure in ns, and level of the sync line."""
 
 
 class Scene(Protocol):
@@ -45,16 +57,17 @@ class LiveBasler:
         sync_line: number of the input that shows the sync line's level.
 
     Attributes:
-        fed: frames that were given to pylon.
+        fed: frames that pylon took since the grab began.
     """
 
     def __init__(self, scene: Scene, mid_exposure_ns: int, sync_line: int) -> None:
         emulate(1)
         self._device = find_camera(None)
         self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
-        self._coming: deque[tuple[U8, int, int, int] | None] = deque()
+        self._coming: deque[_Frame | None] = deque()
         self._came = threading.Condition()
-        self._fed: deque[tuple[U8, int, int, int]] = deque()
+        self._fed: deque[tuple[int, _Frame]] = deque()
+        self._triggers = self._retrieved = 0
         self._feeder: threading.Thread | None = None
         self._drop, self._gone = 0, False
         self.fed = 0
@@ -87,8 +100,10 @@ class LiveBasler:
         """Begin: the scene sends frames of the region that was set."""
         nodes = self._device.GetNodeMap()
         nodes.GetNode("TriggerSource").Value = "Software"
+        nodes.GetNode("ExposureTimeAbs").Value = EXPOSURE_US
         self._coming.clear()
         self._fed.clear()
+        self._triggers = self._retrieved = self.fed = 0
         self._device.StartGrabbing(strategy)
         self._feeder = threading.Thread(target=self._feed, name="scene's frames", daemon=True)
         self._feeder.start()
@@ -108,9 +123,15 @@ class LiveBasler:
     def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
         """The next result of pylon's, with the scene's picture in it."""
         result = self._device.RetrieveResult(timeout_ms, handling)
-        if result is None or not result.IsValid() or not self._fed:
+        if result is None or not result.IsValid():
             return result
-        frame = self._fed.popleft()
+        with self._came:
+            # a trigger that pylon's camera missed gave no result
+            while self._fed[0][0] < result.BlockID:
+                self._fed.popleft()
+            frame = self._fed.popleft()[1]
+            self._retrieved += 1
+            self._came.notify()
         if self._drop:
             from pypylon import pylon
 
@@ -135,23 +156,47 @@ class LiveBasler:
             self._came.notify()
 
     def _feed(self) -> None:
-        from pypylon import genicam, pylon
+        from pypylon import genicam
 
-        handling = pylon.TimeoutHandling_Return
         while True:
             with self._came:
-                if not self._came.wait_for(lambda: self._coming, READY_MS / 1000):
+                if not self._came.wait_for(lambda: self._coming, READY_S):
                     continue
                 frame = self._coming.popleft()
             if frame is None:
                 return
             try:
-                if not self._gone and self._device.WaitForFrameTriggerReady(READY_MS, handling):
-                    self._fed.append(frame)
-                    self._device.ExecuteSoftwareTrigger()
-                    self.fed += 1
+                self._give(frame)
             except genicam.GenericException:
                 return  # it grabs no more: what comes now is lost, and its number is missing
+
+    def _give(self, frame: _Frame) -> None:
+        """One trigger for one frame; the emulation misses some, which no camera's line would."""
+        for _ in range(TRIES):
+            if self._gone or not self._ready():
+                return
+            with self._came:
+                self._fed.append((self._triggers, frame))
+                self._triggers += 1
+            self._device.ExecuteSoftwareTrigger()
+            end = time.monotonic() + MISSED_S
+            while time.monotonic() < end:
+                with self._came:
+                    if self._retrieved + self._device.NumReadyBuffers.Value > self.fed:
+                        self.fed += 1
+                        return
+                    self._came.wait(LOOK_S)
+
+    def _ready(self) -> bool:
+        """Whether the next trigger may come, after waiting for it."""
+        from pypylon import pylon
+
+        end = time.monotonic() + READY_S
+        while time.monotonic() < end:
+            # right after the start it says no at once
+            if self._device.WaitForFrameTriggerReady(LOOK_MS, pylon.TimeoutHandling_Return):
+                return True
+        return False
 
 
 class _Value:
@@ -176,6 +221,7 @@ class _Result:
     ) -> None:
         self._result = result
         self.Array, self.BlockID, self.ImageNumber = image, number, number + 1
+        self.NumberOfSkippedImages = 0  # the numbers say it
         self.TimeStamp = t_ns - mid_exposure_ns
         self.ChunkTimestamp = _Value(self.TimeStamp)
         self.ChunkLineStatusAll = _Value(sync << bit)
@@ -207,9 +253,13 @@ class _NodeMap:
             "ChunkModeActive": _Choice(),
             "ChunkSelector": _Choice(("Timestamp", "LineStatusAll")),
             "ChunkEnable": _Choice(),
+            # the emulated exposure stays short, so that no trigger comes too soon
+            "ExposureTime": _Choice(),
+            "ExposureTimeAbs": _Choice(),
             "TriggerSource": _Choice(("Software", "Line1", "Line2", "Line3")),
         }
 
     def GetNode(self, name: str) -> Any:
         """A setting by its name."""
-        return self._own.get(name) or self._map.GetNode(name)
+        own = self._own.get(name)
+        return own if own is not None else self._map.GetNode(name)

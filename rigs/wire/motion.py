@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from rigs.arms.pose import angle_deg, between, distance_mm
+from rigs.arms.pose import angle_deg, between, distance_mm, way
 from rigs.capabilities import Pose
 
 F64 = npt.NDArray[np.float64]
@@ -104,7 +105,11 @@ class Line:
         gone, _ = self.ramp.at(t_s - self.start_s)
         if self.ramp.length == 0 or gone >= self.ramp.length:
             return self.end
-        return between(self.begin, self.end, gone / self.ramp.length)
+        return self._way(gone / self.ramp.length)
+
+    @cached_property
+    def _way(self) -> Callable[[float], Pose]:
+        return way(self.begin, self.end)
 
 
 class StraightMotion:

@@ -67,6 +67,7 @@ def standing_arm(
         arm = UrStandIn(
             settings.host,
             motion,
+            cycle_hz=settings.frequency_hz,
             digital_inputs=lambda t_s: bit if sync(t_s) else 0,
             reach_mm=REACH_MM,
             clock=clock,

@@ -19,8 +19,9 @@ import numpy.typing as npt
 from protocols.program import PlateAction
 from protocols.timing import Timing
 from rigs.arms.settings import ArmSettings
-from rigs.capabilities import ArmState, RigError
+from rigs.capabilities import ArmState, Pose, RigError, Segment
 from rigs.mock.clocks import trial_clocks
+from rigs.mock.devices import build_mock
 from rigs.mock.event_camera import MockEventCamera
 from rigs.mock.frame_camera import MockFrameCamera
 from rigs.mock.geometry import ContactPlane
@@ -104,6 +105,7 @@ class Theatre:
         arm: ArmSettings,
         on_frames: Callable[[FrameChunk], None],
     ) -> None:
+        _rehearse(settings, timing)
         self._origin_ns = time.monotonic_ns() - LAG_NS
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
         plane = ContactPlane.from_settings(settings.scene.contact)
@@ -280,3 +282,24 @@ class Theatre:
         except KeyError:
             raise RigError(device, f"no stand-in can show '{kind}' of it") from None
         what()
+
+
+def _rehearse(settings: MockSettings, timing: Timing) -> None:
+    """Let a world like this one run for a moment: what has to be compiled or loaded is then there.
+
+    Compiling holds Python's lock for seconds, in which no stand-in would answer.
+    """
+    devices = build_mock(settings, timing)
+    devices.arm.connect()
+    devices.begin_trial(1)
+    devices.frames.set_region(64, 64)
+    devices.events.start()
+    devices.frames.start()
+    devices.sync.start(100.0, 1)
+    home = devices.arm.pose()
+    devices.arm.start([Segment(Pose((home.xyz_mm[0] + 1.0, *home.xyz_mm[1:]), home.rotvec_deg), 5)])
+    for _ in range(10):
+        devices.clock.wait(0.05)
+        for read in (devices.events.read, devices.events.read_pulses, devices.frames.read):
+            read()
+    devices.truth(devices.clock.now_ns() - 100_000_000)
