@@ -301,7 +301,10 @@ class BaslerCamera:
                 np.empty((0, *self._shape), np.uint8), none, none, none, np.empty(0, np.uint8)
             )
         return FrameChunk(
-            np.stack([frame.image for frame in frames]),
+            # one frame, as a quick loop finds it, is handed on as it is
+            np.stack([frame.image for frame in frames])
+            if len(frames) > 1
+            else frames[0].image[np.newaxis],
             np.array([frame.number for frame in frames], np.int64),
             np.array([frame.t_ns for frame in frames], np.int64),
             np.array([frame.host_ns for frame in frames], np.int64),
