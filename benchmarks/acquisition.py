@@ -5,8 +5,8 @@ another process through dv-processing and the DVXplorer driver; both go into a t
 Events are made before the clock runs. One run, for it is long.
 
 frames_lost, events_lost, pulses_lost: sent or exposed, and not in the trial's files. The emulated
-camera slows down where a real one would lose frames, so `frames_per_s` stands beside them. It is asked
-for `EMULATED_HZ`, for it waits a period and then draws: asked for 100/s, it makes 99.
+camera slows down where a real one would lose frames, so `frames_per_s` stands beside them. It is
+asked for `EMULATED_HZ`, for it waits a period and then draws: asked for 100/s, it makes 99.
 dropped_on_purpose, dropped_noticed: in a second, short run the stand-in drops frames; noticed are
 those missing in the file's frame numbers that the driver counted too.
 memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all;

@@ -28,7 +28,7 @@ class Nodes:
     def has(self, name: str) -> bool:
         """Whether a setting is there and may be written now."""
         node = self._map.GetNode(name)
-        return node is not None and bool(self._genicam.IsWritable(node))
+        return node is not None and node.GetAccessMode() in (self._genicam.RW, self._genicam.WO)
 
     def offers(self, name: str, choice: str) -> bool:
         """Whether a setting can be set and `choice` is one of its values."""
@@ -49,7 +49,9 @@ class Nodes:
         """The value of the first of `names` that can be read now; None where none can."""
         for name in names:
             node = self._map.GetNode(name)
-            if node is not None and self._genicam.IsReadable(node):
+            if node is None:
+                continue
+            if node.GetAccessMode() in (self._genicam.RW, self._genicam.RO):
                 with suppress(self._genicam.GenericException):
                     return node.Value
         return None
