@@ -186,8 +186,8 @@ def _serve(
     """The process; it never returns, for taking a writer down may wait for ever."""
     status = 1
     try:
-        packets = [_made(*packet) for packet in source()]
-        writers, ports = _open_writers(size)
+        packets = [made(*packet) for packet in source()]
+        writers, ports = open_writers(size)
         pipe.send(("ready", ports))
         if pipe.recv() == "go":
             pipe.send(("sent", _send(pipe, packets, writers, realtime, stall_after)))
@@ -201,7 +201,9 @@ def _serve(
 
 
 @dataclass(frozen=True)
-class _Made:
+class Made:
+    """A packet in the library's own types."""
+
     store: Any
     triggers: Any
     events: int
@@ -209,7 +211,8 @@ class _Made:
     end_us: int
 
 
-def _made(chunk: EventChunk, pulses_us: I64) -> _Made:
+def made(chunk: EventChunk, pulses_us: I64) -> Made:
+    """Events and rising edges, us, as the library sends them."""
     import dv_processing as dv
 
     store = dv.EventStore()
@@ -221,10 +224,10 @@ def _made(chunk: EventChunk, pulses_us: I64) -> _Made:
         [dv.Trigger(at, rising) for at in pulses_us.tolist()]
     )
     ends = [int(times[-1]) for times in (chunk.t_us, pulses_us) if len(times)]
-    return _Made(store, triggers, len(chunk), len(pulses_us), max(ends, default=0))
+    return Made(store, triggers, len(chunk), len(pulses_us), max(ends, default=0))
 
 
-def _open_writers(size: tuple[int, int]) -> tuple[tuple[Any, Any], tuple[int, int]]:
+def open_writers(size: tuple[int, int]) -> tuple[tuple[Any, Any], tuple[int, int]]:
     """Writers of events and of triggers on ports that are free, and the ports."""
     import dv_processing as dv
 
@@ -255,7 +258,7 @@ def _free_port() -> int:
 
 def _send(
     pipe: Connection,
-    packets: list[_Made],
+    packets: list[Made],
     writers: tuple[Any, Any],
     realtime: bool,
     stall_after: int | None,
