@@ -28,7 +28,7 @@ from storage.streams import I64, EventChunk
 Packet = tuple[EventChunk, I64]
 """Events, and the rising edges that came with them, us of the camera's clock."""
 Source = Callable[[], Iterable[Packet]]
-READY_S = 180.0
+READY_S = 600.0
 """The longest that it takes to make all packets, s."""
 CLIENT_S = 30.0
 """The longest that it waits for its client, and for what is queued to leave, s."""
