@@ -20,6 +20,7 @@ import numpy as np
 from rigs.cameras.counts import EventCounts
 from rigs.cameras.event_source import DEVICE, EventSource, open_source
 from rigs.cameras.health import dvxplorer_health
+from rigs.cameras.patience import Patience
 from rigs.cameras.settings import DvxplorerSettings
 from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import I64, EventChunk, Json, PulseChunk
@@ -71,6 +72,7 @@ class DvxplorerCamera:
         self._counts = EventCounts()
         self._fault: RigError | None = None
         self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
         self._silent_ns = 0
 
     @property
@@ -173,7 +175,7 @@ class DvxplorerCamera:
         if self._fault is not None:
             raise self._fault
         silent_s = self._silent_ns / 1e9
-        hung_s = (time.monotonic_ns() - self._asked_ns) / 1e9
+        hung_s = self._patience.waited_s(self._asked_ns)
         if self._keep and hung_s > HANG_S:
             raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:

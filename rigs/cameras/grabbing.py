@@ -16,6 +16,7 @@ from typing import Any
 
 from rigs.cameras.counts import GrabCounts
 from rigs.cameras.nodes import DEVICE
+from rigs.cameras.patience import Patience
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import RigError
 from storage.streams import U8
@@ -96,6 +97,7 @@ class Grab:
         self._shortest_ns: int | None = None
         self._before: tuple[int, int] | None = None
         self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
         self._silent_ns = 0
         self._heard = False
         self._stopping = threading.Event()
@@ -115,10 +117,10 @@ class Grab:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
             silent_ns = self._silent_ns
-            hung_ns = time.monotonic_ns() - self._asked_ns
+            hung_s = self._patience.waited_s(self._asked_ns)
             limit = self._settings.stall_ns if self._heard else self._settings.first_ns
-            if hung_ns > HANG_S * 1e9:
-                return RigError(DEVICE, f"pylon has not answered for {hung_ns / 1e9:.1f} s")
+            if hung_s > HANG_S:
+                return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
             if limit and silent_ns > limit:
                 what = "no frame" if self._heard else "not one frame since the start,"
                 return RigError(

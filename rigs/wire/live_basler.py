@@ -61,6 +61,7 @@ class LiveBasler:
         self._ahead: deque[_Pushed] = deque()
         self._pushed: dict[int, _Pushed] = {}
         self._exposing = False
+        self._shape = (0, 0)
         self._error: Exception | None = None
         self._feeder: threading.Thread | None = None
         self.frames_sent = self.unseen = self.unmatched = 0
@@ -108,6 +109,8 @@ class LiveBasler:
         nodes.GetNode("TriggerMode").Value = "On"
         self._device.StartGrabbing(strategy)
         self._pushed.clear()
+        width, height = self.region  # asked here, for a push must not wait for the device
+        self._shape = height, width
         self._error = None
         self._exposing = True
         self._feeder = threading.Thread(target=self._feed, name="live frames", daemon=True)
@@ -134,9 +137,8 @@ class LiveBasler:
                 return False
             if self._error is not None:
                 raise LiveError(f"no trigger is taken: {self._error}")
-            width, height = self.region
-            if image.shape != (height, width):
-                raise ValueError(f"a picture of {image.shape} instead of {(height, width)}")
+            if image.shape != self._shape:
+                raise ValueError(f"a picture of {image.shape} instead of {self._shape}")
             if len(self._ahead) >= AHEAD:
                 raise LiveError(f"{AHEAD} frames wait to be exposed; push fewer a second")
             self._ahead.append(_Pushed(image, start_ns, lines))
