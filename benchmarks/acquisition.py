@@ -12,7 +12,8 @@ those missing in the file's frame numbers that the driver counted too.
 memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all;
 memory_end_growth_mb: from the median of the first fifth to that of the last.
 cores: processor time of this process, all drivers, pylon's emulation and writing, over time.
-loop_max_ms: the longest time between two looks of the loop that reads and writes.
+loop_max_ms: the longest time between two looks of the loop that reads and writes; queued_max_ms: how
+much of that it waited for a processor, which others had.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,
 over 100. encode_s_per_trial: encoding the run's spool when the trial ends.
 """
@@ -29,7 +30,7 @@ from statistics import median
 
 import numpy as np
 
-from benchmarks.measure import SEED, Figures, resident_mb
+from benchmarks.measure import SEED, Figures, queued_s, resident_mb
 from benchmarks.storage import noisy_frames
 from rigs.cameras.basler import BaslerCamera, find_camera
 from rigs.cameras.dvxplorer import DvxplorerCamera
@@ -121,7 +122,8 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
         **rates,
         "memory_growth_mb": max(0.0, max(memory) - max(early)),
         "memory_end_growth_mb": max(0.0, median(late) - median(early)),
-        "loop_max_ms": max(pauses) * 1e3,
+        "loop_max_ms": max(pauses)[0] * 1e3,
+        "queued_max_ms": max(pauses)[1] * 1e3,
         "encode_s_per_trial": encode_s,
     }
 
@@ -132,9 +134,10 @@ def _loop(
     events: DvxplorerCamera,
     server: DvxplorerServer,
     seconds: float,
-) -> tuple[list[float], list[float], Figures]:
+) -> tuple[list[float], list[tuple[float, float]], Figures]:
     """Read and write as a rig does: memory at every look, time between looks, and rates."""
     memory, pauses, idle = [], [], threading.Event()
+    queued = queued_s()
     used = time.process_time()
     began = last = time.perf_counter()
     while last - began < seconds or not server.answered:
@@ -144,7 +147,8 @@ def _loop(
         memory.append(resident_mb())
         idle.wait(POLL_S)
         now = time.perf_counter()
-        pauses.append(now - last)
+        queued, before = queued_s(), queued
+        pauses.append((now - last, queued - before))
         last = now
     rates = {
         "frames_per_s": frames.counts.grabbed / (last - began),
