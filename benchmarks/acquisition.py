@@ -12,8 +12,8 @@ those missing in the file's frame numbers that the driver counted too.
 memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all;
 memory_end_growth_mb: from the median of the first fifth to that of the last.
 cores: processor time of this process, all drivers, pylon's emulation and writing, over time.
-loop_max_ms: the longest time between two looks of the loop that reads and writes; queued_max_ms: how
-much of that it waited for a processor, which others had.
+loop_max_ms: the longest time between two looks of the loop that reads and writes; queued_max_ms:
+how much of that it waited for a processor that others had.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,
 over 100. encode_s_per_trial: encoding the run's spool when the trial ends.
 """
