@@ -9,15 +9,15 @@ means stands in `stamps.py`; what was never tried on a real camera stands in doc
 from __future__ import annotations
 
 import math
-import time
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from rigs.cameras.grabbing import Grab, GrabCounts, GrabSettings
+from rigs.cameras.counts import GrabCounts
+from rigs.cameras.grabbing import Grab, GrabSettings
 from rigs.cameras.health import basler_health
-from rigs.cameras.nodes import DEVICE, Nodes
+from rigs.cameras.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
 from rigs.cameras.settings import BaslerSettings
 from rigs.cameras.stamps import Abilities, choose
 from rigs.capabilities import DeviceHealth, RigError
@@ -27,11 +27,6 @@ TRIGGER_READY_MS = 1000
 """How long a software trigger waits for the camera to be ready for it, ms."""
 _LEAST_BUFFERS = 8
 _END_OF_EXPOSURE = "EventExposureEndData"
-# command, value and ticks a second of the clock, by family; None: nanoseconds
-_LATCHES = (
-    ("TimestampLatch", "TimestampLatchValue", None),
-    ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
-)
 
 
 def find_camera(serial: str | None) -> Any:
@@ -137,7 +132,7 @@ class BaslerCamera:
             chunk=chunk,
             result=result,
             event=event,
-            latch=any(nodes.has(command) for command, _, _ in _LATCHES),
+            latch=has_latch(nodes),
             sync_level=level,
             exposure_line=settings.exposure_line is not None,
         )
@@ -219,23 +214,7 @@ class BaslerCamera:
         """
         if self._running:
             raise RigError(DEVICE, "the region cannot change while it grabs; stop first")
-        nodes = self._nodes
-        for size, offset, wanted in (
-            ("Width", "OffsetX", width_px),
-            ("Height", "OffsetY", height_px),
-        ):
-            nodes.put(0, offset)
-            most, step = nodes.limit(size, "Max"), nodes.limit(size, "Inc")
-            least = nodes.limit(size, "Min")
-            if not least <= wanted <= most or (wanted - least) % step:
-                raise RigError(
-                    DEVICE,
-                    f"{size.lower()} of {wanted} px: must lie between {least} and {most} px "
-                    f"in steps of {step}",
-                )
-            nodes.put(wanted, size)
-            step = nodes.limit(offset, "Inc")
-            nodes.put((most - wanted) // 2 // step * step, offset)
+        centre_region(self._nodes, width_px, height_px)
         self._shape = (height_px, width_px)
 
     def start(self) -> None:
@@ -301,7 +280,10 @@ class BaslerCamera:
                 np.empty((0, *self._shape), np.uint8), none, none, none, np.empty(0, np.uint8)
             )
         return FrameChunk(
-            np.stack([frame.image for frame in frames]),
+            # one frame, as a quick loop finds it, is handed on as it is
+            np.stack([frame.image for frame in frames])
+            if len(frames) > 1
+            else frames[0].image[np.newaxis],
             np.array([frame.number for frame in frames], np.int64),
             np.array([frame.t_ns for frame in frames], np.int64),
             np.array([frame.host_ns for frame in frames], np.int64),
@@ -314,18 +296,7 @@ class BaslerCamera:
         Raises:
             RigError: this camera has no clock that the host can read.
         """
-        nodes = self._nodes
-        for command, value, frequency in _LATCHES:
-            if not nodes.has(command):
-                continue
-            per_s = int(nodes.get(frequency)) if frequency else 10**9
-            before_ns = time.monotonic_ns()
-            nodes.execute(command)
-            after_ns = time.monotonic_ns()
-            # the latch is what happened between the two; reading it out may take its time
-            row = (int(nodes.get(value)) * 10**9 // per_s, before_ns, after_ns)
-            return ClockReads(*(np.array([each], np.int64) for each in row))
-        raise RigError(DEVICE, "this camera has no clock that the host can read")
+        return latch_clock(self._nodes)
 
     def stop(self) -> None:
         """Stop grabbing; frames exposed before can still be read. Bounded by `STOP_S`."""

@@ -11,14 +11,16 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import timedelta
 from typing import Any
 
 import numpy as np
 
+from rigs.cameras.counts import EventCounts
 from rigs.cameras.event_source import DEVICE, EventSource, open_source
 from rigs.cameras.health import dvxplorer_health
+from rigs.cameras.patience import Patience
 from rigs.cameras.settings import DvxplorerSettings
 from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import I64, EventChunk, Json, PulseChunk
@@ -34,31 +36,6 @@ CLOSE_S = 3.0
 _EVENT_BYTES = 13
 _LOOK_NS = 10_000_000
 """The most that one look which found nothing counts as silence, ns."""
-
-
-@dataclass
-class EventCounts:
-    """What one run received.
-
-    Attributes:
-        events: kept, read or not.
-        pulses: rising edges.
-        gaps: silences of more than `gap_s` between events, on the camera's clock.
-        longest_gap_us: the longest silence between two events.
-        filtered: dropped by the noise filter, if it is on.
-        overflowed: dropped because nobody read; the run ends with an error then.
-        other_triggers: triggers that are no rising edges.
-        before: events thrown away before the run.
-    """
-
-    events: int = 0
-    pulses: int = 0
-    gaps: int = 0
-    longest_gap_us: int = 0
-    filtered: int = 0
-    overflowed: int = 0
-    other_triggers: int = 0
-    before: int = 0
 
 
 class DvxplorerCamera:
@@ -95,6 +72,7 @@ class DvxplorerCamera:
         self._counts = EventCounts()
         self._fault: RigError | None = None
         self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
         self._silent_ns = 0
 
     @property
@@ -197,7 +175,7 @@ class DvxplorerCamera:
         if self._fault is not None:
             raise self._fault
         silent_s = self._silent_ns / 1e9
-        hung_s = (time.monotonic_ns() - self._asked_ns) / 1e9
+        hung_s = self._patience.waited_s(self._asked_ns)
         if self._keep and hung_s > HANG_S:
             raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:

@@ -11,10 +11,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
+from rigs.cameras.counts import GrabCounts
 from rigs.cameras.nodes import DEVICE
+from rigs.cameras.patience import Patience
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import RigError
 from storage.streams import U8
@@ -31,36 +33,6 @@ _DRAIN_ROUNDS = 2
 """Empty looks in a row after which a stopped camera has nothing more to say."""
 NO_ID = (1 << 64) - 1
 """A block id of pylon that says there is none."""
-
-
-@dataclass
-class GrabCounts:
-    """What became of the frames of one run.
-
-    Attributes:
-        grabbed: whole frames in order, handed on or still in the queue.
-        failed: came incomplete.
-        skipped: missing in the camera's ids, or overwritten in pylon.
-        late: arrived later after their time than `late_s` allows; they are handed on.
-        out_of_order: came after a later one or twice; they are not handed on.
-        unstamped: their time never came; they are not handed on.
-    """
-
-    grabbed: int = 0
-    failed: int = 0
-    skipped: int = 0
-    late: int = 0
-    out_of_order: int = 0
-    unstamped: int = 0
-
-    @property
-    def lost(self) -> int:
-        """Frames that were exposed, as far as one can tell, and not handed on."""
-        return self.failed + self.skipped + self.out_of_order + self.unstamped
-
-    def copy(self) -> GrabCounts:
-        """As they are now."""
-        return GrabCounts(*(getattr(self, field.name) for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -125,6 +97,7 @@ class Grab:
         self._shortest_ns: int | None = None
         self._before: tuple[int, int] | None = None
         self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
         self._silent_ns = 0
         self._heard = False
         self._stopping = threading.Event()
@@ -144,10 +117,10 @@ class Grab:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
             silent_ns = self._silent_ns
-            hung_ns = time.monotonic_ns() - self._asked_ns
+            hung_s = self._patience.waited_s(self._asked_ns)
             limit = self._settings.stall_ns if self._heard else self._settings.first_ns
-            if hung_ns > HANG_S * 1e9:
-                return RigError(DEVICE, f"pylon has not answered for {hung_ns / 1e9:.1f} s")
+            if hung_s > HANG_S:
+                return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
             if limit and silent_ns > limit:
                 what = "no frame" if self._heard else "not one frame since the start,"
                 return RigError(

@@ -6,7 +6,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -91,60 +93,73 @@ def test_the_description_of_triggers_is_the_librarys() -> None:
     assert ours[ours.index(b"<dv") :].rstrip(b"\0") == theirs[theirs.index(b"<dv") :].rstrip(b"\0")
 
 
-def read_back(server: DvServer, packets: list[bytes], ask: Callable[[Any], Any], n: int) -> Any:
-    import dv_processing as dv
-
-    reader = dv.io.NetworkReader("127.0.0.1", server.port)
-    assert server.wait_for_client(10.0)
+def serve(pipe: Any, header: bytes, packets: list[bytes]) -> None:
+    """In a process of its own: the library's reader holds Python's lock while it connects."""
+    server = DvServer(header)
+    pipe.send(server.port)
+    assert server.wait_for_client(20.0)
     for packet in packets:
         server.send(packet)
+    pipe.recv()
+    server.close()
+
+
+@contextmanager
+def reader_of(header: bytes, packets: list[bytes]) -> Iterator[Any]:
+    import dv_processing as dv
+
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=serve, args=(theirs, header, packets), daemon=True)
+    process.start()
+    try:
+        assert ours.poll(60.0)
+        yield dv.io.NetworkReader("127.0.0.1", ours.recv())
+        ours.send("end")
+        process.join(20.0)
+    finally:
+        process.kill()
+
+
+def taken(ask: Callable[[], Any], n: int) -> list[Any]:
     found: list[Any] = []
     end = time.monotonic() + 20.0
     while sum(map(len, found)) < n:
-        batch = ask(reader)
+        batch = ask()
         if batch is not None and len(batch):
             found.append(batch)
         assert time.monotonic() < end, "not all has come within 20 s"
-    return found, reader
+    return found
 
 
 @pytest.mark.realtime
 def test_the_librarys_reader_takes_every_event() -> None:
     chunks = [chunk_of(n, seed) for seed, n in enumerate((1, 3, 100_000, 7))]
-    server = DvServer(events_header((640, 480), "here"))
-    try:
-        packets = [events_packet(chunk) for chunk in chunks]
+    packets = [events_packet(chunk) for chunk in chunks]
+    with reader_of(events_header((640, 480), "here"), packets) as reader:
 
-        def ask(reader: Any) -> Any:
+        def ask() -> Any:
             batch = reader.getNextEventBatch()
             return None if batch is None else batch.numpy()
 
-        found, reader = read_back(server, packets, ask, sum(map(len, chunks)))
+        rows = np.concatenate(taken(ask, sum(map(len, chunks))))
         assert reader.getEventResolution() == (640, 480)
-        rows = np.concatenate(found)
-        for name, column in (("timestamp", "t_us"), ("x", "x"), ("y", "y"), ("polarity", "p")):
-            expected = np.concatenate([getattr(chunk, column) for chunk in chunks])
-            assert np.array_equal(rows[name], expected)
-    finally:
-        server.close()
+    for name, column in (("timestamp", "t_us"), ("x", "x"), ("y", "y"), ("polarity", "p")):
+        expected = np.concatenate([getattr(chunk, column) for chunk in chunks])
+        assert np.array_equal(rows[name], expected)
 
 
 @pytest.mark.realtime
 def test_the_librarys_reader_takes_every_trigger() -> None:
     import dv_processing as dv
 
-    server = DvServer(triggers_header("here"))
-    try:
-        times = [np.sort(np.random.default_rng(n).integers(0, 1 << 50, n)) for n in (1, 2, 5, 64)]
-        packets = [triggers_packet(t) for t in times]
-        found, _ = read_back(server, packets, lambda reader: reader.getNextTriggerBatch(), 72)
-        triggers = [trigger for batch in found for trigger in batch]
-        assert [trigger.timestamp for trigger in triggers] == np.concatenate(times).tolist()
-        assert {trigger.type for trigger in triggers} == {
-            dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
-        }
-    finally:
-        server.close()
+    times = [np.sort(np.random.default_rng(n).integers(0, 1 << 50, n)) for n in (1, 2, 5, 64)]
+    packets = [triggers_packet(t) for t in times]
+    with reader_of(triggers_header("here"), packets) as reader:
+        found = taken(reader.getNextTriggerBatch, 72)
+        triggers = [(trigger.timestamp, trigger.type) for batch in found for trigger in batch]
+    assert [at for at, _ in triggers] == np.concatenate(times).tolist()
+    assert {kind for _, kind in triggers} == {dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE}
 
 
 def test_a_client_that_leaves_does_not_keep_the_server() -> None:
