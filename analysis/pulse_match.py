@@ -120,7 +120,7 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
         raise NoMatchError(
             "no_match", "the reference pulses span hours: stray stamps, or many trials"
         )
-    y_bins = np.zeros(int((y[-1] - y_start) / width) + 1)
+    y_bins = np.zeros(int((y[-1] - y_start) / width) + 1, np.float32)
     y_bins[((y - y_start) / width).astype(np.int64)] = 1.0
     length = _PIECE_TICKS * tick
     best: list[_Place] = []
@@ -157,7 +157,7 @@ def _spread(count: int) -> list[float]:
 
 
 def _correlate(
-    piece: Floats, y_bins: Floats, width: float, max_drift: float
+    piece: Floats, y_bins: NDArray[np.float32], width: float, max_drift: float
 ) -> tuple[list[float], list[float], float]:
     """Lags of the piece's centre from bin 0 (ns) and drifts that fit best, and the peak ratio.
 
@@ -170,15 +170,17 @@ def _correlate(
     # one step of drift moves the piece's ends by a bin
     steps = int(np.ceil(max_drift * half / width))
     drifts = np.linspace(-max_drift, max_drift, 2 * steps + 1) if steps else np.zeros(1)
-    combs = np.zeros((drifts.size, bins + 2))
+    combs = np.zeros((drifts.size, bins + 2), np.float32)
     for comb, drift in zip(combs, drifts, strict=True):
         places = np.round(piece * (1 + drift) / width).astype(np.int64) + bins // 2 + 1
         comb[places] = 1.0
     # a pulse may fall on either side of an edge: let it count in the neighbours too
     combs[:, 1:-1] += 0.5 * (combs[:, 2:] + combs[:, :-2])
-    every = fft.irfft(spectrum * np.conj(fft.rfft(combs, size)), size)
-    which = every.argmax(axis=0)
-    scores = every[which, np.arange(size)]
+    products = fft.rfft(combs, size)
+    np.multiply(spectrum, np.conj(products, out=products), out=products)
+    every = fft.irfft(products, size, overwrite_x=True)
+    # all counts are multiples of a half, which rounding finds again
+    scores = np.rint(2.0 * every.max(axis=0))
     first = float(scores.max())
     columns: list[int] = []
     second = 0.0
@@ -199,7 +201,7 @@ def _correlate(
     lags = [column if column < y_bins.size else column - size for column in columns]
     return (
         [(lag + bins // 2 + 1 + 0.5) * width for lag in lags],
-        [float(drifts[which[column]]) for column in columns],
+        [float(drifts[np.rint(2.0 * every[:, column]).argmax()]) for column in columns],
         second / first,
     )
 
