@@ -214,7 +214,8 @@ class ClockMap:
             if b:
                 q = offset // BILLION
                 gained += q * b + (offset - q * BILLION) * b // BILLION
-            gained = (gained + BILLION // 2) // BILLION
+            gained += BILLION // 2
+            gained //= BILLION
         else:
             q, r = np.divmod(offset, BILLION)
             gained, rest = np.divmod(q * b, BILLION)
