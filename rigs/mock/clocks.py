@@ -254,20 +254,27 @@ class Noise:
 
     def of(self, numbers: I64) -> F64:
         """Standard normal, cut at four, for the instants `numbers` (not negative), (n, width)."""
-        result = np.empty((len(numbers), self._width))
         if not len(numbers):
-            return result
+            return np.empty((0, self._width))
+        first, last = int(numbers.min()) // JITTER_BLOCK, int(numbers.max()) // JITTER_BLOCK
+        if first == last:
+            # a new array, for the numbers are picked by an array
+            return self._block(first)[numbers - first * JITTER_BLOCK]
+        result = np.empty((len(numbers), self._width))
         block, inside = np.divmod(numbers, JITTER_BLOCK)
-        for index in range(int(block.min()), int(block.max()) + 1):
-            if index not in self._blocks:
-                if len(self._blocks) > 1:
-                    self._blocks.pop(min(self._blocks))
-                rng = generator(self._seed, self._purpose, index)
-                draw = rng.standard_normal((JITTER_BLOCK, self._width))
-                self._blocks[index] = np.clip(draw, -4.0, 4.0)
+        for index in range(first, last + 1):
             here = block == index
-            result[here] = self._blocks[index][inside[here]]
+            result[here] = self._block(index)[inside[here]]
         return result
+
+    def _block(self, index: int) -> F64:
+        if index not in self._blocks:
+            if len(self._blocks) > 1:
+                self._blocks.pop(min(self._blocks))
+            rng = generator(self._seed, self._purpose, index)
+            draw = rng.standard_normal((JITTER_BLOCK, self._width))
+            self._blocks[index] = np.clip(draw, -4.0, 4.0)
+        return self._blocks[index]
 
 
 class Jitter:

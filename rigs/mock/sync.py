@@ -131,7 +131,7 @@ class MockSyncBox:
         if self.rate_hz == 0.0:
             return 0
         box = undisturbed(self.clock).to_reference(true_ns)
-        guess = max(int(box * self.rate_hz / 1e9) - 1, 0)
+        guess = max(int(box * self.rate_hz / 1e9) + 1, 0)
         while guess and self._true_of(guess - 1) >= true_ns:
             guess -= 1
         while self._true_of(guess) < true_ns:
