@@ -95,6 +95,25 @@ def _chunk(name: str) -> int:
     return EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
 
 
+def open_inside(file: Any, name: str) -> Any:
+    """A dataset of an open `h5py.File` that keeps its values in that file.
+
+    Raises:
+        KeyError: there is none of this name.
+        ValueError: it is a link, or its values are in another file.
+    """
+    at = ""
+    for part in name.split("/"):
+        at = f"{at}/{part}"
+        if file.id.links.get_info(at.encode()).type != h5py.h5l.TYPE_HARD:
+            raise ValueError(f"{file.filename}: {name} points out of the file")
+    data = file[name]
+    kept = data.id.get_create_plist()
+    if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
+        raise ValueError(f"{file.filename}: {name} points out of the file")
+    return data
+
+
 class Column:
     """A dataset that grows at its end.
 

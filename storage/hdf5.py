@@ -14,7 +14,20 @@ from typing import Any
 import h5py
 import numpy as np
 
-from storage.columns import COLUMNS, INDEX, OFFSET, TIMING, TRACKS, Array, Column, blank, create
+from storage.columns import (
+    COLUMNS,
+    FORMAT,
+    INDEX,
+    OFFSET,
+    TIMING,
+    TRACKS,
+    Array,
+    Column,
+    blank,
+    create,
+    open_inside,
+)
+from storage.errors import StoreError
 from storage.streams import I64, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 
 _READS = ("t", "before", "after")
@@ -144,10 +157,22 @@ class StreamFile:
 
 
 class StreamReader:
-    """A trial's HDF5 file opened for reading; a context manager."""
+    """A trial's HDF5 file opened for reading; a context manager.
+
+    Raises:
+        StoreError: it was written by a newer version.
+        ValueError: a column points out of the file.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = h5py.File(path, "r")
+        found = int(self._file.attrs.get("format", 1))
+        if found > FORMAT:
+            self._file.close()
+            raise StoreError(
+                f"{path}: format = {found}: was written by a newer version of SlipLab; this one "
+                f"reads formats up to {FORMAT}: update it"
+            )
         self._opened: dict[str, Any] = {}
         self.t_offset_us = int(self._file[OFFSET][()])
 
@@ -165,7 +190,7 @@ class StreamReader:
     def _data(self, name: str) -> Any:
         """A column, opened once."""
         if name not in self._opened:
-            self._opened[name] = self._file[name]
+            self._opened[name] = open_inside(self._file, name)
         return self._opened[name]
 
     def event_times(self) -> I64:

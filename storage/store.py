@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.errors import StoreError
+from storage.errors import StoreError, disk_explained
 from storage.files import (
     json_text,
     make_folder,
@@ -35,7 +35,7 @@ from storage.files import (
 from storage.recording import Recording
 from storage.streams import Json
 from storage.whole import partial, write_sums
-from storage.writer import PROVENANCE, TrialWriter
+from storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
 
 __all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError", "safe_name"]
 
@@ -47,6 +47,10 @@ INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
+
+
+def _holds(path: Path, data: bytes) -> bool:
+    return path.is_file() and not path.is_symlink() and path.read_bytes() == data
 
 
 def safe_name(name: str) -> str:
@@ -103,7 +107,8 @@ class Campaign:
     def update(self, info: Json, protocol_text: str, rig_text: str) -> None:
         """Write the campaign's description and its copies of protocol and rig file.
 
-        Only what changed is written.
+        Only what changed is written. While it is, there are no checksums: a description without
+        them was interrupted, one that does not match them is damaged.
         """
         for name in ("trials", "incoming", "quarantine", "bench"):
             make_folder(self._inside(self.folder / name))
@@ -111,10 +116,16 @@ class Campaign:
         for folder in (self.folder.parent.parent, self.folder.parent, self.folder):
             sync_folder(folder)
         texts = {PROTOCOL: protocol_text, RIG: rig_text, INFO: json_text(info)}
-        for name, text in texts.items():
-            path = self.folder / name
-            if not path.is_file() or path.read_bytes() != text.encode():
-                write_bytes(path, text.encode())
+        changed = [
+            (self.folder / name, text.encode())
+            for name, text in texts.items()
+            if not _holds(self.folder / name, text.encode())
+        ]
+        if changed:
+            (self.folder / CHECKSUMS).unlink(missing_ok=True)
+            sync_folder(self.folder)
+        for path, data in changed:
+            write_bytes(path, data)
         write_sums(self.folder, tuple(texts))
 
     def committed(self) -> set[str]:
@@ -295,15 +306,16 @@ class Store:
         """The store in `folder`, made if there is none.
 
         Raises:
-            StoreError: the folder holds something else.
+            StoreError: the folder holds something else, or nothing can be written there.
         """
         if not (folder / STORE).exists():
             if folder.exists() and not folder.is_dir():
                 raise StoreError(f"{folder}: is a file; give a folder for the store")
             if folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir()):
                 raise StoreError(f"{folder}: holds other files; give an empty folder or a store")
-            make_folder(folder)
-            write_json(folder / STORE, {"format": FORMAT})
+            with disk_explained(folder):
+                make_folder(folder)
+                write_json(folder / STORE, {"format": FORMAT})
         return Store.open(folder)
 
     def campaign(self, name: str) -> Campaign:

@@ -136,7 +136,10 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
             found.append(problem(folder / name, "is missing, or no folder"))
     names = (PROTOCOL, RIG, INFO)
     sums: Json = {}
-    if store.format > 1:
+    if store.format > 1 and not (folder / CHECKSUMS).exists():
+        what = "is missing; the next `sliplab collect` writes it"
+        found.append(problem(folder / CHECKSUMS, what, UNFINISHED))
+    elif store.format > 1:
         try:
             sums = read_sums(folder, names)
         except ValueError as error:
@@ -151,8 +154,8 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
         except (OSError, ValueError, StoreError, InputError) as error:
             found.append(problem(path, f"cannot be read: {error}"))
             continue
-        if name in sums and (what := byte_problem(path, sums[name])) is not None:
-            found.append(problem(path, f"{what}; `sliplab collect` writes it again"))
+        if name in sums and (wrong := byte_problem(path, sums[name])) is not None:
+            found.append(problem(path, f"{wrong}; `sliplab collect` writes it again"))
     return found + [
         Problem(item.path, item.what, item.kind, campaign.name)
         for place in (folder, folder / "bench")

@@ -28,7 +28,7 @@ def protocol(trials: int, video: bool = False) -> dict[str, Any]:
     collection["factors"]["depth"]["values"] = [2.4]
     collection["factors"]["speed"]["values"] = [1.6]
     collection["factors"]["direction"]["values"] = [
-        round(360 / trials * number, 3) for number in range(trials)
+        round(137.508 * number % 360, 2) for number in range(trials)
     ]
     collection["motion"][3]["distance"] = "1.6 mm"
     collection["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
@@ -87,8 +87,14 @@ def wrong(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
     return found
 
 
-def wrong_at_the_end(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
-    """What is not as it must be once the campaign went to its end."""
+def wrong_at_the_end(
+    store: Path, whole: dict[str, dict[str, str]], also: str = "interrupted"
+) -> list[str]:
+    """What is not as it must be once the campaign went to its end.
+
+    Args:
+        also: how another cause may begin for which something is in quarantine.
+    """
     found = wrong(store, whole)
     there = hashes(store)
     found += [f"{name}: is missing" for name in sorted(whole.keys() - there.keys())]
@@ -103,6 +109,6 @@ def wrong_at_the_end(store: Path, whole: dict[str, dict[str, str]]) -> list[str]
     found += [f"{path}: is litter" for path in (campaign / "incoming").iterdir()]
     for path in (campaign / "quarantine").iterdir():
         cause = str(read_json(path / "cause.json").get("cause", ""))
-        if cause != "interrupted" and not cause.startswith("gate: "):
+        if not cause.startswith(("interrupted", "gate: ", also)):
             found.append(f"{path}: is in quarantine for '{cause}'")
     return found
