@@ -201,7 +201,7 @@ class StreamReader:
 
     def _times(self, low: int, high: int) -> I64:
         """Times of some events on the camera's clock, us."""
-        return np.add(self._file.rows(TIMES).read(low, high), self.t_offset_us, dtype=np.int64)
+        return self._file.rows(TIMES).added(low, high, self.t_offset_us)
 
     def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
         """Events with start <= t < end on the camera's clock; all by default.
@@ -221,8 +221,9 @@ class StreamReader:
         last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
         last = max(first, last)
         low, high = low + first, low + last
-        columns = (rows.read(low, high) for rows in (x, y, p))
-        return EventChunk(*columns, times[first:last])
+        return EventChunk(
+            x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
+        )
 
     def pulses(self, group: str) -> I64:
         """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.

@@ -16,12 +16,19 @@ import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 
 from storage.columns import Array
+from storage.streams import I64
+
+_BLOCK = 1 << 15
+_CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
+"""Of unpacked chunks, a column. A chunk of events fits; more than the processor's own cache holds
+would make every chunk go through main memory."""
 
 
 @cache
 def _access() -> Any:
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)  # as h5py does: columns close with their file
+    access.set_cache(0, _CACHE_SLOTS, _CACHE_BYTES, 0.75)
     return access
 
 
@@ -107,8 +114,27 @@ class Rows:
         high = min(len(self) if high is None else high, len(self))
         low = min(low, high)
         values = np.empty((high - low, *self.shape[1:]), self._dtype)
+        self._read(low, values)
+        return values
+
+    def _read(self, low: int, values: Array) -> None:
+        """Fill `values` from row `low` on."""
         if values.size:
             place = self._data.get_space()
             place.select_hyperslab((low, *(0 for _ in self.shape[1:])), values.shape)
             self._data.read(h5py.h5s.create_simple(values.shape), place, values)
+
+    def added(self, low: int, high: int, amount: int) -> I64:
+        """Rows low to high of a column of integers, as int64, with `amount` added to each.
+
+        Narrower rows are read into the end of the result and widened from its beginning, block by
+        block: fresh memory costs as much as unpacking what goes into it.
+        """
+        values = np.empty(high - low, np.int64)
+        narrow = values.view(self._dtype)[-len(values) :] if len(values) else values
+        self._read(low, narrow)
+        for start in range(0, len(values), _BLOCK):
+            block = values[start : start + _BLOCK]
+            block[...] = narrow[start : start + _BLOCK]  # never reaches rows that are still to come
+            block += amount
         return values
