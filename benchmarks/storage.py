@@ -1,45 +1,46 @@
-"""Writing and reading a trial, beside the lab's way: lists of times, one a pixel, pickled.
+"""Writing and reading a trial, beside other files for events (`benchmarks/event_files.py`).
 
-The pickles are given every advantage: their lists are made before the clock runs, reading them
-stops at the lists, and they keep neither polarity nor microseconds.
+Events go through one core, frames through two. A window is 30 ms in the middle of the file, which
+is opened for it anew; its figure is of the window alone for ours and a rival alike.
 """
 
 from __future__ import annotations
 
-import pickle
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.event_files import rivals
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, spread
 from benchmarks.slides import many_events
 from rigs.scene.frames import FrameOptics, PlateView
 from rigs.scene.randomness import generator
 from storage.hdf5 import StreamFile, StreamReader
 from storage.streams import U8, EventChunk
-from storage.video import VideoWriter
+from storage.video import VideoWriter, read_frames
 
-WIDTH, HEIGHT = 640, 480
 CHUNK = 20_000
 WINDOW_US = 30_000
-Lists = list[list[list[int]]]
 
 
 def measure(
     events: int = 3_000_000, frames: int = 250, size: int = 800, runs: int = RUNS
 ) -> Figures:
-    """Events through HDF5 and pickles on one core, frames through FFV1 on two."""
+    """Events through HDF5 and its rivals on one core, frames through FFV1 on two."""
     with tempfile.TemporaryDirectory() as folder:
         return _events(Path(folder), events, runs) | _frames(Path(folder), frames, size, runs)
 
 
 def _events(folder: Path, count: int, runs: int) -> Figures:
     data = many_events(count)
-    lists = _lists(data)
-    hdf5, pickled = folder / "data.h5", folder / "data.pickle"
+    others = rivals(folder, data)
+    hdf5 = folder / "data.h5"
     first, last = int(data.t_us[0]), int(data.t_us[-1])
     starts = np.linspace(first, last - WINDOW_US, 20).astype(np.int64).tolist()
+    middle = starts[10]
 
     def write() -> None:
         file = StreamFile(hdf5)
@@ -57,55 +58,24 @@ def _events(folder: Path, count: int, runs: int) -> Figures:
             with StreamReader(hdf5) as reader:
                 reader.events(start, start + WINDOW_US)
 
-    def pickle_write() -> None:
-        with pickled.open("wb") as file:
-            pickle.dump(lists, file, protocol=pickle.HIGHEST_PROTOCOL)
-
-    def pickle_read() -> Lists:
-        with pickled.open("rb") as file:
-            loaded: Lists = pickle.load(file)
-        return loaded
-
-    def pickle_window() -> list[tuple[int, int, int]]:
-        low, high = (starts[10] - first) // 1000, (starts[10] - first + WINDOW_US) // 1000
-        return [
-            (x, y, t)
-            for y, row in enumerate(pickle_read())
-            for x, times in enumerate(row)
-            for t in times
-            if low <= t < high
-        ]
-
+    work: dict[str, Callable[[], object]] = {"write": write, "read": read, "window": windows}
+    for name, other in others.items():
+        work[f"{name}_write"], work[f"{name}_read"] = other.write, other.read
+        work[f"{name}_window"] = partial(other.window, middle, middle + WINDOW_US)
     with one_core():
-        taken = alternate(
-            runs, write=write, pickle_write=pickle_write, read=read, pickle_read=pickle_read,
-            window=windows, pickle_window=pickle_window,
-        )  # fmt: skip
+        taken = alternate(runs, **work)
     back = read()
     for column in ("x", "y", "p", "t_us"):
         if not np.array_equal(getattr(back, column), getattr(data, column)):
             raise RuntimeError(f"{column} came back otherwise than it was written")
-    millions = count / 1e6
-    each = [value * 1e3 / len(starts) for value in taken["window"]]
-    return {
-        **rate("write_m_events_per_s", millions, taken["write"]),
-        **rate("read_m_events_per_s", millions, taken["read"]),
-        **spread("window_30ms_ms", each),
-        "bytes_per_event": hdf5.stat().st_size / count,
-        **rate("pickle_write_m_events_per_s", millions, taken["pickle_write"]),
-        **rate("pickle_read_m_events_per_s", millions, taken["pickle_read"]),
-        **spread("pickle_window_30ms_ms", [value * 1e3 for value in taken["pickle_window"]]),
-        "pickle_bytes_per_event": pickled.stat().st_size / count,
-    }
-
-
-def _lists(data: EventChunk) -> Lists:
-    """Whole milliseconds since the first event, a list a pixel."""
-    lists: Lists = [[[] for _ in range(WIDTH)] for _ in range(HEIGHT)]
-    ms = ((data.t_us - data.t_us[0]) // 1000).tolist()
-    for x, y, t in zip(data.x.tolist(), data.y.tolist(), ms, strict=True):
-        lists[y][x].append(t)
-    return lists
+    taken["window"] = [value / len(starts) for value in taken["window"]]
+    figures: Figures = {}
+    for name, path in {"": hdf5, **{f"{n}_": other.path for n, other in others.items()}}.items():
+        for what in ("write", "read"):
+            figures |= rate(f"{name}{what}_m_events_per_s", count / 1e6, taken[name + what])
+        figures |= spread(f"{name}window_30ms_ms", [v * 1e3 for v in taken[f"{name}window"]])
+        figures[f"{name}bytes_per_event"] = path.stat().st_size / count
+    return figures
 
 
 def noisy_frames(count: int, size: int, noise: float) -> U8:
@@ -135,6 +105,9 @@ def _frames(folder: Path, count: int, size: int, runs: int) -> Figures:
         video.close()
 
     taken = alternate(runs, encode=encode)["encode"]
+    for number, image in enumerate(read_frames(path, threads=2)):
+        if not np.array_equal(image, images[number % len(images)]):
+            raise RuntimeError(f"frame {number} came back otherwise than it was written")
     pixels = count * size * size
     return {
         **rate("frames_per_s_800", count, taken),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from pathlib import Path
 
 import typer
 from typer.exceptions import TyperException
@@ -10,6 +12,7 @@ from typer.exceptions import TyperException
 from flows import console, stopping
 from flows.cli import app
 from protocols.errors import InputError
+from storage.errors import disk_error
 
 
 def main() -> None:
@@ -48,6 +51,13 @@ def _explain(error: Exception) -> int:
     if isinstance(error, TyperException):
         console.say(f"error: {error.format_message()} (see --help)")
         return console.WRONG_INPUT
+    if (
+        isinstance(error, OSError)
+        and error.filename
+        and (said := disk_error(Path(os.fsdecode(error.filename)), error))
+    ):
+        console.say(f"error: {said}")
+        return console.FAILED
     expected = {"StoreError", "RigError", "ArmFault", "Locked"}
     if type(error).__name__ not in expected:
         console.messages.print_exception(max_frames=8)

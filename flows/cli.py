@@ -256,7 +256,10 @@ def trials(
     from storage.catalogue import catalogue, query
     from storage.store import Store
 
-    table = catalogue(Store.open(store))
+    unreadable: list[str] = []
+    table = catalogue(Store.open(store), unreadable)
+    for problem in unreadable:
+        console.say(f"left out: {problem}")
     if where is not None:
         try:
             table = query(table, where)
@@ -277,7 +280,11 @@ def trials(
         import json
 
         console.print_json(
-            {"count": len(table), "trials": json.loads(table.to_json(orient="records"))}
+            {
+                "count": len(table),
+                "trials": json.loads(table.to_json(orient="records")),
+                "unreadable": unreadable,
+            }
         )
     elif output is None:
         shown = [name for name in SHOWN if name in table.columns]
@@ -287,18 +294,42 @@ def trials(
 
 
 @app.command()
-def verify(store: StoreArgument, as_json: JsonOption = False) -> None:
-    """Check every checksum, count and clock of a store; changes nothing."""
+def verify(
+    store: StoreArgument,
+    quarantine: Annotated[
+        bool,
+        typer.Option("--quarantine", help="Set damaged trials aside, to be taken again."),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check every checksum, count and clock of a store; changes nothing unless told to."""
     from storage.store import Store
+    from storage.verify import set_aside, trial_folders
     from storage.verify import verify as look
 
     opened = Store.open(store)
-    total = sum(len(campaign.committed()) for campaign in opened.campaigns())
+    total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     with console.bar("verify (trials)", total) as bar:
         problems = look(opened, lambda name: bar.advance(1, name))
+    moved: list[str] = []
+    if quarantine and any(item.trial for item in problems):
+        from flows.stretch import owned
+
+        with owned(opened):
+            moved = set_aside(opened, problems)
+        console.say(f"{len(moved)} damaged trials are in quarantine; `sliplab collect` takes them")
     if as_json:
+        damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
         console.print_json(
-            {"trials": total, "ok": not problems, "problems": [vars(item) for item in problems]}
+            {
+                "trials": total,
+                "whole": total - damaged,
+                "damaged": damaged,
+                "format": opened.format,
+                "ok": not problems,
+                "problems": [vars(item) for item in problems],
+                "quarantined": moved,
+            }
         )
     elif problems:
         rows = [[item.path, item.what] for item in problems]
@@ -307,6 +338,33 @@ def verify(store: StoreArgument, as_json: JsonOption = False) -> None:
         console.results.print(f"{total} trials, all as they were committed")
     if problems:
         raise typer.Exit(console.FAILED)
+
+
+@app.command()
+def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
+    """Bring a store of an older version to this one's format; copies of what changes are kept.
+
+    `collect` does the same before it begins.
+    """
+    from storage.errors import disk_explained
+    from storage.lock import exclusive
+    from storage.migrate import kept
+    from storage.migrate import migrate as bring
+    from storage.store import Store
+
+    opened = Store.open(store)
+    with (
+        disk_explained(opened.folder),
+        exclusive(opened.folder / ".lock", f"the store {opened.folder}"),
+    ):
+        passed = bring(opened)
+    copies = [str(kept(opened, number)) for number in passed]
+    if as_json:
+        console.print_json({"format": opened.format, "from": passed, "copies": copies})
+    elif passed:
+        console.results.print(f"format {passed[0]} to {opened.format}; copies: {copies}")
+    else:
+        console.results.print(f"nothing to do: format {opened.format} is the newest")
 
 
 @app.command()

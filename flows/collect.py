@@ -6,8 +6,6 @@ real rig, a task a batch on a mock rig (where a trial takes less time than a tas
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from datetime import UTC, datetime
 from typing import Any
 
 from prefect import flow, task
@@ -15,18 +13,11 @@ from prefect.cache_policies import NO_CACHE
 
 from flows import console, stopping
 from flows.orchestration import Parcel, run
-from flows.orders import (
-    Order,
-    campaign_counts,
-    check_disk,
-    describe_campaign,
-    pending_trials,
-)
+from flows.orders import Order, campaign_counts, check_disk, pending_trials
 from flows.session import Session
+from flows.stretch import refresh, stretch
 from flows.timing import timed
 from protocols import Trial
-from rigs.build import build_rig
-from storage.lock import exclusive
 from storage.store import Store
 
 MOCK_BATCH = 25
@@ -43,51 +34,22 @@ def take_trials(session: Parcel[Session], trials: Parcel[list[Trial]]) -> int:
 def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
     """Take the trials of an order that its store lacks."""
     wanted = order.content
-    store = Store.create(wanted.store)
-    with (
-        exclusive(store.folder / ".lock", f"the store {store.folder}"),
-        timed(store, f"collect {wanted.campaign}"),
-    ):
-        campaign = describe_campaign(store, wanted)
-        campaign.sweep()
-        rig = build_rig(wanted.rig)
-        rig.should_stop = stopping.requested
-        session = Session(wanted.plan, wanted.rig, rig, campaign, wanted.bench.operator)
-        pending = pending_trials(wanted.plan, campaign)
-        trials = wanted.wanted(campaign)
-        campaign.add_bench_record(_bench_record(wanted))
+    with stretch(wanted) as work, timed(Store(wanted.store), f"collect {wanted.campaign}"):
+        session, trials = work.session, work.trials
         simulated = "simulated " if wanted.rig.simulated else ""
         with console.bar(f"collect {wanted.campaign} ({simulated}trials)", len(trials)) as bar:
             session.on_trial = lambda trial, outcome: bar.advance(1, f"{trial.id} {outcome}")
-            try:
-                with stopping.signals():  # Prefect has handlers of its own inside a flow
-                    rig.connect()
-                    size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
-                    for start in range(0, len(trials), size):
-                        take_trials(Parcel(session), Parcel(trials[start : start + size]))
-            finally:
-                rig.close()
+            with stopping.signals():  # Prefect has handlers of its own inside a flow
+                session.rig.connect()
+                size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
+                for start in range(0, len(trials), size):
+                    take_trials(Parcel(session), Parcel(trials[start : start + size]))
         return {
-            **campaign_counts(wanted, campaign),
+            **campaign_counts(wanted, session.campaign),
             "taken": session.taken,
             "retaken": session.retaken,
-            "left_out": len(pending) - len(trials),
+            "left_out": work.left_out,
         }
-
-
-def _bench_record(order: Order) -> dict[str, Any]:
-    """One stretch of work at the rig."""
-    began = datetime.now(UTC)
-    skin = order.rig.skin
-    return {
-        "began": began.isoformat(timespec="seconds"),
-        **asdict(order.bench),
-        "rig": order.rig.name,
-        "sensor": order.rig.sensor,
-        "skin": skin.serial,
-        "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
-        "simulated": order.rig.simulated,
-    }
 
 
 def collect(order: Order) -> dict[str, Any]:
@@ -96,5 +58,4 @@ def collect(order: Order) -> dict[str, Any]:
     if pending_trials(order.plan, store.campaign(order.campaign)):
         check_disk([order])
         return run(collect_flow, Parcel(order))
-    campaign = describe_campaign(store, order)
-    return {**campaign_counts(order, campaign), "taken": 0, "retaken": 0, "left_out": 0}
+    return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

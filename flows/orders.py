@@ -71,7 +71,7 @@ def make_order(
     begun = None
     if (store / "store.json").exists():
         found = Store.open(store).campaign(name)
-        begun = found if (found.folder / "campaign.json").exists() else None
+        begun = found if found.begun else None
     # one campaign, one physics: a level of a factor that is added later must not change it
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)

@@ -22,12 +22,12 @@ from protocols.hashing import hash_integer
 from rigs.capabilities import RigError
 from rigs.rig import Rig, StopRequested, TrialRun
 from rigs.rig_file import RigFile
-from storage.files import disk_full
-from storage.store import Campaign, StoreError
+from storage.errors import disk_explained
+from storage.recording import RECORD_FORMAT
+from storage.store import Campaign
 from storage.streams import Json
 from storage.writer import TrialWriter
 
-RECORD_FORMAT = 1
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
 
@@ -52,10 +52,16 @@ class Session:
     _zero_slot: int | None = None
 
     def take(self, trials: list[Trial]) -> None:
-        """Take `trials`, with what has to be done before each."""
+        """Take `trials`, with what has to be done before each.
+
+        Raises:
+            RigError: a device failed, or a person did not do what was asked.
+            StoreError: the store's disk is full, read-only or failing.
+        """
         for trial in trials:
             self._prepare(trial)
-            self._take(trial)
+            with disk_explained(self.campaign.folder, RigError):
+                self._take(trial)
             self._before = trial
 
     def _prepare(self, trial: Trial) -> None:
@@ -132,7 +138,7 @@ class Session:
             if found.passed:
                 try:
                     writer.commit(self._record(trial, attempt, run, found, frame_px), provenance)
-                except OSError as error:
+                except (OSError, RuntimeError) as error:
                     self._abandon(writer, error)
                     raise
                 self.on_trial(trial, "committed")
@@ -148,21 +154,12 @@ class Session:
         """Put what there is of a trial aside, with its cause, if that can be written at all.
 
         What cannot be moved now is found and put aside when the campaign goes on.
-
-        Raises:
-            StoreError: the disk is full, instead of `error`.
         """
         with suppress(OSError, RuntimeError):
             writer.abandon()
         with suppress(OSError):
             if writer.folder.exists():
                 self.campaign.quarantine(writer.folder, _cause(error))
-        if disk_full(error):
-            free = shutil.disk_usage(self.campaign.folder).free
-            raise StoreError(
-                f"{self.campaign.folder}: its disk is full ({free / 1e9:.1f} GB free): make room, "
-                "then run the same command to go on; every committed trial is kept"
-            ) from error
 
     def _reject(
         self,

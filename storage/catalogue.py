@@ -6,38 +6,55 @@ from typing import Any
 
 import pandas as pd
 
-from storage.store import Store
+from storage.recording import Recording
+from storage.store import Store, StoreError
 
 
-def catalogue(store: Store) -> pd.DataFrame:
+def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
     """One row a committed trial: campaign, id, condition, counts, quality.
 
     Conditions become columns by factor; levels with a unit are numbers, the unit stands in the
     column's name (``depth_mm``), a slash in it as ``_per_``.
+
+    Args:
+        unreadable: gets a line for every trial that is damaged; without it, one is an error.
+
+    Raises:
+        StoreError: a trial is damaged.
     """
     rows: list[dict[str, Any]] = []
     for campaign in store.campaigns():
+        if unreadable is not None:
+            unreadable += [f"{trial}: {why}" for trial, why in campaign.damaged().items()]
         for recording in campaign.recordings():
-            record = recording.record
-            row: dict[str, Any] = {
-                "campaign": campaign.name,
-                "trial": record["trial"],
-                "experiment": record["experiment"],
-                "role": record["role"],
-                "repetition": record["repetition"],
-                "block": record["block"],
-                "attempt": record["attempt"],
-                "simulated": record["simulated"],
-                "recorded_s": record["recorded_s"],
-                "events": record["counts"]["events"],
-                "frames": record["counts"]["frames"],
-                "frame_source": recording.frame_source,
-                "sync_uncertainty_us": recording.clocks["events"]["uncertainty_ns"] / 1000,
-                "passed": record["quality"]["passed"],
-            }
-            row.update(_condition(record["condition"]))
-            rows.append(row)
+            try:
+                rows.append(_row(campaign.name, recording))
+            except StoreError as error:
+                if unreadable is None:
+                    raise
+                unreadable.append(str(error))
     return pd.DataFrame(rows)
+
+
+def _row(campaign: str, recording: Recording) -> dict[str, Any]:
+    record = recording.record
+    return {
+        "campaign": campaign,
+        "trial": record["trial"],
+        "experiment": record["experiment"],
+        "role": record["role"],
+        "repetition": record["repetition"],
+        "block": record["block"],
+        "attempt": record["attempt"],
+        "simulated": record["simulated"],
+        "recorded_s": record["recorded_s"],
+        "events": record["counts"]["events"],
+        "frames": record["counts"]["frames"],
+        "frame_source": recording.frame_source,
+        "sync_uncertainty_us": recording.clocks["events"]["uncertainty_ns"] / 1000,
+        "passed": record["quality"]["passed"],
+        **_condition(record["condition"]),
+    }
 
 
 def _condition(condition: dict[str, str]) -> dict[str, Any]:

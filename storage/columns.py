@@ -3,6 +3,9 @@
 A trial has more columns than it has chunks in most of them, so that making, opening and resizing
 them costs more than their data. So every file begins as a copy of one that has all columns and no
 rows, and rows wait in memory until they are whole chunks.
+
+Format 2 differs from 1 in how events are kept: LZ4 instead of zstd, and times after the offset in
+32 bits (docs/decisions/0020). A reader need not know which it has.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ Array = npt.NDArray[Any]
 Kind = tuple[str, tuple[int, ...], str]
 """Type, shape of a row, unit."""
 
-FORMAT = 1
+FORMAT = 2
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
@@ -30,7 +33,7 @@ COLUMNS: dict[str, Kind] = {
     "events/x": ("uint16", (), "px"),
     "events/y": ("uint16", (), "px"),
     "events/p": ("uint8", (), "1 brighter, 0 darker"),
-    "events/t": ("int64", (), "us of the event camera's clock after t_offset"),
+    "events/t": ("uint32", (), "us of the event camera's clock after t_offset"),
     "event_pulses/t": ("int64", (), "ns of the event camera's clock"),
     "arm_pulses/t": ("int64", (), "ns of the arm controller's clock"),
     "sync_pulses/t": ("int64", (), "ns of the sync box's clock: the trial's time line"),
@@ -58,9 +61,15 @@ TIMING: dict[str, Kind] = {
     "frame_camera_reads/before": ("int64", (), "ns of the host's monotonic clock"),
     "frame_camera_reads/after": ("int64", (), "ns of the host's monotonic clock"),
 }
+TIMES = "events/t"
+WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
+"""The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
 INDEX, OFFSET = "ms_to_idx", "t_offset"
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
-_PACKED = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
+_SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
+_EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")
+# whole bytes: the lowest one of a time is noise, the highest ones are all but constant
+_TIMES = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
 
 
 @cache
@@ -86,9 +95,15 @@ def create(file: Any, name: str, kind: Kind) -> None:
         dtype,
         maxshape=(None, *shape),
         chunks=(_chunk(name), *shape),
-        **_PACKED,
+        **_filter(name),
     )
     data.attrs["unit"] = unit
+
+
+def _filter(name: str) -> Any:
+    if name.startswith(TIMES):
+        return _TIMES
+    return _EVENTS if name.startswith("events/") else _SMALL
 
 
 def _chunk(name: str) -> int:
@@ -138,3 +153,17 @@ class Column:
         place.select_hyperslab((self._written, *(0 for _ in self.shape)), rows.shape)
         self._data.write(h5py.h5s.create_simple(rows.shape), place, rows)
         self._written, self._waiting = end, 0
+
+    def widened(self, file: Any, name: str, kind: Kind) -> Column:
+        """The same rows as another type, in place of the dataset `name`."""
+        self.flush()
+        wider = f"{name}64"
+        create(file, wider, kind)
+        column = Column(file, wider)
+        old = file[name]
+        for start in range(0, self._written, EVENT_CHUNK):
+            column.append(old[start : start + EVENT_CHUNK])
+        column.flush()
+        del file[name]
+        file.move(wider, name)
+        return column

@@ -3,6 +3,9 @@
 Every write in the project goes through here: a temporary file beside the target, flushed to the
 disk, then renamed over it, then the folder flushed too. In a folder that is still aside and becomes
 visible by a rename of its own, files are only flushed.
+
+A killed program may leave a temporary file. Its name says whose it is (`.NAME.PID.tmp`), so that
+`sweep_temporary` takes away what nobody will finish.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ import errno
 import hashlib
 import json
 import os
+import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,13 +23,43 @@ from typing import Any
 _BLOCK = 1 << 20
 
 
+_TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
+_NAME_BYTES = 200
+"""Of a target's name in that of its temporary file; a file's name has at most 255 bytes."""
+_FAULTS = {
+    errno.ENOSPC: "is full",
+    errno.EDQUOT: "has no room left for this user (quota)",
+    errno.EFBIG: "takes no larger file",
+    errno.EROFS: "is read-only",
+    errno.EACCES: "may not be written to by this user",
+    errno.EPERM: "may not be written to by this user",
+    errno.EIO: "reports errors; it may be failing",
+    errno.ENXIO: "is gone",
+    errno.ENODEV: "is gone",
+    errno.ESTALE: "is gone",
+}
+_IN_WORDS = re.compile(r"errno = (\d+)")
+
+
+def disk_fault(error: BaseException | None) -> str | None:
+    """What is the matter with the disk if `error`, or what caused it, says so: ``is full``.
+
+    HDF5 tells some of it in words only.
+    """
+    while error is not None:
+        number = error.errno if isinstance(error, OSError) else None
+        if number is None and (told := _IN_WORDS.search(str(error))):
+            number = int(told[1])
+        if number in _FAULTS:
+            return _FAULTS[number]
+        hidden = error.__suppress_context__
+        error = error.__cause__ or (None if hidden else error.__context__)
+    return None
+
+
 def disk_full(error: BaseException | None) -> bool:
     """Whether `error`, or what caused it, is a disk or a quota without room."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            return True
-        error = error.__cause__
-    return False
+    return disk_fault(error) in {_FAULTS[errno.ENOSPC], _FAULTS[errno.EDQUOT]}
 
 
 def sync_folder(folder: Path) -> None:
@@ -45,9 +80,20 @@ def sync_file(path: Path) -> None:
         os.close(handle)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and what is missing above it, and flush each one's entry to the disk."""
+    missing = [folder]
+    while not missing[-1].parent.is_dir():
+        missing.append(missing[-1].parent)
+    for path in reversed(missing):
+        path.mkdir(exist_ok=True)
+        sync_folder(path.parent)
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write `path` atomically; its folder must exist."""
-    temporary = path.with_name(f".{path.name}.tmp")
+    name = os.fsencode(path.name)[:_NAME_BYTES].decode(errors="ignore")
+    temporary = path.with_name(f".{name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as handle:
             handle.write(data)
@@ -58,6 +104,35 @@ def write_bytes(path: Path, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
+
+
+def temporary_files(folder: Path) -> Iterator[tuple[Path, bool]]:
+    """Temporary files in a folder, and whether the program that began each still runs."""
+    if not folder.is_dir():
+        return
+    for path in sorted(folder.iterdir()):
+        if (found := _TEMPORARY.fullmatch(path.name)) and path.is_file():
+            yield path, _runs(int(found[1]))
+
+
+def sweep_temporary(folder: Path) -> int:
+    """Delete temporary files that a killed program left in a folder; returns how many."""
+    left = [path for path, runs in temporary_files(folder) if not runs]
+    for path in left:
+        path.unlink(missing_ok=True)
+    return len(left)
+
+
+def _runs(pid: int) -> bool:
+    if pid == os.getpid():
+        return False  # asked between two writes of ours: it is of another with this number
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
 
 
 def write_text(path: Path, text: str) -> None:
@@ -71,7 +146,7 @@ def write_json(path: Path, data: Any) -> None:
     Raises:
         ValueError: a NaN or an infinity, which JSON has no word for.
     """
-    write_text(path, _json_text(data))
+    write_text(path, json_text(data))
 
 
 def write_json_aside(path: Path, data: Any) -> None:
@@ -83,12 +158,17 @@ def write_json_aside(path: Path, data: Any) -> None:
         ValueError: as `write_json`.
     """
     with path.open("wb") as handle:
-        handle.write(_json_text(data).encode())
+        handle.write(json_text(data).encode())
         handle.flush()
         os.fsync(handle.fileno())
 
 
-def _json_text(data: Any) -> str:
+def json_text(data: Any) -> str:
+    """How JSON is written: keys sorted, one a line.
+
+    Raises:
+        ValueError: as `write_json`.
+    """
     return _indented(data, 0) + "\n"
 
 
@@ -129,7 +209,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
     if not isinstance(data, dict):
         raise ValueError(f"{path}: holds no JSON object")

@@ -9,14 +9,29 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import h5py
 import numpy as np
 
-from storage.columns import COLUMNS, INDEX, OFFSET, TIMING, TRACKS, Array, Column, blank, create
+from storage.columns import (
+    COLUMNS,
+    FORMAT,
+    INDEX,
+    OFFSET,
+    TIMES,
+    TIMING,
+    TRACKS,
+    WIDE,
+    Array,
+    Column,
+    blank,
+    create,
+)
+from storage.errors import StoreError
+from storage.rows import RowFile, Rows
 from storage.streams import I64, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 
+_LAST_32 = 2**32 - 1
 _READS = ("t", "before", "after")
 
 
@@ -30,6 +45,7 @@ class StreamFile:
         self._offset: int | None = None
         self._last_us: int | None = None
         self._next_ms = 0
+        self._wide = False
         self._columns = {name: Column(self._file, name) for name in (*COLUMNS, INDEX)}
 
     @property
@@ -60,12 +76,15 @@ class StreamFile:
         self._append("events/x", chunk.x)
         self._append("events/y", chunk.y)
         self._append("events/p", chunk.p)
-        self._append("events/t", times)
+        if int(times[-1]) > _LAST_32 and not self._wide:
+            self._columns[TIMES] = self._columns[TIMES].widened(self._file, TIMES, WIDE)
+            self._wide = True
+        self._append(TIMES, times)
 
     def _mark(self, times: I64, end_ms: int) -> None:
         """Note the first event at or after each millisecond before `end_ms`."""
         marks = np.arange(self._next_ms, end_ms, dtype=np.int64) * 1000
-        before = self._columns["events/t"].count
+        before = self._columns[TIMES].count
         self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
         self._next_ms = max(end_ms, self._next_ms)
 
@@ -132,7 +151,7 @@ class StreamFile:
     def finish(self) -> None:
         """Write what is held back and the index, and close the file."""
         # one more mark, so that the last millisecond has an end
-        self._append(INDEX, np.full(1, self._columns["events/t"].count, np.int64))
+        self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
         for column in self._columns.values():
             column.flush()
         self._file[OFFSET][()] = self._offset or 0
@@ -144,12 +163,26 @@ class StreamFile:
 
 
 class StreamReader:
-    """A trial's HDF5 file opened for reading; a context manager."""
+    """A trial's HDF5 file opened for reading; a context manager.
+
+    Raises:
+        StoreError: it was written by a newer version.
+        ValueError: a column points out of the file.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._file = h5py.File(path, "r")
-        self._opened: dict[str, Any] = {}
-        self.t_offset_us = int(self._file[OFFSET][()])
+        self._file = RowFile(path)
+        try:
+            found = self._file.attribute("format", 1)
+            if found > FORMAT:
+                raise StoreError(
+                    f"{path}: format = {found}: was written by a newer version of SlipLab; this "
+                    f"one reads formats up to {FORMAT}: update it"
+                )
+            self.t_offset_us = int(self._file.rows(OFFSET).read())
+        except BaseException:
+            self._file.close()
+            raise
 
     def __enter__(self) -> StreamReader:
         return self
@@ -162,37 +195,35 @@ class StreamReader:
     ) -> None:
         self._file.close()
 
-    def _data(self, name: str) -> Any:
-        """A column, opened once."""
-        if name not in self._opened:
-            self._opened[name] = self._file[name]
-        return self._opened[name]
-
     def event_times(self) -> I64:
         """Times of all events on the camera's clock, us."""
-        times: I64 = self._data("events/t")[:]
-        times += self.t_offset_us
-        return times
+        return self._times(0, len(self._file.rows(TIMES)))
+
+    def _times(self, low: int, high: int) -> I64:
+        """Times of some events on the camera's clock, us."""
+        return self._file.rows(TIMES).added(low, high, self.t_offset_us)
 
     def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
         """Events with start <= t < end on the camera's clock; all by default.
 
         Only the part of the file that holds them is read.
         """
-        x, y, p, t = (self._data(f"events/{name}") for name in "xypt")
-        low, high = 0, t.shape[0]
-        marks = self._data(INDEX)
+        x, y, p = (self._file.rows(f"events/{name}") for name in "xyp")
+        low, high = 0, len(self._file.rows(TIMES))
+        marks = self._file.rows(INDEX)
         if start_us is not None and len(marks):
             low = _bracket(marks, start_us - self.t_offset_us, high)[0]
         if end_us is not None and len(marks):
             high = _bracket(marks, end_us - self.t_offset_us, high)[1]
         high = max(low, high)
-        times = t[low:high] + self.t_offset_us
+        times = self._times(low, high)
         first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
         last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
         last = max(first, last)
-        rows = slice(low + first, low + last)
-        return EventChunk(x[rows], y[rows], p[rows], times[first:last])
+        low, high = low + first, low + last
+        return EventChunk(
+            x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
+        )
 
     def pulses(self, group: str) -> I64:
         """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
@@ -216,25 +247,28 @@ class StreamReader:
         return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
 
     def column(self, name: str) -> Array:
-        """One column by its name in the file, such as ``frames/t``."""
-        return np.asarray(self._data(name)[:])
+        """One column by its name in the file, such as ``frames/t``; times are int64."""
+        values = self._file.rows(name).read()
+        return values.astype(np.int64) if name == TIMES else values
 
     def has(self, name: str) -> bool:
         """Whether the file has a column of this name; those of `TRACKS` and
         `TIMING` may be missing."""
-        return name in self._opened or name in self._file
+        return self._file.has(name)
 
     def counts(self) -> dict[str, int]:
         """Rows of every column; 0 for one that is missing."""
         return {
-            name: int(self._data(name).shape[0]) if self.has(name) else 0
+            name: len(self._file.rows(name)) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS, *TIMING)
         }
 
 
-def _bracket(marks: Any, t_us: int, count: int) -> tuple[int, int]:
+def _bracket(marks: Rows, t_us: int, count: int) -> tuple[int, int]:
     """Indices that enclose time `t_us` after the offset, from the millisecond index."""
     ms = t_us // 1000
-    low = 0 if ms < 0 else int(marks[ms]) if ms < len(marks) else count
-    high = 0 if ms + 1 < 0 else int(marks[ms + 1]) if ms + 1 < len(marks) else count
-    return low, high
+    near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
+    if ms < 0:
+        return 0, near[0] if ms == -1 and near else 0
+    near += [count, count]
+    return near[0], near[1]

@@ -11,11 +11,16 @@ from typing import Any
 import numpy as np
 
 from storage.clockmap import ClockMap
+from storage.errors import StoreError
 from storage.files import read_json
 from storage.hdf5 import StreamReader
 from storage.streams import F64, I64, U8, EventChunk, Json
 from storage.video import read_frame, read_frames
-from storage.writer import CHECKSUMS, DATA, FRAMES, RECORD
+from storage.whole import byte_problem, read_sums
+from storage.writer import DATA, FRAMES, RECORD
+
+RECORD_FORMAT = 1
+"""What this version writes into a record as its ``format``."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +36,10 @@ class Tracks:
 class Recording:
     """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
 
-    A committed trial is never rewritten. Where its clocks were fitted again and came out
-    otherwise, the new ones stand among the derived results, and are used in the record's place.
+    A committed trial is never rewritten, and never read where it is not what was committed: each
+    of its files is held against its checksum before this object first reads it. Where its clocks
+    were fitted again and came out otherwise, the new ones stand among the derived results, and are
+    used in the record's place.
 
     Args:
         folder: the trial's own folder.
@@ -42,6 +49,7 @@ class Recording:
     def __init__(self, folder: Path, sync_file: Path | None = None) -> None:
         self.folder = folder
         self.sync_file = sync_file
+        self._checked: set[str] = set()
 
     def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None]]:
         """To another process goes where the trial is, not what was read of it."""
@@ -49,8 +57,19 @@ class Recording:
 
     @cached_property
     def record(self) -> Json:
-        """The trial's record."""
-        return read_json(self.folder / RECORD)
+        """The trial's record.
+
+        Raises:
+            StoreError: it is damaged, or was written by a newer version.
+        """
+        path = self._sound(RECORD)
+        found = read_json(path)
+        if found.get("format", RECORD_FORMAT) > RECORD_FORMAT:
+            raise StoreError(
+                f"{path}: format = {found['format']}: was written by a newer version of SlipLab; "
+                f"this one reads formats up to {RECORD_FORMAT}: update it"
+            )
+        return found
 
     @property
     def trial_id(self) -> str:
@@ -60,8 +79,37 @@ class Recording:
     @cached_property
     def raw_checksum(self) -> str:
         """One hash that stands for the raw data of this trial and its record."""
-        sums = read_json(self.folder / CHECKSUMS)
-        return "".join(str(sums[name]["sha256"])[:16] for name in sorted(sums))
+        return "".join(str(self._sums[name]["sha256"])[:16] for name in sorted(self._sums))
+
+    @cached_property
+    def _sums(self) -> Json:
+        """The trial's checksums."""
+        try:
+            return read_sums(self.folder)
+        except ValueError as error:
+            raise self._damaged(str(error)) from None
+
+    def _sound(self, name: str) -> Path:
+        """One of the trial's files, once it has been held against its checksum.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        path = self.folder / name
+        if name not in self._checked:
+            if name not in self._sums:
+                raise self._damaged(f"{path}: is not among the checksums")
+            if (problem := byte_problem(path, self._sums[name])) is not None:
+                raise self._damaged(f"{path}: {problem}")
+            self._checked.add(name)
+        return path
+
+    def _damaged(self, what: str) -> StoreError:
+        store = self.folder.parents[3] if len(self.folder.parents) > 3 else self.folder
+        return StoreError(
+            f"{what}: this trial is damaged; `sliplab verify {store} --quarantine` sets it aside, "
+            "and `sliplab collect` takes it again"
+        )
 
     @property
     def checksum(self) -> str:
@@ -113,7 +161,7 @@ class Recording:
 
     def open(self) -> StreamReader:
         """The HDF5 file, as a context manager."""
-        return StreamReader(self.folder / DATA)
+        return StreamReader(self._sound(DATA))
 
     def clock(self, device: str) -> ClockMap:
         """The map from a device's clock (``events``, ``frames``, ``arm``) to the time line.
@@ -140,11 +188,11 @@ class Recording:
 
     def frames(self, threads: int = 1) -> Iterator[U8]:
         """Decoded frames, uint8 of shape (height, width)."""
-        return read_frames(self.folder / FRAMES, threads)
+        return read_frames(self._sound(FRAMES), threads)
 
     def frame(self, index: int) -> U8:
         """One decoded frame."""
-        return read_frame(self.folder / FRAMES, index)
+        return read_frame(self._sound(FRAMES), index)
 
     def tracks(self) -> Tracks:
         """The markers' places, where they were recorded instead of a video.

@@ -1,14 +1,17 @@
 """The store: a folder with campaigns, each of which is one protocol run on one rig.
 
     STORE/store.json
-    STORE/campaigns/NAME/campaign.json protocol.yaml rig.yaml
+    STORE/campaigns/NAME/campaign.json protocol.yaml rig.yaml checksums.json
     STORE/campaigns/NAME/trials/ID/      committed trials
     STORE/campaigns/NAME/incoming/ID/    the trial being written
     STORE/campaigns/NAME/quarantine/     what did not become a trial, each with its cause
     STORE/campaigns/NAME/bench/          who stood at the rig, one file a stretch of work
     STORE/derived/ models/ report/       what analysis made of it; may be deleted at any time
+    STORE/before/                        copies of what a migration changed
 
-What is committed is decided by one rename and by nothing else.
+What is committed is decided by one rename and by nothing else. A folder among the committed ones
+that is not whole all the same (a file was deleted or cut short) is no trial: it is passed over when
+reading, and quarantined and taken again by the next collection. docs/store.md has all of it.
 """
 
 from __future__ import annotations
@@ -19,19 +22,35 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.files import read_json, sync_folder, write_json, write_text
+from storage.errors import StoreError, disk_explained
+from storage.files import (
+    json_text,
+    make_folder,
+    read_json,
+    sweep_temporary,
+    sync_folder,
+    write_bytes,
+    write_json,
+)
 from storage.recording import Recording
 from storage.streams import Json
-from storage.writer import PROVENANCE, TrialWriter
+from storage.whole import partial, write_sums
+from storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
 
-FORMAT = 1
+__all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError", "safe_name"]
+
+FORMAT = 2
+"""What this version writes; `storage.migrate` says what changed, and brings older ones forward."""
 SYNC = "sync"
 """The step whose results hold clocks that were fitted again; recordings read them there."""
+INFO, PROTOCOL, RIG, STORE, CAUSE = (
+    "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
+)  # fmt: skip
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
-class StoreError(RuntimeError):
-    """A store that cannot be used as asked; the message names the path and what to do."""
+def _holds(path: Path, data: bytes) -> bool:
+    return path.is_file() and not path.is_symlink() and path.read_bytes() == data
 
 
 def safe_name(name: str) -> str:
@@ -58,29 +77,69 @@ class Campaign:
 
     @property
     def info(self) -> Json:
-        """What `campaign.json` says."""
-        return read_json(self.folder / "campaign.json")
+        """What `campaign.json` says.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        path = self.folder / INFO
+        try:
+            found = read_json(path)
+            if not {"name", "simulated"} <= found.keys():
+                raise ValueError(f"{path}: lacks 'name' or 'simulated'")
+        except (OSError, ValueError) as error:
+            raise StoreError(
+                f"{error}; it is damaged: put it back from a copy, or move {self.folder} away "
+                "and collect anew"
+            ) from None
+        return found
+
+    @property
+    def begun(self) -> bool:
+        """Whether something was ever collected into it, or could have been."""
+        return (self.folder / INFO).exists() or any(self._folders("trials"))
 
     @property
     def protocol_file(self) -> Path:
         """The copy of the protocol this campaign runs by."""
-        return self.folder / "protocol.yaml"
+        return self.folder / PROTOCOL
 
     def update(self, info: Json, protocol_text: str, rig_text: str) -> None:
-        """Write the campaign's description and its copies of protocol and rig file."""
+        """Write the campaign's description and its copies of protocol and rig file.
+
+        Only what changed is written. While it is, there are no checksums: a description without
+        them was interrupted, one that does not match them is damaged.
+        """
         for name in ("trials", "incoming", "quarantine", "bench"):
-            (self.folder / name).mkdir(parents=True, exist_ok=True)
-        write_text(self.protocol_file, protocol_text)
-        write_text(self.folder / "rig.yaml", rig_text)
-        write_json(self.folder / "campaign.json", info)
+            make_folder(self._inside(self.folder / name))
+        # who made them may have been killed before their entries were on the disk
+        for folder in (self.folder.parent.parent, self.folder.parent, self.folder):
+            sync_folder(folder)
+        texts = {PROTOCOL: protocol_text, RIG: rig_text, INFO: json_text(info)}
+        changed = [
+            (self.folder / name, text.encode())
+            for name, text in texts.items()
+            if not _holds(self.folder / name, text.encode())
+        ]
+        if changed:
+            (self.folder / CHECKSUMS).unlink(missing_ok=True)
+            sync_folder(self.folder)
+        for path, data in changed:
+            write_bytes(path, data)
+        write_sums(self.folder, tuple(texts))
 
     def committed(self) -> set[str]:
-        """Ids of the committed trials."""
-        return {path.name for path in self._folders("trials")}
+        """Ids of the committed trials, as far as they are whole."""
+        return {path.name for path in self._whole()}
+
+    def damaged(self) -> dict[str, str]:
+        """Folders among the committed trials that are not whole, and why."""
+        found = {path.name: partial(path) for path in self._folders("trials")}
+        return {name: cause for name, cause in found.items() if cause is not None}
 
     def recordings(self) -> Iterator[Recording]:
-        """The committed trials by id."""
-        for path in self._folders("trials"):
+        """The committed trials by id, as far as they are whole."""
+        for path in self._whole():
             yield Recording(path, self._sync_file(path.name))
 
     def recording(self, trial_id: str) -> Recording:
@@ -98,21 +157,38 @@ class Campaign:
         self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
     ) -> TrialWriter:
         """Begin to write a trial; what stood aside under its id is quarantined first."""
-        aside = self.folder / "incoming" / safe_name(trial_id)
+        aside = self._inside(self.folder / "incoming" / safe_name(trial_id))
+        target = self._inside(self.folder / "trials" / trial_id)
         if aside.exists():
             self.quarantine(aside, "interrupted")
-        return TrialWriter(aside, self.folder / "trials" / trial_id, frame_px, rate_hz, spool=spool)
+        if target.is_dir() and (cause := partial(target)) is not None:
+            self.quarantine(target, f"damaged: {cause}")
+        return TrialWriter(aside, target, frame_px, rate_hz, spool=spool)
 
     def sweep(self) -> int:
-        """Quarantine what a killed program left aside; returns how many folders."""
-        left = list(self._folders("incoming"))
-        for path in left:
-            self.quarantine(path, "interrupted")
+        """Clear up after a killed program or a failing disk, before trials are taken.
+
+        Trials that stand aside, and committed ones that are not whole, go to quarantine; temporary
+        files are deleted. Whoever calls this holds the store's lock.
+
+        Returns:
+            how many folders went to quarantine.
+        """
+        for folder in (self.folder, self.folder / "bench"):
+            sweep_temporary(folder)
+        left = dict.fromkeys(self._folders("incoming"), "interrupted")
+        for name, cause in self.damaged().items():
+            left[self.folder / "trials" / name] = f"damaged: {cause}"
+        for path, cause in left.items():
+            self.quarantine(path, cause)
+        for path in self._folders("quarantine"):
+            sweep_temporary(path)
         return len(left)
 
     def quarantine(self, folder: Path, cause: str) -> Path:
-        """Move a folder that did not become a trial out of the way, with its cause."""
-        write_json(folder / "cause.json", {"cause": cause, "trial": folder.name})
+        """Move a folder that is no trial, or no longer, out of the way, with its cause."""
+        sweep_temporary(folder)
+        write_json(folder / CAUSE, {"cause": cause, "trial": folder.name})
         target = self.quarantine_path(folder.name)
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -129,8 +205,11 @@ class Campaign:
         """Cause and trial of everything in quarantine."""
         causes = []
         for path in self._folders("quarantine"):
-            file = path / "cause.json"
-            known = read_json(file) if file.exists() else {"cause": "unknown"}
+            try:
+                known = read_json(path / CAUSE)
+            except (OSError, ValueError):
+                known = {}
+            known.setdefault("cause", "unknown")
             trial_id = path.name.rpartition(".")[0]
             causes.append({**known, "trial": trial_id, "folder": path.name})
         return causes
@@ -146,7 +225,9 @@ class Campaign:
     def add_bench_record(self, data: Json) -> None:
         """Keep who stood at the rig, with what, for one stretch of work."""
         folder = self.folder / "bench"
-        number = len(list(folder.glob("*.json"))) + 1
+        make_folder(self._inside(folder))
+        there = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]
+        number = max(there, default=0) + 1
         write_json(folder / f"{number:04d}.json", data)
 
     def provenance(self, recording: Recording) -> Json:
@@ -161,8 +242,24 @@ class Campaign:
         folder = self.folder / name
         if folder.is_dir():
             for path in sorted(folder.iterdir()):
-                if path.is_dir():
+                if path.is_dir() and not path.is_symlink():
                     yield path
+
+    def _whole(self) -> Iterator[Path]:
+        return (path for path in self._folders("trials") if partial(path) is None)
+
+    def _inside(self, path: Path) -> Path:
+        """`path`, if no link on the way to it leads out of the store.
+
+        Raises:
+            StoreError: one does.
+        """
+        store = self.folder.parent.parent
+        if not path.resolve().is_relative_to(store.resolve()):
+            raise StoreError(
+                f"{path}: a link leads out of the store; put a folder of its own in its place"
+            )
+        return path
 
 
 @dataclass(frozen=True)
@@ -178,35 +275,47 @@ class Store:
         Raises:
             StoreError: no store there, or one of another format.
         """
-        path = folder / "store.json"
+        path = folder / STORE
         if not path.is_file():
             raise StoreError(
                 f"{folder}: is not a store (no store.json); `sliplab collect` makes one"
             )
         try:
             found = read_json(path).get("format")
-        except ValueError as error:
-            raise StoreError(str(error)) from None
-        if found != FORMAT:
+        except (OSError, ValueError) as error:
             raise StoreError(
-                f"{path}: format = {found}; this version of SlipLab reads format {FORMAT}"
+                f"{error}; it is damaged: put it back from a copy; in this version it says "
+                f'{{"format": {FORMAT}}}'
+            ) from None
+        if isinstance(found, int) and found > FORMAT:
+            raise StoreError(
+                f"{path}: format = {found}: was written by a newer version of SlipLab; this one "
+                f"reads formats up to {FORMAT}: update it"
             )
+        if isinstance(found, bool) or not isinstance(found, int) or found < 1:
+            raise StoreError(f"{path}: format = {found!r}: must be a number from 1 to {FORMAT}")
         return Store(folder)
+
+    @property
+    def format(self) -> int:
+        """The format that the store has; `storage.migrate` brings older ones to `FORMAT`."""
+        return int(read_json(self.folder / STORE)["format"])
 
     @staticmethod
     def create(folder: Path) -> Store:
         """The store in `folder`, made if there is none.
 
         Raises:
-            StoreError: the folder holds something else.
+            StoreError: the folder holds something else, or nothing can be written there.
         """
-        if not (folder / "store.json").exists():
+        if not (folder / STORE).exists():
             if folder.exists() and not folder.is_dir():
                 raise StoreError(f"{folder}: is a file; give a folder for the store")
             if folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir()):
                 raise StoreError(f"{folder}: holds other files; give an empty folder or a store")
-            folder.mkdir(parents=True, exist_ok=True)
-            write_json(folder / "store.json", {"format": FORMAT})
+            with disk_explained(folder):
+                make_folder(folder)
+                write_json(folder / STORE, {"format": FORMAT})
         return Store.open(folder)
 
     def campaign(self, name: str) -> Campaign:
@@ -219,7 +328,9 @@ class Store:
         if not folder.is_dir():
             return []
         return [
-            Campaign(path) for path in sorted(folder.iterdir()) if (path / "campaign.json").exists()
+            Campaign(path)
+            for path in sorted(folder.iterdir())
+            if not path.is_symlink() and (path / INFO).is_file()
         ]
 
     @property

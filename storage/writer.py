@@ -154,7 +154,6 @@ class TrialWriter:
         self.seal()
         write_json_aside(self.folder / "cause.json", cause)
         self._finish_folder(record, provenance)
-        quarantine.parent.mkdir(parents=True, exist_ok=True)
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)
 

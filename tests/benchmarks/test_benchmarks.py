@@ -30,7 +30,8 @@ PROMISED = {
     "storage": {
         "write_m_events_per_s", "read_m_events_per_s", "window_30ms_ms", "bytes_per_event",
         "frames_per_s_800", "pickle_write_m_events_per_s", "pickle_read_m_events_per_s",
-        "pickle_window_30ms_ms", "pickle_bytes_per_event",
+        "pickle_window_30ms_ms", "pickle_bytes_per_event", "aedat4_write_m_events_per_s",
+        "aedat4_read_m_events_per_s", "aedat4_window_30ms_ms", "aedat4_bytes_per_event",
     },
     "scene": {
         "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_frame_emulator",

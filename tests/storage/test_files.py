@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.files import _json_text, read_json, write_json
+from storage.files import json_text, read_json, write_json
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 FINITE = LEAVES.filter(lambda value: value not in (float("inf"), float("-inf")))
@@ -28,7 +28,7 @@ TREES = st.recursive(
 @given(data=TREES)
 def test_json_is_that_of_the_standard_library(data: object) -> None:
     expected = json.dumps(data, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    assert _json_text(data) == expected + "\n"
+    assert json_text(data) == expected + "\n"
 
 
 def test_json_comes_back(tmp_path: Path) -> None:
@@ -40,4 +40,4 @@ def test_json_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bad", [float("nan"), [1.0, float("inf")], {"a": {"b": [float("nan")]}}])
 def test_json_has_no_word_for_these(bad: object) -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
-        _json_text(bad)
+        json_text(bad)

@@ -1,0 +1,85 @@
+"""Is a folder what its `checksums.json` says? At a glance, or byte for byte."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from storage.files import read_json, sha256, write_json
+from storage.streams import Json
+from storage.writer import CHECKSUMS, DATA, RECORD
+
+
+def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
+    """The checksums of a folder: by file name, ``sha256`` and ``bytes``.
+
+    Raises:
+        ValueError: missing, damaged, or without one of the files that are `needed`; the message
+            names the file.
+    """
+    path = folder / CHECKSUMS
+    try:
+        sums = read_json(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+    for name, said in sums.items():
+        plain = isinstance(said, dict) and {"sha256", "bytes"} <= said.keys()
+        if not plain or name != Path(name).name or name in {"", ".", ".."}:
+            raise ValueError(f"{path}: is no list of checksums")
+    for name in needed:
+        if name not in sums:
+            raise ValueError(f"{path}: has no checksum of {name}")
+    return sums
+
+
+def size_problem(path: Path, said: Json) -> str | None:
+    """What is wrong with a file without reading it; None when it is there with all its bytes."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return "is missing"
+    if not stat.S_ISREG(found.st_mode):
+        return "is no plain file"
+    if found.st_size != said["bytes"]:
+        return f"has {found.st_size} bytes, not {said['bytes']}"
+    return None
+
+
+def byte_problem(path: Path, said: Json) -> str | None:
+    """What is wrong with a file, all of it read; None when it is as it was written."""
+    problem = size_problem(path, said)
+    if problem is None:
+        try:
+            return None if sha256(path) == said["sha256"] else "does not match its checksum"
+        except OSError as error:
+            return f"cannot be read: {error.strerror}"
+    return problem
+
+
+def partial(folder: Path) -> str | None:
+    """Why a trial's folder is not whole, by the sizes of its files; None when it is.
+
+    Bytes that changed in place are found by `storage.verify` only.
+    """
+    try:
+        sums = read_sums(folder)
+    except ValueError as error:
+        return str(error)
+    for name, said in sums.items():
+        if (problem := size_problem(folder / name, said)) is not None:
+            return f"{folder / name}: {problem}"
+    return None
+
+
+def write_sums(folder: Path, names: tuple[str, ...]) -> None:
+    """Write the checksums of some files of a folder, atomically, if they are not there already."""
+    sums = {
+        name: {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size}
+        for name in names
+    }
+    try:
+        if read_json(folder / CHECKSUMS) == sums:
+            return
+    except (OSError, ValueError):
+        pass
+    write_json(folder / CHECKSUMS, sums)

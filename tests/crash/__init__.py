@@ -1,0 +1,1 @@
+"""Crashes on purpose: `python -m tests.crash` kills a campaign again and again."""

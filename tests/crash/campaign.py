@@ -1,0 +1,114 @@
+"""A campaign of small fast slides, and what must be true of its store at any moment."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flows.orders import Order, make_order
+from flows.stretch import stretch
+from storage.files import read_json
+from storage.store import Store
+from storage.verify import UNFINISHED, verify
+from tests.conftest import ROOT, SMALL
+
+NAME = "crash"
+BY_TIME = {"provenance.json"}
+"""When and where: the only file of a trial that differs from one run to the next."""
+
+
+def protocol(trials: int, video: bool = False) -> dict[str, Any]:
+    """Slides that are over in a second, each in a direction of its own."""
+    data: dict[str, Any] = yaml.safe_load(yaml.safe_dump(SMALL))
+    data["name"] = NAME
+    collection = data["collection"]
+    collection["factors"]["depth"]["values"] = [2.4]
+    collection["factors"]["speed"]["values"] = [1.6]
+    collection["factors"]["direction"]["values"] = [
+        round(137.508 * number % 360, 2) for number in range(trials)
+    ]
+    collection["motion"][3]["distance"] = "1.6 mm"
+    collection["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
+    collection["maintenance"] = {"rezero": {"every": 7, "speed": "0.5 mm/s", "search": "1.5 mm"}}
+    # about one attempt in six is over this, so that retakes are interrupted as well
+    collection["gates"]["sync_uncertainty"]["digital_input"] = "0.0023 ms"
+    collection["gates"]["retakes"] = 10
+    if video:
+        collection["recording"]["region"] = {"width": "12 mm", "height": "12 mm"}
+    data["analysis"]["split"] = {"method": "ranked"}
+    return data
+
+
+def order(folder: Path, trials: int, video: bool = False) -> Order:
+    """Protocol and rig file in `folder`, and a store beside them that may not exist yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "protocol.yaml").write_text(yaml.safe_dump(protocol(trials, video)))
+    rig = ROOT / "rigs" / ("mock.yaml" if video else "rehearsal.yaml")
+    return make_order(folder / "protocol.yaml", rig, folder / "store")
+
+
+def collect(wanted: Order) -> None:
+    """Take what the store lacks, as `sliplab collect` does below Prefect."""
+    with stretch(wanted) as work:
+        work.session.rig.connect()
+        work.session.take(work.trials)
+
+
+def hashes(store: Path) -> dict[str, dict[str, str]]:
+    """SHA-256 of every file of every committed trial, without what differs by time."""
+    folder = store / "campaigns" / NAME / "trials"
+    return {
+        trial.name: {
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(trial.iterdir())
+            if path.name not in BY_TIME
+        }
+        for trial in (sorted(folder.iterdir()) if folder.is_dir() else [])
+    }
+
+
+def wrong(store: Path, whole: dict[str, dict[str, str]]) -> list[str]:
+    """What is not as it must be in a store that was just killed: nothing, one hopes.
+
+    A trial that is there is byte for byte the undisturbed one, and `verify` finds nothing that is
+    damaged, only what the next collection clears up.
+    """
+    found = [
+        f"{name}: is not the undisturbed trial"
+        for name, files in hashes(store).items()
+        if whole.get(name) != files
+    ]
+    if (store / "store.json").exists():
+        problems = verify(Store.open(store))
+        found += [f"{p.path}: {p.what}" for p in problems if p.kind != UNFINISHED]
+    return found
+
+
+def wrong_at_the_end(
+    store: Path, whole: dict[str, dict[str, str]], also: str = "interrupted"
+) -> list[str]:
+    """What is not as it must be once the campaign went to its end.
+
+    Args:
+        also: how another cause may begin for which something is in quarantine.
+    """
+    found = wrong(store, whole)
+    there = hashes(store)
+    found += [f"{name}: is missing" for name in sorted(whole.keys() - there.keys())]
+    found += [f"{p.path}: {p.what}" for p in verify(Store.open(store))]
+    campaign = store / "campaigns" / NAME
+    wanted = {"protocol.yaml", "rig.yaml", "campaign.json", "checksums.json",
+              "trials", "incoming", "quarantine", "bench"}  # fmt: skip
+    for folder, names in ((store, {"store.json", ".lock", "campaigns"}), (campaign, wanted)):
+        strangers = {path.name for path in folder.iterdir()} - names
+        found += [f"{folder / name}: is litter" for name in sorted(strangers)]
+    found += [f"{path}: is litter" for path in store.rglob("*.tmp")]
+    found += [f"{path}: is litter" for path in (campaign / "incoming").iterdir()]
+    for path in (campaign / "quarantine").iterdir():
+        cause = str(read_json(path / "cause.json").get("cause", ""))
+        if not cause.startswith(("interrupted", "gate: ", also)):
+            found.append(f"{path}: is in quarantine for '{cause}'")
+    return found
