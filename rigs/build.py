@@ -47,7 +47,9 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         frames=devices.frames,
         sync=devices.sync,
         operator=devices.operator,
-        frame=PlateFrame.taught((plane.centre, plane.right, plane.above)),
+        frame=PlateFrame.taught((plane.centre, plane.right, plane.above)).with_zero(
+            file.calibration.zero_mm
+        ),
         poll_s=float(file.poll),
         timing=file.timing,
         touch_mm=file.calibration.touch_depth,
