@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from protocols.program import PlateAction
 from rigs.capabilities import ArmState, RigError
+from rigs.mock.jogging import hold_board, jog
 from rigs.mock.world import World
 
 _MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
@@ -60,7 +61,8 @@ class SimulatedOperator:
     """Does at once what it is asked, and says so.
 
     `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
-    stop at the pendant. Everything else is only confirmed.
+    stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
+    the camera (`rigs.mock.jogging`). Everything else is only confirmed.
     """
 
     def __init__(self, world: World) -> None:
@@ -81,4 +83,8 @@ class SimulatedOperator:
             self._world.mass_kg = float(match[1]) * (0.001 if match[2] == "g" else 1.0)
         elif task == "protective_stop":
             self._world.arm_state = ArmState.READY
+        elif task == "jog":
+            return jog(self._world, expected)
+        elif task == "board":
+            hold_board(self._world, expected)
         return True

@@ -26,6 +26,7 @@ from rigs.mock.path import SENSOR, ArmPath, Leg
 from rigs.mock.physics import Physics
 from rigs.mock.settings import MockSettings
 from rigs.mock.skins import skin_of
+from rigs.scene.board import BoardPlace
 from rigs.scene.skin import Skin
 from rigs.scene.vibration import Vibration
 
@@ -44,16 +45,18 @@ class World:
         now_ns: true time since the trial began, which is also the host's monotonic clock.
         past_ns: true time spent in earlier trials.
         trials: how often `begin_trial` was called.
+        board: where a printed board is held before the outside camera, if it is.
         plate_marked: whether the sliding plate with its ArUco marker stands there.
     """
 
     def __init__(self, settings: MockSettings) -> None:
         self.settings = settings
         self.skin: Skin = skin_of(settings)
-        self.plane = ContactPlane.from_settings(settings.scene.contact)
+        self.plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self.mass_kg = settings.scene.plate.mass_kg
         self.now_ns = self.past_ns = 0
         self.trials = 0
+        self.board: BoardPlace | None = None
         start = self.plane.pose(0.0, 0.0, -CLEARANCE_MM)
         if settings.arm.start_xyz_mm is not None:
             start = type(start)(settings.arm.start_xyz_mm, start.rotvec_deg)
