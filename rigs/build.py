@@ -53,6 +53,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         poll_s=float(file.poll),
         timing=file.timing,
         touch_mm=file.calibration.touch_depth,
+        centre_px=file.calibration.centre_px,
         plate=devices.plate,
         simulation=_MockSimulation(devices),
     )

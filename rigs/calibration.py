@@ -168,6 +168,11 @@ class Calibration(StrictModel):
         """Depth zero that a rig begins with."""
         return 0.0 if self.depth_zero is None else self.depth_zero.zero
 
+    @property
+    def centre_px(self) -> tuple[float, float] | None:
+        """Where the event camera sees the skin's centre; None: nobody has looked."""
+        return None if self.event_crop is None else self.event_crop.centre
+
 
 COMMANDS = {
     "contact_plane": "sliplab teach plane",
@@ -187,6 +192,8 @@ class CalibrationFault:
     key: str
     value: str | None
     expected: str
+    command: str
+    """What mends it, but for ``--rig``."""
 
 
 def find_faults(
@@ -226,15 +233,23 @@ def find_faults(
                 "frame_camera.scale_px_per_mm",
                 f"{scale_px_per_mm:g}",
                 f"must be calibration.lens.scale_px_per_mm = {lens.scale_px_per_mm:g}, or the "
-                f"lens is another: run `{COMMANDS['lens']}`",
+                "lens is another",
+                COMMANDS["lens"],
             )
         )
     return found
 
 
+def measured_on(calibration: Calibration, name: str) -> date | None:
+    """The day of an entry; None where there is none."""
+    entry = getattr(calibration, name)
+    day: date | None = getattr(entry, "taught", None) or getattr(entry, "measured", None)
+    return day
+
+
 def _too_old(name: str, entry: Any, limit: int, today: date) -> CalibrationFault | None:
     if entry is None:
-        return CalibrationFault(f"calibration.{name}", None, f"is missing: run `{COMMANDS[name]}`")
+        return CalibrationFault(f"calibration.{name}", None, "is missing", COMMANDS[name])
     key = "taught" if hasattr(entry, "taught") else "measured"
     day: date = getattr(entry, key)
     age = (today - day).days
@@ -247,7 +262,7 @@ def _too_old(name: str, entry: Any, limit: int, today: date) -> CalibrationFault
 
 
 def _mend(name: str, key: str, value: str, text: str) -> CalibrationFault:
-    return CalibrationFault(f"calibration.{name}.{key}", value, f"{text}: run `{COMMANDS[name]}`")
+    return CalibrationFault(f"calibration.{name}.{key}", value, text, COMMANDS[name])
 
 
 def without_taught(data: dict[str, Any]) -> dict[str, Any]:
