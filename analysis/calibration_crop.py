@@ -21,6 +21,8 @@ _BLUR_PX = 9
 _SHARE = 0.1
 """Of the brightest of the blurred counts: what is above it belongs to the skin."""
 _LEAST_EVENTS = 2000
+_ROUND = 0.6
+"""Least ratio of the narrowest to the widest spread of what fires."""
 
 
 class CropError(ValueError):
@@ -89,5 +91,8 @@ def _circle(counts: Counts) -> tuple[float, float, float]:
     if len(rows) < _BLUR_PX**2:
         raise CropError("events are all over the picture, or nowhere together: no skin is seen")
     places = np.column_stack([columns, rows]).astype(np.float32)
+    narrow, wide = np.linalg.eigvalsh(np.cov(places.T)) ** 0.5
+    if narrow < _ROUND * wide:
+        raise CropError("what fires is long and not round: no skin is seen, or a part of it only")
     (x, y), radius = cv2.minEnclosingCircle(places)
     return float(x), float(y), float(radius)

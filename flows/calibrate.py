@@ -127,8 +127,8 @@ def teach_plane(bench: Bench, span_mm: float, creep: Creep, repeats: int) -> Fin
             for index, (name, xy) in enumerate(places.items()):
                 seed = 1000 * (number + 1) + index
                 found[name].append(touch(rig, *xy, creep, seed))
-                bar.advance(1, f"{name} {found[name][-1].by_events_mm:+.3f} mm")
-    depths = {name: [t.by_events_mm for t in touches] for name, touches in found.items()}
+                bar.advance(1, f"{name} {found[name][-1].depth_mm:+.3f} mm")
+    depths = {name: [t.depth_mm for t in touches] for name, touches in found.items()}
     points = {
         name: rig.frame.pose(Position(*xy, float(np.mean(depths[name])))).xyz_mm
         for name, xy in places.items()
@@ -230,13 +230,15 @@ def teach_zero(bench: Bench, creep: Creep, repeats: int, with_markers: bool) -> 
     if with_markers:
         side = max(16, round(REGION_MM * camera.scale_px_per_mm / 16) * 16)
         rig.frames.set_region(min(side, camera.width_px), min(side, camera.height_px))
-    touches = []
-    with console.bar(f"{bench.simulated}touches", repeats) as bar:
+    ways = ("events", "markers") if with_markers else ("events",)
+    depths: dict[str, list[float]] = {way: [] for way in ways}
+    with console.bar(f"{bench.simulated}touches", repeats * len(ways)) as bar:
         for number in range(repeats):
-            find = marker_finder(bench) if with_markers else None
-            touches.append(touch(rig, 0.0, 0.0, creep, 2000 + number, find))
-            bar.advance(1, f"{touches[-1].by_events_mm:+.3f} mm")
-    events = np.array([t.by_events_mm for t in touches])
+            for way in ways:
+                find = marker_finder(bench) if way == "markers" else None
+                depths[way].append(touch(rig, 0.0, 0.0, creep, 2000 + number, find).depth_mm)
+                bar.advance(1, f"by {way} {depths[way][-1]:+.3f} mm")
+    events = np.array(depths["events"])
     zero, residual = float(events.mean()), float(np.ptp(events)) / 2
     entry: dict[str, Any] = {"zero": _mm(zero), "by_events": _mm(zero)}
     figures: dict[str, Any] = {
@@ -247,10 +249,10 @@ def teach_zero(bench: Bench, creep: Creep, repeats: int, with_markers: bool) -> 
     }
     method = f"event rate, {repeats} touches at {creep.speed_mm_s:g} mm/s"
     if with_markers:
-        markers = np.array([t.by_markers_mm for t in touches], np.float64)
+        markers = np.array(depths["markers"])
         difference = zero - float(markers.mean())
         residual = max(residual, float(np.ptp(markers)) / 2, abs(difference) / 2)
-        method = f"event rate, checked by marker motion, {repeats} touches"
+        method = f"event rate, checked by marker motion, {repeats} touches each"
         entry |= {"by_markers": _mm(float(markers.mean())), "difference": _mm(difference)}
         figures |= {"by_markers_mm": markers.tolist(), "difference_mm": difference}
         if abs(difference) > MOST_DIFFERENCE_MM:

@@ -132,15 +132,21 @@ def _stands(data: Any, key: str) -> bool:
 
 
 def _put(here: CommentedMap, key: str, value: Any) -> None:
-    """Set one key; a mapping that is there keeps its place and its comments."""
+    """Set one key; a mapping that is there keeps its place and its comments.
+
+    A new key goes before the last one: a comment or an empty line after a mapping belongs to its
+    last key, and would stand in the middle.
+    """
     there = here.get(key)
     if isinstance(value, Mapping) and isinstance(there, CommentedMap):
         for old in [name for name in there if name not in value]:
             del there[old]
         for name, item in value.items():
             _put(there, name, item)
-    else:
+    elif key in here or not here:
         here[key] = _plain(value)
+    else:
+        here.insert(len(here) - 1, key, _plain(value))
 
 
 def _plain(value: Any) -> Any:

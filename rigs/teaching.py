@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from protocols.program import Move, Position
-from rigs.capabilities import ArmFault, Pose, RigError, Segment
+from rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
 from rigs.touching import LOOK_S, QUIET_S, MarkerTouch, RateTouch
 from storage.streams import FrameChunk
@@ -28,6 +28,9 @@ FRAMES_HZ = 100
 APPROACH_MM_S = 5.0
 """From clear of the plate to where creeping begins; events are watched on the way."""
 MOST_CREEP_MM_S = 1.0
+ASLANT = 0.1
+"""How far a path aslant goes sideways for each mm in."""
+_UNTRUE = {ArmState.PROTECTIVE_STOP, ArmState.EMERGENCY_STOP, ArmState.DISCONNECTED}
 _APPROACH_LOOK_S = 0.05
 _GRACE_S = 5.0
 _OVER_MM = 0.05
@@ -42,14 +45,14 @@ class Creep:
         speed_mm_s: creeping speed, at most `MOST_CREEP_MM_S`.
         search_mm: hard limit beyond the plane that the rig assumes.
         clearance_mm: how far before that plane creeping begins.
-        after_mm: how much farther it may go, within the limit, once one way of looking has noticed
-            the touch and the other has not.
+        after_mm: how much farther it may go, within the limit, when events have told of a touch
+            and the markers, which are looked at, have not.
     """
 
     speed_mm_s: float = 0.5
     search_mm: float = 2.0
     clearance_mm: float = 3.0
-    after_mm: float = 0.6
+    after_mm: float = 0.3
 
     def __post_init__(self) -> None:
         """Raises ValueError where a number is not positive or creeping would not be creeping."""
@@ -65,35 +68,14 @@ class Touch:
     """One touch at (x, y) of the assumed plane; depths in mm from it into the plate.
 
     Attributes:
-        by_events_mm: depth of the surface by event rate, `touch_mm` of the rig taken off.
-        by_markers_mm: depth of the surface by marker motion; None where that was not asked for.
+        depth_mm: of the surface; by event rate `touch_mm` of the rig is taken off.
         deepest_mm: how deep the arm went.
     """
 
     x_mm: float
     y_mm: float
-    by_events_mm: float
-    by_markers_mm: float | None
+    depth_mm: float
     deepest_mm: float
-
-
-@dataclass
-class _Look:
-    """What was noticed while creeping."""
-
-    deep_mm: float
-    wanted: int
-    events_mm: float | None = None
-    markers_mm: float | None = None
-    host_ns: list[int] = field(default_factory=list)
-    depth_mm: list[float] = field(default_factory=list)
-
-    @property
-    def noticed(self) -> int:
-        return (self.events_mm is not None) + (self.markers_mm is not None)
-
-    def depth_at(self, host_ns: int) -> float:
-        return float(np.interp(host_ns, self.host_ns, self.depth_mm))
 
 
 def touch(
@@ -102,8 +84,10 @@ def touch(
     """Touch the plate once at (x, y) of the plane that the rig assumes, and let go.
 
     Out along the plate's normal, across, in at `APPROACH_MM_S` to `clearance_mm` before the plane
-    and at creeping speed from there, until the events tell of a touch (and the markers, if
-    `find` is given), or to `search_mm` beyond the plane, where the arm's path ends.
+    and at creeping speed from there, until the touch is noticed, or to `search_mm` beyond the
+    plane, where the arm's path ends. Without `find` a touch is noticed by event rate, on a path
+    straight in. With it by the motion of markers, on a path that goes aslant: then a papilla that
+    holds on to the plate stays behind the free ones.
 
     Args:
         seed: what a simulated rig draws its randomness from.
@@ -114,30 +98,35 @@ def touch(
         RigError: nothing was noticed within the limit, something was met before creeping began,
             or a device failed; the arm is stopped, and clear if it is healthy.
     """
-    clear = Position(x_mm, y_mm, -creep.clearance_mm)
+    aslant = 0.0 if find is None else ASLANT
+    clear = Position(x_mm - aslant * creep.clearance_mm, y_mm, -creep.clearance_mm)
+    deepest = Position(x_mm + aslant * creep.search_mm, y_mm, creep.search_mm)
     with rig.safely(clear):
         at = rig.position()
         out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
-        across = Position(x_mm, y_mm, out.depth_mm)
+        across = Position(clear.x_mm, clear.y_mm, out.depth_mm)
         rig.move(Move("out", out, RETRACT_SPEED_MM_S), at)
         rig.move(Move("across", across, RETRACT_SPEED_MM_S), out)
         if rig.simulation is not None:
             rig.simulation.begin_trial(seed)
-        markers = MarkerTouch() if find is not None else None
         try:
             _start(rig, seed, find is not None)
             rig.wait(QUIET_S)
             rate = RateTouch(rig.central_events())
             _approach(rig, across, clear, rate)
-            found = _creep(rig, clear, creep, rate, find, markers)
+            watch = _Watch(rig, creep, rate, find)
+            _creep(rig, clear, deepest, watch)
         finally:
             for device in (rig.events, rig.frames, rig.sync):
                 with suppress(RigError):
                     device.stop()
-        rig.move(Move("release", clear, RETRACT_SPEED_MM_S), rig.position())
-    if found.events_mm is None or (find is not None and found.markers_mm is None):
-        raise _unnoticed(found, find is not None, creep)
-    return Touch(x_mm, y_mm, found.events_mm, found.markers_mm, found.deep_mm)
+        at = rig.position()
+        rig.move(
+            Move("release", Position(at.x_mm, at.y_mm, clear.depth_mm), RETRACT_SPEED_MM_S), at
+        )
+    if watch.touched_mm is None:
+        raise watch.nothing()
+    return Touch(x_mm, y_mm, watch.touched_mm, watch.deepest_mm)
 
 
 def _start(rig: Rig, seed: int, with_frames: bool) -> None:
@@ -175,67 +164,70 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
         raise arm_fault(progress.state, "approach")
 
 
-def _creep(
-    rig: Rig,
-    clear: Position,
-    creep: Creep,
-    rate: RateTouch,
-    find: MarkerFinder | None,
-    markers: MarkerTouch | None,
-) -> _Look:
-    found = _Look(clear.depth_mm, 1 if find is None else 2)
-    deepest = Position(clear.x_mm, clear.y_mm, creep.search_mm)
-    seconds = clear.distance_mm(deepest) / creep.speed_mm_s
-    rig.arm.start([Segment(rig.frame.pose(deepest), creep.speed_mm_s)])
-    deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
-    limit = creep.search_mm + _OVER_MM
-    while not rig.arm.progress().done:
-        rig.wait(LOOK_S)
+class _Watch:
+    """Looks for a touch while the arm creeps, and knows how deep it may go."""
+
+    def __init__(self, rig: Rig, creep: Creep, rate: RateTouch, find: MarkerFinder | None) -> None:
+        self._rig, self._creep, self._rate, self._find = rig, creep, rate, find
+        self._markers = MarkerTouch()
+        self._host_ns: list[int] = []
+        self._depth_mm: list[float] = []
+        self._by_events_mm: float | None = None
+        self._limit_mm = creep.search_mm + _OVER_MM
+        self.speed_mm_s = creep.speed_mm_s
+        self.deepest_mm = -creep.clearance_mm
+        self.touched_mm: float | None = None
+
+    def look(self) -> bool:
+        """Look once; whether creeping is over."""
+        rig = self._rig
         depth = rig.position().depth_mm
-        found.deep_mm = max(found.deep_mm, depth)
-        if depth > limit or rig.clock.now_ns() > deadline:
-            break
-        found.host_ns.append(rig.clock.now_ns())
-        found.depth_mm.append(depth)
-        if rate.touched(rig.central_events()) and found.events_mm is None:
-            found.events_mm = depth - creep.speed_mm_s * rate.LATE_S - rig.touch_mm
-            limit = min(limit, depth + creep.after_mm)
-        if find is not None and markers is not None:
+        self.deepest_mm = max(self.deepest_mm, depth)
+        if self._rate.touched(rig.central_events()) and self._by_events_mm is None:
+            self._by_events_mm = depth - self.speed_mm_s * self._rate.LATE_S - rig.touch_mm
+            self._limit_mm = min(self._limit_mm, depth + self._creep.after_mm)
+            if self._find is None:
+                self.touched_mm = self._by_events_mm
+        if self._find is not None:
+            self._host_ns.append(rig.clock.now_ns())
+            self._depth_mm.append(depth)
             chunk = rig.frames.read()
             rig.sync.read_pulses()
-            when = markers.add(find(chunk), chunk.host_ns) if len(chunk) else None
-            if when is not None and found.markers_mm is None:
-                found.markers_mm = found.depth_at(when)
-                limit = min(limit, depth + creep.after_mm)
-        if found.noticed == found.wanted:
+            when = self._markers.add(self._find(chunk), chunk.host_ns) if len(chunk) else None
+            if when is not None:
+                self.touched_mm = float(np.interp(when, self._host_ns, self._depth_mm))
+        return self.touched_mm is not None or depth > self._limit_mm
+
+    def nothing(self) -> RigError:
+        """Why nothing was found."""
+        if self._by_events_mm is not None:
+            return RigError(
+                "frame camera",
+                f"saw no marker move up to {self.deepest_mm:.3f} mm, but events told of a touch "
+                f"at {self._by_events_mm:.3f} mm: does it see the centre marker? (--by events "
+                "does without)",
+            )
+        return RigError(
+            "arm",
+            f"met nothing within the hard limit of {self._creep.search_mm:g} mm beyond the plane "
+            "that the rig assumes, and has gone back: teach by hand, or allow more (--search)",
+        )
+
+
+def _creep(rig: Rig, clear: Position, deepest: Position, watch: _Watch) -> None:
+    seconds = clear.distance_mm(deepest) / watch.speed_mm_s
+    rig.arm.start([Segment(rig.frame.pose(deepest), watch.speed_mm_s)])
+    deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
+    while not rig.arm.progress().done:
+        rig.wait(LOOK_S)
+        if watch.look():
             break
+        if rig.clock.now_ns() > deadline:
+            raise ArmFault("arm", "did not end creeping in time")
     rig.arm.stop()
     state = rig.arm.state()
     if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
         raise arm_fault(state, "creeping")
-    return found
-
-
-def _unnoticed(found: _Look, with_markers: bool, creep: Creep) -> RigError:
-    if found.noticed == 0:
-        return RigError(
-            "arm",
-            f"met nothing within the hard limit of {creep.search_mm:g} mm beyond the plane that "
-            "the rig assumes, and has gone back: jog nearer and teach by hand, or allow more "
-            "(--search)",
-        )
-    if found.events_mm is None:
-        return RigError(
-            "event camera",
-            f"saw no touch, but the markers moved at {found.markers_mm:.3f} mm: is the centre "
-            "papilla where the rig file's calibration.event_crop says?",
-        )
-    assert with_markers
-    return RigError(
-        "frame camera",
-        f"saw no marker move up to {found.deep_mm:.3f} mm, but events told of a touch at "
-        f"{found.events_mm:.3f} mm: does it see the centre marker? (--by events does without)",
-    )
 
 
 def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
@@ -246,14 +238,14 @@ def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
 
     Raises:
         StopRequested: the person said stop, or `rig.should_stop` became true.
-        RigError: the arm moves while it should stand, or is not healthy.
+        RigError: the arm moves while it should stand, was stopped, or does not answer.
     """
     poses = []
     for prompt, word in prompts:
         if not rig.operator.ask("jog", prompt, word) or rig.should_stop():
             raise StopRequested
         state = rig.arm.state()
-        if not state.healthy:
+        if state in _UNTRUE:  # others, such as local control, only keep it from being told to move
             raise arm_fault(state, word)
         pose = rig.arm.pose()
         rig.wait(0.2)
