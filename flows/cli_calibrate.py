@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from datetime import date
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows import console, stopping
+from flows import console
 from protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from flows.calibrate import Bench, Finding, Planned
+    from flows.measuring import Bench, Finding
     from rigs.teaching import Creep
 
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
@@ -84,9 +80,10 @@ def teach_plane(
     as_json: JsonOption = False,
 ) -> None:
     """The contact plane: touches at the centre, to the right, above, and one that checks them."""
-    from flows import calibrate as steps
+    from flows import teach as steps
+    from flows.measuring import Measurement
 
-    command = _Command(rig, out, "plane", as_json)
+    command = Measurement(rig, out, "plane", as_json)
     if by is By.HAND:
         command.run([], yes, dry_run, steps.teach_plane_by_hand, "a person jogs the arm")
         return
@@ -113,13 +110,14 @@ def teach_zero(
     as_json: JsonOption = False,
 ) -> None:
     """Depth zero: touches at the centre, seen by both cameras."""
-    from flows import calibrate as steps
+    from flows import teach as steps
+    from flows.measuring import Measurement
 
-    command = _Command(rig, out, "zero", as_json)
+    command = Measurement(rig, out, "zero", as_json)
     creep = _creep(speed, search, clearance)
     steps.check_touches(command.file, "zero", 0.0, creep)
-    moves = steps.planned_touches([("centre", (0.0, 0.0))], creep)
     both = by is ZeroBy.BOTH
+    moves = steps.planned_zero(creep, both)
     command.run(moves, yes, dry_run, lambda bench: steps.teach_zero(bench, creep, repeats, both))
 
 
@@ -140,9 +138,10 @@ def teach_tool(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """The tool centre point: a person brings the tip onto one point, leaning in many ways."""
-    from flows import calibrate as steps
+    from flows import teach as steps
+    from flows.measuring import Measurement
 
-    command = _Command(rig, out, "tool", as_json)
+    command = Measurement(rig, out, "tool", as_json)
     set_now = _tool(tool)
     command.run(
         [], yes, dry_run, lambda bench: steps.teach_tool(bench, poses, set_now),
@@ -167,9 +166,10 @@ def calibrate_lens(
 ) -> None:
     """Lens and scale of the outside camera, from a printed ChArUco board. Nothing moves."""
     from flows import calibrate as steps
+    from flows.measuring import Measurement
 
     board = _board(columns, rows, square)
-    command = _Command(rig, out, "lens", as_json)
+    command = Measurement(rig, out, "lens", as_json)
 
     def measure(bench: Bench) -> Finding:
         if images is not None:
@@ -195,15 +195,16 @@ def calibrate_crop(
 ) -> None:
     """Where the skin is in the event camera's picture: press, and move in a circle."""
     from flows import calibrate as steps
+    from flows.measuring import Measurement, Planned
 
-    command = _Command(rig, out, "crop", as_json)
+    command = Measurement(rig, out, "crop", as_json)
     limit = float(command.file.limits.depth)
     if depth > limit:
         text = f"is deeper than the rig may go: limits.depth = {limit:g} mm"
         raise InputError("--depth", "", f"{depth:g} mm", text)
     moves = [
-        steps.Planned("press", 0.0, 0.0, -5.0, depth, 2.0),
-        steps.Planned(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
+        Planned("press", 0.0, 0.0, -5.0, depth, 2.0),
+        Planned(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
     ]
     command.run(moves, yes, dry_run, lambda bench: steps.calibrate_crop(bench, depth, radius))
 
@@ -228,127 +229,6 @@ def calibrate_board(
         return
     console.print_pairs(f"board {out}", sizes)
     console.say("print at 100 %, measure the ruler, and fix the sheet to something flat")
-
-
-class _Command:
-    """One calibration of one rig file, from the question to the written entry.
-
-    Raises:
-        InputError: the rig file cannot be read, or not be written to.
-    """
-
-    def __init__(self, rig: Path, out: Path | None, what: str, as_json: bool) -> None:
-        from rigs.rig_edit import writable_target
-        from rigs.rig_file import load_rig_file
-        from rigs.rig_inheritance import rig_path
-
-        self.path, self.what, self.as_json = rig_path(rig), what, as_json
-        self.file, self.text = load_rig_file(rig)
-        self._target: Callable[[], Path] = lambda: writable_target(self.path, out)
-
-    def run(
-        self,
-        moves: Sequence[Planned],
-        yes: bool,
-        dry_run: bool,
-        measure: Callable[[Bench], Finding],
-        who: str = "",
-        *,
-        with_arm: bool = True,
-    ) -> None:
-        """Say what will move, ask, measure, write, and say what was found."""
-        from flows.calibrate import Bench
-        from rigs.build import build_rig
-        from rigs.rig import StopRequested
-        from rigs.rig_edit import write_entries
-
-        if dry_run:
-            self._dry(moves, who)
-            return
-        target = self._target()
-        self._say(moves, who)
-        if moves and not yes:
-            _confirm()
-        today = date.today()
-        rig = build_rig(self.file)
-        rig.should_stop = stopping.requested
-        try:
-            if with_arm:
-                rig.connect()
-            finding = measure(Bench(self.file, rig, today))
-        except StopRequested:
-            console.say("stopped: the arm stands still, nothing was written")
-            raise KeyboardInterrupt from None
-        finally:
-            with _undisturbed():
-                rig.close()
-        written = write_entries(
-            self.path, target, finding.changes, today=today, remove=finding.remove,
-            expected=self.text,
-        )  # fmt: skip
-        self._show(finding, written.path, written.kept)
-
-    def _rows(self, moves: Sequence[Planned]) -> list[dict[str, Any]]:
-        from protocols.program import Position
-        from rigs.plate_frame import PlateFrame
-
-        plane = self.file.calibration.contact_plane
-        frame = PlateFrame.taught((plane.centre, plane.right, plane.above))
-        if self.what == "crop":
-            frame = frame.with_zero(self.file.calibration.zero_mm)
-        rows = []
-        for move in moves:
-            base = frame.pose(Position(move.x_mm, move.y_mm, move.to_mm)).xyz_mm
-            rows.append({**vars(move), "base_mm": [round(v, 3) for v in base]})
-        return rows
-
-    def _say(self, moves: Sequence[Planned], who: str) -> None:
-        simulated = " (simulated)" if self.file.simulated else ""
-        console.say(f"{self.what} of rig {self.file.name}{simulated}: {who or 'the arm moves'}")
-        for row in self._rows(moves):
-            console.say(
-                f"  {row['what']}: at ({row['x_mm']:.1f}, {row['y_mm']:.1f}) mm of the plate, "
-                f"depth {row['from_mm']:+.2f} to at most {row['to_mm']:+.2f} mm at "
-                f"{row['speed_mm_s']:g} mm/s; the deepest point is {row['base_mm']} mm in the "
-                "arm's base frame"
-            )
-
-    def _dry(self, moves: Sequence[Planned], who: str) -> None:
-        rows = self._rows(moves)
-        if self.as_json:
-            console.print_json(
-                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
-                 "dry_run": True, "who": who or "the arm moves", "moves": rows}
-            )  # fmt: skip
-            return
-        columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
-                   "deepest in base, mm"]  # fmt: skip
-        table = [list(row.values()) for row in rows]
-        title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
-        console.print_table(title, columns, table)
-        if who:
-            console.say(who)
-
-    def _show(self, finding: Finding, path: Path, kept: Path | None) -> None:
-        removed = [key for key in finding.remove if self._had(key)]
-        if self.as_json:
-            console.print_json(
-                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
-                 **finding.figures, "written": str(path), "kept": kept and str(kept),
-                 "keys": list(finding.changes), "removed": removed}
-            )  # fmt: skip
-            return
-        simulated = " (simulated)" if self.file.simulated else ""
-        shown = {name: _shown(value) for name, value in finding.figures.items()}
-        console.print_pairs(f"{self.what} of rig {self.file.name}{simulated}", shown)
-        console.say(f"written to {path}: {', '.join(finding.changes)}")
-        for key in removed:
-            console.say(f"removed {key}: it belonged to what was there before")
-        if kept is not None:
-            console.say(f"the old file is {kept}")
-
-    def _had(self, key: str) -> bool:
-        return getattr(self.file.calibration, key.rpartition(".")[2], None) is not None
 
 
 def _creep(speed: float, search: float, clearance: float) -> Creep:
@@ -377,35 +257,3 @@ def _board(columns: int, rows: int, square: float) -> Any:
         return Board(columns, rows, square, 0.75 * square)
     except BoardError as error:
         raise InputError("--columns", "", f"{columns} x {rows}", str(error)) from None
-
-
-def _confirm() -> None:
-    if not sys.stdin.isatty():
-        raise InputError("--yes", "", None, "is needed where there is no terminal to ask on")
-    typer.confirm("Is the way free, and a hand at the stop button? Move the arm?", abort=True,
-                  err=True)  # fmt: skip
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Faults of a device that is given back do not hide what went wrong before."""
-    from contextlib import suppress
-
-    from rigs.capabilities import RigError
-
-    with suppress(RigError):
-        yield
-
-
-def _shown(value: object) -> object:
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
-    if isinstance(value, dict):
-        return "; ".join(f"{key} {_shown(item)}" for key, item in value.items())
-    return _text(value) if isinstance(value, float) else value
-
-
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 100 else (
-        f"{value:.2f}" if isinstance(value, float) else str(value)
-    )  # fmt: skip

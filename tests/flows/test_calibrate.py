@@ -16,8 +16,7 @@ import pytest
 
 from analysis.calibration_charuco import Board, find_corners
 from flows import __main__ as entry
-from flows import calibrate as steps
-from flows import cli_calibrate, console, stopping
+from flows import calibrate, console, measuring, stopping, teach
 from flows.board_print import PNG_PX_PER_MM, print_board
 from protocols import InputError
 from protocols.program import Position
@@ -46,16 +45,16 @@ def lab(folder: Path, *, moved_mm: float = 0.0, leant_mm: float = 0.0, mock: str
     return path
 
 
-def bench(path: Path, **attributes: Any) -> steps.Bench:
+def bench(path: Path, **attributes: Any) -> measuring.Bench:
     file, _ = load_rig_file(path)
     rig = build_rig(file)
     rig.connect()
     for name, value in attributes.items():
         setattr(rig, name, value)
-    return steps.Bench(file, rig, date(2026, 12, 1))
+    return measuring.Bench(file, rig, date(2026, 12, 1))
 
 
-def taught(finding: steps.Finding) -> PlateFrame:
+def taught(finding: measuring.Finding) -> PlateFrame:
     plane = finding.changes["calibration.contact_plane"]
     points = [
         [float(v.removesuffix(" mm")) for v in plane[k]] for k in ("centre", "right", "above")
@@ -77,18 +76,18 @@ def error_of(frame: PlateFrame) -> tuple[float, float]:
     ("moved_mm", "leant_mm"), [(1.2, 0.0), (-1.5, 0.0), (0.5, 1.5), (0.0, 0.0)]
 )
 def test_a_wrong_plane_is_mended(tmp_path: Path, moved_mm: float, leant_mm: float) -> None:
-    found = steps.teach_plane(bench(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
+    found = teach.teach_plane(bench(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
                               QUICK, 2)  # fmt: skip
     off, turned = error_of(taught(found))
     assert off < 0.12
     assert turned < 0.5
     assert found.figures["moved_mm"] == pytest.approx(-moved_mm, abs=0.08)
-    assert found.figures["residual_mm"] <= steps.MOST_PLANE_MM
+    assert found.figures["residual_mm"] <= teach.MOST_PLANE_MM
     assert found.remove == ("calibration.depth_zero",)
 
 
 def test_a_plane_by_hand_is_found_too(tmp_path: Path) -> None:
-    found = steps.teach_plane_by_hand(bench(lab(tmp_path, moved_mm=8.0, leant_mm=6.0)))
+    found = teach.teach_plane_by_hand(bench(lab(tmp_path, moved_mm=8.0, leant_mm=6.0)))
     off, turned = error_of(taught(found))
     assert off < 0.15
     assert turned < 0.5
@@ -126,13 +125,13 @@ def by_hand(points: dict[str, tuple[float, float, float]]) -> Any:
 def test_points_that_make_no_plane_write_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: Any, says: str
 ) -> None:
-    monkeypatch.setattr(steps, "jogged", by_hand(points))
+    monkeypatch.setattr(teach, "jogged", by_hand(points))
     with pytest.raises(RigError, match=says):
-        steps.teach_plane_by_hand(bench(lab(tmp_path)))
+        teach.teach_plane_by_hand(bench(lab(tmp_path)))
 
 
 def test_depth_zero_by_both_ways_is_the_truth(tmp_path: Path) -> None:
-    found = steps.teach_zero(bench(lab(tmp_path, moved_mm=-0.6)), QUICK, 3, True)
+    found = teach.teach_zero(bench(lab(tmp_path, moved_mm=-0.6)), QUICK, 3, True)
     entry_ = found.changes["calibration.depth_zero"]
     assert found.figures["zero_mm"] == pytest.approx(0.6, abs=0.06)
     assert np.mean(found.figures["by_markers_mm"]) == pytest.approx(0.6, abs=0.06)
@@ -144,22 +143,22 @@ def test_a_touch_depth_that_is_wrong_is_told_by_the_markers(tmp_path: Path) -> N
     path = lab(tmp_path)
     path.write_text(path.read_text().replace("touch_depth: 0.34 mm", "touch_depth: 0.04 mm"))
     with pytest.raises(RigError, match=r"apart. Is calibration.touch_depth = 0.04 mm right"):
-        steps.teach_zero(bench(path), QUICK, 1, True)
-    found = steps.teach_zero(bench(path), QUICK, 1, False)
+        teach.teach_zero(bench(path), QUICK, 1, True)
+    found = teach.teach_zero(bench(path), QUICK, 1, False)
     assert found.figures["by_markers_mm"] is None
 
 
 def test_depth_zero_from_a_video(tmp_path: Path) -> None:
     path = lab(tmp_path)
     path.write_text(path.read_text().replace("level: tracks", "level: video"))
-    found = steps.teach_zero(bench(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
+    found = teach.teach_zero(bench(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
     assert abs(found.figures["by_markers_mm"][0]) < 0.08
 
 
 @pytest.mark.parametrize("tip", [(0.0, 0.0, 0.0), (0.8, -1.5, 3.0)])
 def test_the_tip_is_found_by_pivoting(tmp_path: Path, tip: tuple[float, float, float]) -> None:
     path = lab(tmp_path, mock=f"  arm: {{tip_offset_mm: {list(tip)}}}\n")
-    found = steps.teach_tool(bench(path), 8, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    found = teach.teach_tool(bench(path), 8, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     assert np.linalg.norm(np.array(found.figures["offset_mm"]) - tip) < 0.1
     assert found.figures["residual_mm"] < 0.1
     assert found.figures["off_the_tool_set_mm"] == pytest.approx(np.linalg.norm(tip), abs=0.1)
@@ -169,7 +168,7 @@ def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> 
     """Poses are those of a tool; what is found is from the flange."""
     path = lab(tmp_path, mock="  arm: {tip_offset_mm: [0.5, 0, 1]}\n")
     tool = Pose((10.0, -5.0, 80.0), (0.0, 0.0, 90.0))
-    found = steps.teach_tool(bench(path), 8, tool)
+    found = teach.teach_tool(bench(path), 8, tool)
     # the tip in the tool's axes, turned by 90 degrees about z into the flange's
     assert np.allclose(found.figures["offset_mm"], [10.0, -5.0 + 0.5, 81.0], atol=0.1)
 
@@ -180,37 +179,37 @@ def test_poses_that_are_all_alike_write_nothing(
     here = bench(lab(tmp_path))
     here.rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
     with pytest.raises(RigError, match="too much alike"):
-        steps.teach_tool(here, 5, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+        teach.teach_tool(here, 5, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
 def test_the_crop_is_where_the_skin_is(tmp_path: Path) -> None:
-    found = steps.calibrate_crop(bench(lab(tmp_path)), 2.4, 1.0)
+    found = calibrate.calibrate_crop(bench(lab(tmp_path)), 2.4, 1.0)
     assert np.hypot(*(np.array(found.figures["centre_px"]) - [319.5, 239.5])) < 4.0
     # the outer ring's markers, and what they move
     assert 2 * (11.2 + 1.2) * 14 - 10 < found.figures["diameter_px"] < 400
     with pytest.raises(RigError, match="event camera"):
-        steps.calibrate_crop(bench(lab(tmp_path)), 0.01, 0.1)
+        calibrate.calibrate_crop(bench(lab(tmp_path)), 0.01, 0.1)
 
 
 def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(MOCK + "  frame_camera: {k1: -0.2}\n")
     here = bench(path)
-    pictures = steps.see_boards(here, 8)
+    pictures = calibrate.see_boards(here, 8)
     assert len(pictures) == 8
-    found = steps.calibrate_lens(pictures, Board(), here.today)
+    found = calibrate.calibrate_lens(pictures, Board(), here.today)
     assert found.figures["scale_px_per_mm"] == pytest.approx(20.0, rel=3e-4)
     assert found.figures["distortion"][0] == pytest.approx(-0.2, abs=0.02)
     assert found.changes["frame_camera.scale_px_per_mm"] == found.figures["scale_px_per_mm"]
     assert here.rig.simulation is not None
     # another size of square than was printed: the scale follows, the picture cannot tell
-    large = steps.calibrate_lens(pictures, Board(square_mm=6.06, marker_mm=4.545), here.today)
+    large = calibrate.calibrate_lens(pictures, Board(square_mm=6.06, marker_mm=4.545), here.today)
     assert large.figures["scale_px_per_mm"] == pytest.approx(20.0 * 6.0 / 6.06, rel=3e-4)
 
 
 def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="tracks and no pictures"):
-        steps.see_boards(bench(lab(tmp_path)), 4)
+        calibrate.see_boards(bench(lab(tmp_path)), 4)
 
 
 @pytest.mark.parametrize("name", ["board.png", "board.pdf"])
@@ -300,7 +299,7 @@ def test_wrong_input_is_exit_2_and_moves_nothing(
     (tmp_path / "empty").mkdir()
     places = {"LAB": path, "FOLDER": tmp_path / "empty"}
     moved: list[object] = []
-    monkeypatch.setattr(steps, "touch", lambda *_: moved.append(1))
+    monkeypatch.setattr(teach, "touch", lambda *_: moved.append(1))
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert run(*(places.get(str(a), a) for a in arguments)) == console.WRONG_INPUT
     said = capsys.readouterr()
@@ -321,7 +320,7 @@ def test_a_dry_run_says_where_and_connects_to_nothing(
     assert run("teach", what, "--rig", "mock", "--dry-run", "--json") == 0
     data = json.loads(capsys.readouterr().out)
     assert data["dry_run"] is True
-    assert len(data["moves"]) == {"plane": 4, "zero": 1, "tool": 0}[what]
+    assert len(data["moves"]) == {"plane": 4, "zero": 2, "tool": 0}[what]
     for move in data["moves"]:
         assert move["to_mm"] == 2.0
         x = TRUE_PLANE.position(move["base_mm"])
@@ -383,7 +382,7 @@ def test_a_person_who_says_stop_ends_it(
     def stops(*_: object) -> None:
         raise StopRequested
 
-    monkeypatch.setattr(steps, "jogged", stops)
+    monkeypatch.setattr(teach, "jogged", stops)
     path = lab(tmp_path)
     assert run("teach", "tool", "--rig", path, "--yes") == console.INTERRUPTED
     assert "stopped" in capsys.readouterr().err
@@ -400,10 +399,10 @@ def test_the_arm_is_asked_for_before_it_moves(
 
     def answer(text: str, **_: object) -> bool:
         asked.append(text)
-        raise cli_calibrate.typer.Abort
+        raise measuring.typer.Abort
 
     monkeypatch.setattr("sys.stdin", Terminal())
-    monkeypatch.setattr(cli_calibrate.typer, "confirm", answer)
+    monkeypatch.setattr(measuring.typer, "confirm", answer)
     assert run("teach", "zero", "--rig", lab(tmp_path)) == console.INTERRUPTED
     assert "Move the arm?" in asked[0]
 
@@ -443,5 +442,5 @@ def test_an_arm_that_is_stopped_stays_so(tmp_path: Path) -> None:
         "  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"
     )))  # fmt: skip
     with pytest.raises(RigError, match="protective stop"):
-        steps.teach_zero(here, QUICK, 1, False)
+        teach.teach_zero(here, QUICK, 1, False)
     assert here.rig.arm.state() is ArmState.PROTECTIVE_STOP
