@@ -24,7 +24,6 @@ from rigs.rig_file import RigFile, load_rig_file
 from rigs.rig_inheritance import rig_path
 from rigs.teaching import APPROACH_MM_S
 
-
 WAY = (
     f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "
     f"{APPROACH_MM_S:g} mm/s, and then as follows"
@@ -161,7 +160,7 @@ class Measurement:
             return
         columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
                    "deepest in base, mm"]  # fmt: skip
-        table = [list(row.values()) for row in rows]
+        table = [[*list(row.values())[:-1], _shown(row["base_mm"])] for row in rows]
         title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
         console.print_table(title, columns, table)
         console.say(who or WAY)
