@@ -26,7 +26,7 @@ from rigs.teaching import APPROACH_MM_S
 
 WAY = (
     f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "
-    f"{APPROACH_MM_S:g} mm/s, and then as follows"
+    f"{APPROACH_MM_S:g} mm/s, and then as listed"
 )
 
 
@@ -203,6 +203,6 @@ def _shown(value: object) -> object:
 
 
 def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) and abs(value) < 100 else (
+    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 100 else (
         f"{value:.2f}" if isinstance(value, float) else str(value)
     )  # fmt: skip

@@ -185,11 +185,9 @@ class Rig:
         with self.safely(start):
             self._home(start, seed)
             self.events.start()
-            try:
-                self.wait(QUIET_S)
-                zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
-            finally:
-                self.events.stop()
+            self.wait(QUIET_S)
+            zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
+            self.events.stop()
             self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
         self.frame = self.frame.with_zero(zero)
         return zero

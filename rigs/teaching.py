@@ -109,17 +109,16 @@ def touch(
         rig.move(Move("across", across, RETRACT_SPEED_MM_S), out)
         if rig.simulation is not None:
             rig.simulation.begin_trial(seed)
-        try:
-            _start(rig, seed, find is not None)
-            rig.wait(QUIET_S)
-            rate = RateTouch(rig.central_events())
-            _approach(rig, across, clear, rate)
-            watch = _Watch(rig, creep, rate, find)
-            _creep(rig, clear, deepest, watch)
-        finally:
-            for device in (rig.events, rig.frames, rig.sync):
-                with suppress(RigError):
-                    device.stop()
+        # on any failure it is left to `safely` to stop them: the arm comes first
+        _start(rig, seed, find is not None)
+        rig.wait(QUIET_S)
+        rate = RateTouch(rig.central_events())
+        _approach(rig, across, clear, rate)
+        watch = _Watch(rig, creep, rate, find)
+        _creep(rig, clear, deepest, watch)
+        for device in (rig.events, rig.frames, rig.sync):
+            with suppress(RigError):
+                device.stop()
         at = rig.position()
         rig.move(
             Move("release", Position(at.x_mm, at.y_mm, clear.depth_mm), RETRACT_SPEED_MM_S), at
@@ -162,6 +161,8 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
             )
     if not progress.state.healthy:
         raise arm_fault(progress.state, "approach")
+    if not progress.finished:
+        raise ArmFault("arm", f"was stopped from outside, at {rig.position().depth_mm:.2f} mm")
 
 
 class _Watch:
@@ -207,6 +208,8 @@ class _Watch:
                 f"at {self._by_events_mm:.3f} mm: does it see the centre marker? (--by events "
                 "does without)",
             )
+        if self.deepest_mm < self._creep.search_mm - _OVER_MM:
+            return ArmFault("arm", f"was stopped from outside, at {self.deepest_mm:.2f} mm")
         return RigError(
             "arm",
             f"met nothing within the hard limit of {self._creep.search_mm:g} mm beyond the plane "
@@ -303,15 +306,13 @@ def stir(rig: Rig, depth_mm: float, radius_mm: float, speed_mm_s: float, seed: i
         rig.move(Move("press", middle, 2.0), home)
         rig.wait(1.0)
         rig.events.start()
-        try:
-            at = middle
-            for number, way in enumerate((ring, ring[::-1])):
-                for place in (*way, middle):
-                    rig.move(Move("stir", place, speed_mm_s), at)
-                    at = place
-                    chunk = rig.events.read()
-                    np.add.at(count[number], (chunk.y, chunk.x), 1)
-        finally:
-            rig.events.stop()
+        at = middle
+        for number, way in enumerate((ring, ring[::-1])):
+            for place in (*way, middle):
+                rig.move(Move("stir", place, speed_mm_s), at)
+                at = place
+                chunk = rig.events.read()
+                np.add.at(count[number], (chunk.y, chunk.x), 1)
+        rig.events.stop()
         rig.move(Move("release", home, RETRACT_SPEED_MM_S), at)
     return count
