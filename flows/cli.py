@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from flows import console
+from flows.cli_calibrate import calibrate_app, teach_app
 from protocols.errors import InputError
 
 app = typer.Typer(
@@ -19,6 +20,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+app.add_typer(teach_app, name="teach")
+app.add_typer(calibrate_app, name="calibrate")
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]

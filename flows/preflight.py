@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 from flows.console import size
 from flows.orders import Order, check_disk, make_order, missing_bytes, pending_trials
 from protocols import InputError
+from rigs.calibration import COMMANDS, find_faults, measured_on
+from rigs.rig_inheritance import read_rig, rig_path
 from storage.store import Store
 
 
@@ -43,7 +46,45 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
         found.append(Check("space", True, f"needs {needed}, {size(free)} free"))
     except InputError as error:
         found.append(Check("space", False, error.expected))
+    found += _check_calibration(order, rig)
     found += _check_devices(order)
+    return found
+
+
+def _check_calibration(order: Order, rig: Path) -> list[Check]:
+    """Whether what was measured on the rig is there, recent, and of one piece."""
+    plan, calibration = order.plan.protocol.collection, order.rig.calibration
+    needed = {"contact_plane", "tool_centre_point", "event_crop"}
+    if "frames" in plan.recording.streams:
+        needed.add("lens")
+    if plan.maintenance.rezero is None:
+        needed.add("depth_zero")
+    faults = find_faults(
+        calibration,
+        simulated=order.rig.simulated,
+        needed=needed,
+        scale_px_per_mm=order.rig.frame_camera.scale_px_per_mm,
+        today=date.today(),
+    )
+    source = read_rig(rig_path(rig))
+    found = [
+        Check(
+            "calibration",
+            False,
+            InputError(
+                source.blame(f.key),
+                f.key,
+                f.value,
+                f"{f.expected}: run `{f.command} --rig {rig}`",
+            ).message,
+        )
+        for f in faults
+    ]
+    if not found:
+        entries = [name for name in COMMANDS if getattr(calibration, name) is not None]
+        days = ", ".join(f"{name} {measured_on(calibration, name)}" for name in entries)
+        age = " (simulated: of any age)" if order.rig.simulated else ""
+        found.append(Check("calibration", True, f"{days}{age}"))
     return found
 
 

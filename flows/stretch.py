@@ -106,6 +106,7 @@ def _bench_record(order: Order) -> dict[str, Any]:
         "rig": order.rig.name,
         "sensor": order.rig.sensor,
         "skin": skin.serial,
+        "calibration": order.rig.calibration.model_dump(mode="json", exclude_none=True),
         "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
         "simulated": order.rig.simulated,
     }

@@ -65,6 +65,7 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         poll_s=float(file.poll),
         timing=file.timing,
         touch_mm=file.calibration.touch_depth,
+        centre_px=file.calibration.centre_px,
         plate=devices.plate,
         simulation=_MockSimulation(devices),
     )
@@ -73,7 +74,8 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
 def taught_frame(file: RigFile) -> PlateFrame:
     """The plate's frame as it was taught."""
     plane = file.calibration.contact_plane
-    return PlateFrame.taught((plane.centre, plane.right, plane.above))
+    taught = PlateFrame.taught((plane.centre, plane.right, plane.above))
+    return taught.with_zero(file.calibration.zero_mm)
 
 
 def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:

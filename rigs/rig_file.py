@@ -7,61 +7,23 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from protocols.errors import InputError
 from protocols.hashing import hash_text
 from protocols.plan import Plan
 from protocols.program import Move
-from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
+from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
 from protocols.timing import Timing
 from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from rigs.calibration import Calibration, without_taught
 from rigs.devices import DeviceSettings
 from rigs.mock.promises import check_promises
 from rigs.mock.settings import MockSettings
 from rigs.rig_inheritance import read_rig, rig_path
 
-
-def _mm(raw: object) -> float:
-    return float(parse(raw, "mm"))
-
-
-Millimetre = Annotated[float, BeforeValidator(_mm)]
-Point = tuple[Millimetre, Millimetre, Millimetre]
-
-
-class ContactPlane(StrictModel):
-    """The plate, taught by touching three points with the sensor's centre papilla."""
-
-    centre: Point
-    right: Point
-    """Any point at least 5 mm to the right of the centre, as the sensor sees the plate."""
-    above: Point
-    """Any point at least 5 mm above the centre."""
-    taught: date
-
-    @model_validator(mode="after")
-    def _spans(self) -> ContactPlane:
-        """Three points that are a plane; the frame itself is made by `rigs.plate_frame`."""
-        right, above = (
-            [b - a for a, b in zip(self.centre, point, strict=True)]
-            for point in (self.right, self.above)
-        )
-        lengths = math.hypot(*right), math.hypot(*above)
-        if min(lengths) < 5.0:
-            raise ValueError("needs points at least 5 mm from the centre")
-        cosine = sum(a * b for a, b in zip(right, above, strict=True)) / (lengths[0] * lengths[1])
-        if abs(cosine) > 0.98:
-            raise ValueError("has its three points almost on one line")
-        return self
-
-
-class Calibration(StrictModel):
-    """What was measured on this rig."""
-
-    contact_plane: ContactPlane
-    touch_depth: Millimetre = 0.0
-    """How deep the centre papilla is when touching off notices it, found once with a gauge."""
+SCALE_ERROR = 0.005
+"""How far a measured scale may be from the true one, as a share."""
 
 
 class RigLimits(StrictModel):
@@ -191,11 +153,11 @@ class RigFile(StrictModel):
 
     @model_validator(mode="after")
     def _scales_agree(self) -> RigFile:
-        """The simulated camera draws at the scale that the rig file promises."""
+        """The simulated camera draws at the scale that the rig file promises, or has measured."""
         if self.mock is None:
             return self
         told, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
-        if told != drawn:
+        if abs(told - drawn) > SCALE_ERROR * drawn:
             raise KeyedError(
                 "frame_camera.scale_px_per_mm",
                 told,
@@ -283,7 +245,7 @@ def same_rig(one: str, other: str) -> bool:
     """Whether two contents of rig files describe one rig.
 
     The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
-    ended goes on without it.
+    ended goes on without it. So does one whose plate was taught anew.
     """
     if one == other:
         return True
@@ -291,7 +253,7 @@ def same_rig(one: str, other: str) -> bool:
     for data in (first, second):
         if isinstance(data.get("mock"), dict):
             data["mock"].pop("faults", None)
-    return first == second
+    return without_taught(first) == without_taught(second)
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:

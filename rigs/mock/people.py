@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from protocols.program import PlateAction
 from rigs.capabilities import ArmState
+from rigs.mock.jogging import hold_board, jog
 from rigs.mock.world import World
 from rigs.people import mass_of
 
@@ -58,7 +59,8 @@ class SimulatedOperator:
     """Does at once what it is asked, and says so.
 
     `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
-    stop at the pendant. Everything else is only confirmed.
+    stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
+    the camera (`rigs.mock.jogging`). Everything else is only confirmed.
     """
 
     def __init__(self, world: World) -> None:
@@ -76,4 +78,8 @@ class SimulatedOperator:
             self._world.mass_kg = mass_of(expected)
         elif task == "protective_stop":
             self._world.arm_state = ArmState.READY
+        elif task == "jog":
+            return jog(self._world, expected)
+        elif task == "board":
+            hold_board(self._world, expected)
         return True

@@ -26,6 +26,7 @@ from rigs.mock.path import SENSOR, ArmPath, Leg
 from rigs.mock.physics import Physics
 from rigs.mock.settings import MockSettings
 from rigs.mock.skins import skin_of
+from rigs.scene.board import BoardPlace
 from rigs.scene.skin import Skin
 from rigs.scene.vibration import Vibration
 
@@ -39,7 +40,8 @@ NEAR_MM = 5.0
 
 def start_pose(settings: MockSettings) -> Pose:
     """Where the arm stands when the rig is switched on."""
-    start = ContactPlane.from_settings(settings.scene.contact).pose(0.0, 0.0, -CLEARANCE_MM)
+    plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+    start = plane.pose(0.0, 0.0, -CLEARANCE_MM)
     if settings.arm.start_xyz_mm is not None:
         return Pose(settings.arm.start_xyz_mm, start.rotvec_deg)
     return start
@@ -52,6 +54,7 @@ class World:
         now_ns: true time since the trial began, which is also the host's monotonic clock.
         past_ns: true time spent in earlier trials.
         trials: how often `begin_trial` was called.
+        board: where a printed board is held before the outside camera, if it is.
         plate_marked: whether the sliding plate with its ArUco marker stands there.
 
     Args:
@@ -65,10 +68,11 @@ class World:
     ) -> None:
         self.settings, self._run_on = settings, run_on
         self.skin: Skin = skin_of(settings)
-        self.plane = ContactPlane.from_settings(settings.scene.contact)
+        self.plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self.mass_kg = settings.scene.plate.mass_kg
         self.now_ns = self.past_ns = 0
         self.trials = 0
+        self.board: BoardPlace | None = None
         self.path = path or ArmPath(self.plane, start_pose(settings))
         self.arm_state = ArmState.READY
         self.on_begin: list[Callable[[], None]] = []

@@ -108,7 +108,7 @@ class Theatre:
         _rehearse(settings, timing)
         self._origin_ns = time.monotonic_ns() - LAG_NS
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
-        plane = ContactPlane.from_settings(settings.scene.contact)
+        plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self._arm_clock = clocks.arm
         self._path = MotionPath(plane, start_pose(settings), clocks.arm)
         self.world = World(settings, self._path, run_on=True)
