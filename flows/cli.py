@@ -10,6 +10,7 @@ import typer
 
 from flows import console
 from flows.cli_calibrate import calibrate_app, teach_app
+from flows.cli_rigs import rigs
 from protocols.errors import InputError
 
 app = typer.Typer(
@@ -21,6 +22,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+app.command()(rigs)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
 

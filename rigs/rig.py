@@ -18,6 +18,7 @@ from rigs.capabilities import (
     ArmFault,
     ArmState,
     Clock,
+    DeviceHealth,
     EventCamera,
     FrameCamera,
     Operator,
@@ -118,6 +119,26 @@ class Rig:
                 device.close()
         for end in self.ending:
             end()
+
+    def health(self) -> list[DeviceHealth]:
+        """What the connected devices say of themselves; simulated ones have nothing to say.
+
+        Raises:
+            RigError: one does not answer.
+        """
+        devices = (self.arm, self.events, self.frames, self.sync)
+        return [device.health() for device in devices if hasattr(device, "health")]
+
+    def describe(self) -> dict[str, Json]:
+        """What drivers tell of the trial that just ran, by device: settings, counts, losses."""
+        told = {}
+        for name, device in (("event_camera", self.events), ("frame_camera", self.frames)):
+            if hasattr(device, "describe"):
+                told[name] = device.describe()
+        losses = getattr(self.sync, "losses", None)
+        if losses is not None:
+            told["sync_box"] = {"losses": vars(losses)}
+        return told
 
     def run_trial(
         self,

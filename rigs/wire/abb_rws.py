@@ -262,6 +262,8 @@ class AbbStandIn:
                 "cycle": "once",
             },
             "rw/panel/ctrlstate": lambda: {"ctrlstate": self.controller},
+            "rw/system": lambda: {"name": "IRB120 stand-in", "rwversion": "6.08.00.01"},
+            "ctrl/identity": lambda: {"ctrl-name": "IRB120 stand-in", "ctrl-id": "120-000000"},
             "rw/panel/opmode": lambda: {"opmode": self.mode},
             "rw/elog/0/": self._log_entry,
             "rw/rapid/tasks": lambda: {

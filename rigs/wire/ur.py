@@ -240,6 +240,7 @@ class UrStandIn:
             program.unlock()
             return "Protective stop releasing"
         answers = {
+            "get robot model": "UR5",
             "get serial number": "20205500000",
             "PolyscopeVersion": "URSoftware " + ".".join(map(str, VERSION)) + " (Jan 01 2021)",
             "is in remote control": str(program.remote).lower(),
