@@ -30,7 +30,9 @@ def check_devices(order: Order) -> list[Check]:
     """Connect every device, hear what it says of itself, and fit the clocks; nothing moves."""
     from rigs.build import build_rig
 
-    found: list[Check] = []
+    found = _check_reach(order)
+    if not all(item.passed for item in found):
+        return found
     try:
         rig = build_rig(order.rig)
     except RigError as error:
@@ -48,6 +50,17 @@ def check_devices(order: Order) -> list[Check]:
     finally:
         rig.close()
     return found
+
+
+def _check_reach(order: Order) -> list[Check]:
+    """Devices of a real rig that cannot be reached at all, each by name."""
+    if order.rig.simulated or order.rig.devices is None:
+        return []
+    from rigs.reach import reach
+
+    return [
+        Check(name, False, why) for name, why in reach(order.rig.devices).items() if why is not None
+    ]
 
 
 def _check_clocks(order: Order, rig: Rig) -> list[Check]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import Any
 
+from rigs.arms.settings import ArmSettings, PlaneSettings
 from rigs.capabilities import FrameCamera, Operator, Plate, RigError, Simulation
 from rigs.devices import DeviceSettings
 from rigs.host_clock import HostClock
@@ -78,6 +79,16 @@ def taught_frame(file: RigFile) -> PlateFrame:
     return taught.with_zero(file.calibration.zero_mm)
 
 
+def limited_arm(file: RigFile, devices: DeviceSettings) -> ArmSettings:
+    """The arm's settings; its limits follow the plate that was taught, unless they name one."""
+    limits = devices.arm.limits
+    if limits.plate is None:
+        plane = file.calibration.contact_plane
+        plate = PlaneSettings(centre_mm=plane.centre, right_mm=plane.right, above_mm=plane.above)
+        limits = limits.model_copy(update={"plate": plate})
+    return devices.arm.model_copy(update={"limits": limits})
+
+
 def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     console = ConsoleOperator()
     person = PersonAtPlate(console, devices.plate.mass_kg) if devices.plate else None
@@ -131,7 +142,7 @@ def _driven_rig(
         rig = Rig(
             name=file.name,
             clock=HostClock(),
-            arm=build_arm(devices.arm),
+            arm=build_arm(limited_arm(file, devices)),
             events=events,
             frames=frames,
             sync=SerialSyncBox(devices.sync_box),

@@ -66,7 +66,8 @@ def rig_path(given: Path) -> Path:
 def read_rig(path: Path) -> RigSource:
     """A rig file with everything that it extends, merged but not checked.
 
-    Mappings are merged key by key, everything else is replaced as a whole.
+    Mappings are merged key by key, everything else is replaced as a whole; so is a device's
+    section that names another driver.
 
     Raises:
         InputError: a file cannot be read, or extends itself, or goes on for more than 8 files.
@@ -107,8 +108,12 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     merged = dict(below)
     for key, value in above.items():
         known = merged.get(key)
-        both = isinstance(known, dict) and isinstance(value, dict)
-        merged[key] = _merge(known, value) if both else value  # type: ignore[arg-type]
+        if isinstance(known, dict) and isinstance(value, dict):
+            # another driver has other settings
+            other = "driver" in value and value["driver"] != known.get("driver")
+            merged[key] = value if other else _merge(known, value)
+        else:
+            merged[key] = value
     return merged
 
 

@@ -54,11 +54,17 @@ class SingularityError(GuardError):
 
 
 class Guard:
-    """Holds paths against one rig's limits."""
+    """Holds paths against one rig's limits.
+
+    Raises:
+        ValueError: limits in the plate's frame, and no plate.
+    """
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         plate = limits.plate
+        if plate is None and (limits.frame == "plate" or limits.depth_mm is not None):
+            raise ValueError("limits in the plate's frame need the taught plate (limits.plate)")
         self._frame = (
             PlateFrame.taught((plate.centre_mm, plate.right_mm, plate.above_mm))
             if plate is not None

@@ -36,6 +36,7 @@ class Limits(StrictModel):
     frame: Literal["base", "plate"] = "base"
     """Whose axes the box is in: the arm's base, or the plate (right, up, into the plate)."""
     plate: PlaneSettings | None = None
+    """Left out, the contact plane that the rig was taught."""
     speed_mm_s: Positive = 50.0
     depth_mm: Finite | None = None
     """How far beyond the taught plane the tool centre point may go; needs `plate`."""
@@ -49,8 +50,6 @@ class Limits(StrictModel):
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
                 raise KeyedError("limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm")
-        if self.plate is None and (self.frame == "plate" or self.depth_mm is not None):
-            raise KeyedError("limits.plate", None, "is needed by limits in the plate's frame")
         return self
 
 
