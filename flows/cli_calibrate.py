@@ -126,12 +126,12 @@ def teach_tool(
     rig: RigOption,
     poses: Annotated[int, typer.Option("--poses", min=4, max=50, help="How many.")] = 8,
     tool: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--tool", help="Tool that the controller has now, x,y,z in mm and rotation vector in "
-            "degrees, from the flange."
+            "degrees, from the flange; the rig file's if left out."
         ),
-    ] = "0,0,0,0,0,0",
+    ] = None,
     out: OutOption = None,
     yes: YesOption = False,
     dry_run: DryOption = False,
@@ -140,11 +140,13 @@ def teach_tool(
     """The tool centre point: a person brings the tip onto one point, leaning in many ways."""
     from flows import teach as steps
     from flows.measuring import Measurement
+    from rigs.build import tool_of
 
     command = Measurement(rig, out, "tool", as_json)
-    set_now = _tool(tool)
+    set_now = None if tool is None else _tool(tool)
     command.run(
-        [], yes, dry_run, lambda bench: steps.teach_tool(bench, poses, set_now),
+        [], yes, dry_run,
+        lambda bench: steps.teach_tool(bench, poses, set_now or tool_of(bench.file)),
         "a person jogs the arm",
     )  # fmt: skip
 

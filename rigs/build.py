@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from rigs.arms.settings import ArmSettings, PlaneSettings
-from rigs.capabilities import FrameCamera, Operator, Plate, RigError, Simulation
+from rigs.capabilities import FrameCamera, Operator, Plate, Pose, RigError, Simulation
 from rigs.devices import DeviceSettings
 from rigs.host_clock import HostClock
 from rigs.mock.devices import MockDevices, build_mock
@@ -79,14 +79,24 @@ def taught_frame(file: RigFile) -> PlateFrame:
     return taught.with_zero(file.calibration.zero_mm)
 
 
-def limited_arm(file: RigFile, devices: DeviceSettings) -> ArmSettings:
-    """The arm's settings; its limits follow the plate that was taught, unless they name one."""
-    limits = devices.arm.limits
+def tool_of(file: RigFile) -> Pose:
+    """The tool that the arm's controller is told of, from the flange: as taught, else as given."""
+    taught = file.calibration.tool_centre_point
+    if file.devices is None:
+        return Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    tool = file.devices.arm.tool
+    return Pose(tool.tcp_mm if taught is None else taught.offset, tool.tcp_rotvec_deg)
+
+
+def calibrated_arm(file: RigFile, devices: DeviceSettings) -> ArmSettings:
+    """The arm's settings: tool as taught, limits that follow the taught plane unless they say."""
+    arm = devices.arm
+    limits, plane = arm.limits, file.calibration.contact_plane
     if limits.plate is None:
-        plane = file.calibration.contact_plane
         plate = PlaneSettings(centre_mm=plane.centre, right_mm=plane.right, above_mm=plane.above)
         limits = limits.model_copy(update={"plate": plate})
-    return devices.arm.model_copy(update={"limits": limits})
+    tool = arm.tool.model_copy(update={"tcp_mm": tool_of(file).xyz_mm})
+    return arm.model_copy(update={"limits": limits, "tool": tool})
 
 
 def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
@@ -142,7 +152,7 @@ def _driven_rig(
         rig = Rig(
             name=file.name,
             clock=HostClock(),
-            arm=build_arm(limited_arm(file, devices)),
+            arm=build_arm(calibrated_arm(file, devices)),
             events=events,
             frames=frames,
             sync=SerialSyncBox(devices.sync_box),
