@@ -9,11 +9,13 @@ be wrong: the 95 % quantile of the largest error anywhere between the first and 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
+
+from analysis.pulse_kernels import median, normal_equations, places_of, quantile, residuals_at
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -38,8 +40,12 @@ def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
     half = x.size // 2
     run = x[half : 2 * half] - x[:half]
     far = run > 0
-    slope = float(np.median((y[half : 2 * half] - y[:half])[far] / run[far])) if far.any() else 0.0
-    return slope, float(np.median(y - slope * x))
+    gained = y[half : 2 * half] - y[:half]
+    if far.all():
+        slope = median(gained / run) if half else 0.0
+    else:
+        slope = median(gained[far] / run[far]) if far.any() else 0.0
+    return slope, median(y - slope * x)
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class ClockLine:
     @cached_property
     def residual_p95(self) -> float:
         """95th percentile of the absolute residuals of the pulses on the line, ns."""
-        return float(np.quantile(np.abs(self.residuals[self.inside]), 0.95))
+        return quantile(np.abs(self.residuals[self.inside]), 0.95)
 
     @cached_property
     def slopes(self) -> Floats:
@@ -91,7 +97,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
     floor = max(0.3 * resolution, 0.5)
     rough = y - slope * x - level
     # scatter between neighbours is free of any bend
-    local = max(1.4826 * float(np.median(np.abs(np.diff(rough)))) / 2**0.5, floor)
+    local = max(1.4826 * median(np.abs(rough[1:] - rough[:-1])) / 2**0.5, floor)
     knots = x[[0, -1]]
     values = slope * knots + level
     while True:
@@ -112,47 +118,30 @@ def _robust(
     x: Floats, y: Floats, knots: Floats, values: Floats, floor: float
 ) -> tuple[Floats, Floats, Bools, float]:
     """Huber's M-estimate of the values at knots on what lies inside 5 robust sigma."""
-    piece = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, knots.size - 2)
-    share = (x - knots[piece]) / (knots[piece + 1] - knots[piece])
+    piece, share = places_of(x, knots)
     residuals = y - np.interp(x, knots, values)
     for _ in range(20):
         size = np.abs(residuals)
-        sigma = max(1.4826 * float(np.median(size)), floor)
+        sigma = max(1.4826 * median(size), floor)
         inside = size <= _GATE * sigma
-        full = np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-9))
-        weights = np.where(inside, full, 0.0)
-        new = _least_squares(piece, share, y, weights, knots.size)
+        matrix, right = normal_equations(
+            piece, share, y, residuals, _GATE * sigma, _HUBER * sigma, knots.size
+        )
+        new: Floats = np.linalg.solve(_held(matrix), right)
         moved = float(np.abs(new - values).max())
         values = new
-        residuals = y - (values[piece] + share * (values[piece + 1] - values[piece]))
+        residuals = residuals_at(piece, share, y, values)
         if moved < 1e-3 * sigma:
             break
     sigma = float(np.sqrt((residuals[inside] ** 2).sum() / max(1, inside.sum() - knots.size)))
     return values, residuals, inside, max(sigma, floor)
 
 
-def _normal_matrix(piece: NDArray[np.int64], share: Floats, weights: Floats, n: int) -> Floats:
-    """Of the hat functions at n knots."""
-    matrix: Floats = np.zeros((n, n))
-    here, there = np.arange(n - 1), np.arange(1, n)
-    matrix[here, here] += np.bincount(piece, weights * (1 - share) ** 2, n - 1)
-    matrix[there, there] += np.bincount(piece, weights * share**2, n - 1)
-    matrix[here, there] = np.bincount(piece, weights * share * (1 - share), n - 1)
-    matrix[there, here] = matrix[here, there]
+def _held(matrix: Floats) -> Floats:
+    """Normal equations in which a piece with a single pulse in it hangs on its neighbours."""
+    n = matrix.shape[0]
+    matrix.flat[:: n + 1] += 1e-12 * matrix.trace() / n
     return matrix
-
-
-def _least_squares(
-    piece: NDArray[np.int64], share: Floats, y: Floats, weights: Floats, n: int
-) -> Floats:
-    right: Floats = np.zeros(n)
-    right[:-1] += np.bincount(piece, weights * (1 - share) * y, n - 1)
-    right[1:] += np.bincount(piece, weights * share * y, n - 1)
-    matrix = _normal_matrix(piece, share, weights, n)
-    # a piece with a single pulse in it hangs on its neighbours
-    matrix[np.diag_indices(n)] += 1e-12 * matrix.trace() / n
-    result: Floats = np.linalg.solve(matrix, right).astype(np.float64)
-    return result
 
 
 def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -> bool:
@@ -175,10 +164,9 @@ def _judged(
 ) -> ClockLine:  # fmt: skip
     """The line with its uncertainty."""
     inner, n = residuals[inside], knots.size
-    piece = np.clip(np.searchsorted(knots, x[inside], side="right") - 1, 0, n - 2)
-    share = (x[inside] - knots[piece]) / (knots[piece + 1] - knots[piece])
-    matrix = _normal_matrix(piece, share, np.ones(inner.size), n)
-    matrix[np.diag_indices(n)] += 1e-12 * matrix.trace() / n
+    piece, share = places_of(x[inside], knots)
+    none = np.zeros(inner.size)
+    matrix = _held(normal_equations(piece, share, none, none, np.inf, np.inf, n)[0])
     # asymptotic variance of Huber's estimate (Huber 1964): E psi^2 / (E psi')^2
     limit = _HUBER * sigma
     linear = max(float((np.abs(inner) < limit).mean()), 0.1)
@@ -187,7 +175,10 @@ def _judged(
     covariance = variance * np.linalg.inv(matrix)
     root = np.linalg.cholesky(covariance + (1e-12 * covariance.trace() / n + 1e-6) * np.eye(n))
     # between knots the error is no larger than at one of them
-    largest = np.abs(_draws(n) @ root.T).max(axis=1)
+    errors = _draws(n) @ root.T
+    np.abs(errors, out=errors)
+    # numpy is slow where it takes the largest of two
+    largest = errors.max(axis=1) if n > 8 else reduce(np.maximum, errors.T)
     band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
     band *= float(special.stdtrit(max(1, inner.size - n), 0.975)) / 1.959964
     sag, sudden = 0.0, 0.0
@@ -232,7 +223,7 @@ def _locked(residuals: Floats, resolution: float) -> float:
     """
     if resolution == 0.0 or residuals.size < 2:
         return 0.0
-    shaken = 1.4826 * float(np.median(np.abs(np.diff(residuals)))) / 2**0.5 / resolution
+    shaken = 1.4826 * median(np.abs(residuals[1:] - residuals[:-1])) / 2**0.5 / resolution
     return 0.5 * resolution * float(np.exp(-2 * np.pi**2 * shaken**2))
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.clock_line import ClockLine, fit_line
+from analysis.pulse_kernels import median
 from analysis.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
 from analysis.pulse_runs import stray_stretch
 from storage.clockmap import ClockMap
@@ -203,7 +204,7 @@ def _fit(
         pulses_late=int(px.size - inside.sum()),
         pulses_missed=int(in_span.sum()) - px.size,
         pulses_spurious=x.size - px.size,
-        residual_median_ns=float(np.median(residuals)),
+        residual_median_ns=median(residuals),
         residual_p95_ns=line.residual_p95,
         residual_max_ns=float(residuals.max()),
         offset_ns=clock.to_reference(middle_ns) - middle_ns,
@@ -255,7 +256,7 @@ def _gate_share(x: Floats, y: Floats, match: Match) -> None:
             "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
         )
     px, py = x[match.device], y[match.reference]
-    lag = float(np.median(py - px))
+    lag = median(py - px)
     low, high = max(x[0] + lag, y[0]), min(x[-1] + lag, y[-1])
     in_x = int(((x + lag >= low) & (x + lag <= high)).sum())
     in_y = int(((y >= low) & (y <= high)).sum())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from analysis.clock_line import theil_sen
+from analysis.pulse_kernels import fullest, pair, partners, quantile
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -93,7 +94,7 @@ def match_trains(
 def tick_of(reference: Ints) -> float:
     """The grid on which pulses come: the shortest common interval between pulses, ns."""
     steps = np.diff(reference)
-    tick = float(np.quantile(steps[steps > 0], 0.1)) if (steps > 0).any() else 0.0
+    tick = quantile(steps[steps > 0], 0.1) if (steps > 0).any() else 0.0
     if tick < 1_000:
         raise NoMatchError("no_match", f"reference pulses {tick:.0f} ns apart are no pulse train")
     return tick
@@ -119,7 +120,7 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
         raise NoMatchError(
             "no_match", "the reference pulses span hours: stray stamps, or many trials"
         )
-    y_bins = np.zeros(int((y[-1] - y_start) / width) + 1)
+    y_bins = np.zeros(int((y[-1] - y_start) / width) + 1, np.float32)
     y_bins[((y - y_start) / width).astype(np.int64)] = 1.0
     length = _PIECE_TICKS * tick
     best: list[_Place] = []
@@ -156,7 +157,7 @@ def _spread(count: int) -> list[float]:
 
 
 def _correlate(
-    piece: Floats, y_bins: Floats, width: float, max_drift: float
+    piece: Floats, y_bins: NDArray[np.float32], width: float, max_drift: float
 ) -> tuple[list[float], list[float], float]:
     """Lags of the piece's centre from bin 0 (ns) and drifts that fit best, and the peak ratio.
 
@@ -169,15 +170,17 @@ def _correlate(
     # one step of drift moves the piece's ends by a bin
     steps = int(np.ceil(max_drift * half / width))
     drifts = np.linspace(-max_drift, max_drift, 2 * steps + 1) if steps else np.zeros(1)
-    combs = np.zeros((drifts.size, bins + 2))
+    combs = np.zeros((drifts.size, bins + 2), np.float32)
     for comb, drift in zip(combs, drifts, strict=True):
         places = np.round(piece * (1 + drift) / width).astype(np.int64) + bins // 2 + 1
         comb[places] = 1.0
     # a pulse may fall on either side of an edge: let it count in the neighbours too
     combs[:, 1:-1] += 0.5 * (combs[:, 2:] + combs[:, :-2])
-    every = fft.irfft(spectrum * np.conj(fft.rfft(combs, size)), size)
-    which = every.argmax(axis=0)
-    scores = every[which, np.arange(size)]
+    products = fft.rfft(combs, size)
+    np.multiply(spectrum, np.conj(products, out=products), out=products)
+    every = fft.irfft(products, size, overwrite_x=True)
+    # all counts are multiples of a half, which rounding finds again
+    scores = np.rint(2.0 * every.max(axis=0))
     first = float(scores.max())
     columns: list[int] = []
     second = 0.0
@@ -198,7 +201,7 @@ def _correlate(
     lags = [column if column < y_bins.size else column - size for column in columns]
     return (
         [(lag + bins // 2 + 1 + 0.5) * width for lag in lags],
-        [float(drifts[which[column]]) for column in columns],
+        [float(drifts[np.rint(2.0 * every[:, column]).argmax()]) for column in columns],
         second / first,
     )
 
@@ -275,17 +278,10 @@ def _first_line(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[float
     piece = x[first : last + 1]
     u = piece - place.centre
     predicted = u * (1 + place.drift) + place.centre + place.lag
-    low = np.searchsorted(y, predicted - tick)
-    high = np.searchsorted(y, predicted + tick)
-    counts = high - low
-    which = np.repeat(np.arange(piece.size), counts)
-    begin = np.repeat(low - np.concatenate(([0], np.cumsum(counts)[:-1])), counts)
-    partner = begin + np.arange(which.size)
+    which, partner = partners(predicted, y, tick)
     difference = y[partner] - predicted[which]
     window = tick / 2
-    ordered = np.sort(difference)
-    held = np.searchsorted(ordered, ordered + window, side="right") - np.arange(ordered.size)
-    start = ordered[int(held.argmax())] if ordered.size else 0.0
+    start = fullest(np.sort(difference), window)
     chosen = (difference >= start) & (difference <= start + window)
     if chosen.sum() < MIN_PULSES // 2:
         raise NoMatchError("no_match", "the trains fit nowhere")
@@ -305,22 +301,5 @@ def _pair_strip(
     if low == high:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     # a quarter tick leaves room for bends
-    i, j = _pair(predicted, y[low:high], tick / 4)
+    i, j = pair(predicted, y[low:high], tick / 4)
     return i + first, j + low
-
-
-def _pair(predicted: Floats, y: Floats, gate: float) -> tuple[Ints, Ints]:
-    """Indices of pulses that are each other's nearest, closer than `gate`; both ascending."""
-    to_y = _nearest(y, predicted)
-    back = _nearest(predicted, y)
-    mutual = back[to_y] == np.arange(predicted.size)
-    i = np.flatnonzero(mutual & (np.abs(y[to_y] - predicted) <= gate))
-    return i, to_y[i]
-
-
-def _nearest(grid: Floats, values: Floats) -> Ints:
-    if grid.size == 1:
-        return np.zeros(values.size, np.int64)
-    right = np.clip(np.searchsorted(grid, values), 1, grid.size - 1)
-    left = right - 1
-    return np.where(values - grid[left] <= grid[right] - values, left, right).astype(np.int64)

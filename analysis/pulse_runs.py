@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from analysis.pulse_kernels import most_off
+
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
@@ -66,14 +68,7 @@ def stray_stretch(
         for width in widths:
             if width > reference.size:
                 continue
-            first = np.arange(reference.size - width + 1)
-            first = first[[0, -1]] if at_ends else first
-            on_line = fits[first + width] - fits[first]
-            there = high[first + width - 1] - low[first]
-            # a device that reports few pulses lost some: no doubt about its clock. Where it
-            # reports far too many, noise hides what the clock does
-            clean = there <= 1.5 * width
-            off = int((np.minimum(width, there) - on_line).max(initial=0, where=clean))
+            off = most_off(width, fits, low, high, at_ends)
             if off > max(least, _limit(width, bad_device, bad_reference, log_places)):
                 where = "at one end" if at_ends else "one after the other"
                 return f"of {width} pulses {where} {off} lie off the line"

@@ -5,10 +5,15 @@ another process through dv-processing and the DVXplorer driver; both go into a t
 Events are made before the clock runs. One run, for it is long.
 
 frames_lost, events_lost, pulses_lost: sent or exposed, and not in the trial's files. The emulated
-camera slows down where a real one would lose frames, so `frames_per_s` stands beside them.
-memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all.
+camera slows down where a real one would lose frames, so `frames_per_s` stands beside them. It is
+asked for `EMULATED_HZ`, for it waits a period and then draws: asked for 100/s, it makes 99.
+dropped_on_purpose, dropped_noticed: in a second, short run the stand-in drops frames; noticed are
+those missing in the file's frame numbers that the driver counted too.
+memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all;
+memory_end_growth_mb: from the median of the first fifth to that of the last.
 cores: processor time of this process, all drivers, pylon's emulation and writing, over time.
-loop_max_ms: the longest time between two looks of the loop that reads and writes.
+loop_max_ms: the longest time between two looks of the loop that reads and writes; queued_max_ms:
+how much of that it waited for a processor that others had.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,
 over 100. encode_s_per_trial: encoding the run's spool when the trial ends.
 """
@@ -21,26 +26,31 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
-from benchmarks.measure import SEED, Figures, resident_mb
+from benchmarks.measure import SEED, Figures, queued_s, resident_mb
 from benchmarks.storage import noisy_frames
 from rigs.cameras.basler import BaslerCamera, find_camera
 from rigs.cameras.dvxplorer import DvxplorerCamera
 from rigs.cameras.settings import BaslerSettings
 from rigs.scene.randomness import generator
-from rigs.wire.basler import emulate, show, write_frames
+from rigs.wire.basler import LossyDevice, emulate, show, write_frames
 from rigs.wire.dvxplorer import DvxplorerServer, Packet
 from storage.files import sync_file
 from storage.hdf5 import StreamReader
 from storage.streams import U8, EventChunk, FrameChunk
 from storage.video import count_frames
-from storage.writer import DATA, FRAMES, TrialWriter
+from storage.writer import DATA, FRAMES, SPOOL, TrialWriter
 
 RATE_HZ = 100
+EMULATED_HZ = 101
 PACKET_US = 10_000
 POLL_S = 0.01
+FREE_RUN = BaslerSettings(px_per_mm=20.0, trigger="free run", rate_hz=EMULATED_HZ)
+BURSTS = (1, 2, 5, 17)
+"""How many frames in a row the stand-in drops on purpose."""
 TAIL_S = 10.0
 """How long it waits for what was sent and is not there yet."""
 
@@ -58,6 +68,7 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         write_frames(Path(folder) / "pictures", images)
         figures = _run(Path(folder), seconds, events_per_s, size)
+        figures |= _drop(Path(folder), size)
         figures["saturation_x_realtime"] = _saturate(Path(folder), images, saturating) / RATE_HZ
     return figures
 
@@ -77,9 +88,7 @@ def busy(seconds: float, events_per_s: int) -> Iterator[Packet]:
 
 def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
     trial = TrialWriter(folder / "aside", folder / "trial", (size, size), RATE_HZ, spool=True)
-    frames = BaslerCamera(
-        BaslerSettings(px_per_mm=20.0, trigger="free run", rate_hz=RATE_HZ), find_camera(None)
-    )
+    frames = BaslerCamera(FREE_RUN)
     with DvxplorerServer(partial(busy, seconds, events_per_s)) as server:
         events = DvxplorerCamera(server.settings)
         try:
@@ -102,7 +111,8 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
             frames.close()
     with StreamReader(trial.folder / DATA) as reader:
         rows = reader.counts()
-    early = memory[: max(len(memory) // 5, 1)]
+    fifth = max(len(memory) // 5, 1)
+    early, late = memory[:fifth], memory[-fifth:]
     return {
         "frames_lost": counts.lost + counts.grabbed - count_frames(trial.folder / FRAMES),
         "events_lost": sent.events - rows["events/t"],
@@ -111,7 +121,9 @@ def _run(folder: Path, seconds: float, events_per_s: int, size: int) -> Figures:
         "m_events_per_s": sent.events / sent.seconds / 1e6,
         **rates,
         "memory_growth_mb": max(0.0, max(memory) - max(early)),
-        "loop_max_ms": max(pauses) * 1e3,
+        "memory_end_growth_mb": max(0.0, median(late) - median(early)),
+        "loop_max_ms": max(pauses)[0] * 1e3,
+        "queued_max_ms": max(pauses)[1] * 1e3,
         "encode_s_per_trial": encode_s,
     }
 
@@ -122,9 +134,10 @@ def _loop(
     events: DvxplorerCamera,
     server: DvxplorerServer,
     seconds: float,
-) -> tuple[list[float], list[float], Figures]:
+) -> tuple[list[float], list[tuple[float, float]], Figures]:
     """Read and write as a rig does: memory at every look, time between looks, and rates."""
     memory, pauses, idle = [], [], threading.Event()
+    queued = queued_s()
     used = time.process_time()
     began = last = time.perf_counter()
     while last - began < seconds or not server.answered:
@@ -134,7 +147,8 @@ def _loop(
         memory.append(resident_mb())
         idle.wait(POLL_S)
         now = time.perf_counter()
-        pauses.append(now - last)
+        queued, before = queued_s(), queued
+        pauses.append((now - last, queued - before))
         last = now
     rates = {
         "frames_per_s": frames.counts.grabbed / (last - began),
@@ -157,6 +171,37 @@ def _tail(trial: TrialWriter, events: DvxplorerCamera, wanted: int, pulses: int)
     trial.add_event_pulses(events.read_pulses())
 
 
+def _drop(folder: Path, size: int) -> Figures:
+    """Frames that the stand-in drops on purpose, and how many of them are known in the end."""
+    trial = TrialWriter(folder / "gaps", folder / "no", (size, size), RATE_HZ, spool=True)
+    device = LossyDevice(find_camera(None))
+    frames = BaslerCamera(FREE_RUN, device)
+    idle, end = threading.Event(), time.perf_counter() + TAIL_S
+    try:
+        frames.set_region(size, size)
+        show(frames.device, folder / "pictures")
+        frames.start()
+        for burst in (*BURSTS, 0):
+            before = frames.counts.grabbed
+            while frames.counts.grabbed < before + 5 and time.perf_counter() < end:
+                trial.add_frames(frames.read())
+                idle.wait(POLL_S)
+            device.drop_frames(burst)
+        frames.stop()
+        trial.add_frames(frames.read())
+    finally:
+        frames.close()
+    trial.seal()
+    with StreamReader(trial.folder / DATA) as reader:
+        numbers = reader.column("frames/number")
+    missing = int(numbers[-1]) + 1 - len(numbers)
+    trial.discard()
+    return {
+        "dropped_on_purpose": device.dropped,
+        "dropped_noticed": min(missing, frames.counts.skipped),
+    }
+
+
 def _saturate(folder: Path, images: U8, count: int) -> float:
     """Frames a second into a spool, by the time they are on the disk."""
     size = images.shape[1]
@@ -167,7 +212,8 @@ def _saturate(folder: Path, images: U8, count: int) -> float:
     began = time.perf_counter()
     for _ in range(0, count, len(part)):
         trial.add_frames(chunk)
-    sync_file(trial.folder / "frames.raw")
+    trial.abandon()  # returns when all is written
+    sync_file(trial.folder / SPOOL)
     taken = time.perf_counter() - began
     trial.discard()
     return -(-count // len(part)) * len(part) / taken

@@ -84,6 +84,15 @@ def resident_mb() -> float:
     return float(held.split()[0]) * 1024 / 1e6 if held else float("nan")
 
 
+def queued_s() -> float:
+    """For how long this thread has waited for a processor so far, s; 0 where nobody tells."""
+    try:
+        with open("/proc/thread-self/schedstat", encoding="ascii") as file:
+            return int(file.read().split()[1]) / 1e9
+    except (OSError, IndexError):
+        return 0.0
+
+
 def versions() -> dict[str, str]:
     """Of Python and of the packages that matter."""
     found = {"python": platform.python_version()}

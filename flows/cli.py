@@ -9,6 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from flows import console
+from flows.cli_calibrate import calibrate_app, teach_app
+from flows.cli_rigs import rigs
 from protocols.errors import InputError
 
 app = typer.Typer(
@@ -19,6 +21,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+app.command()(rigs)
+app.add_typer(teach_app, name="teach")
+app.add_typer(calibrate_app, name="calibrate")
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
@@ -108,6 +114,9 @@ def collect(
     rig: RigOption,
     store: StoreOption,
     enable: EnableOption = None,
+    trials: Annotated[
+        int | None, typer.Option("--trials", min=1, help="Take so many of the missing, no more.")
+    ] = None,
     campaign: Annotated[
         str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
     ] = None,
@@ -131,6 +140,7 @@ def collect(
         enable=tuple(enable or ()),
         campaign=campaign,
         bench=Bench(operator, temperature, humidity, note),
+        most=trials,
     )
     for warning in order.plan.warnings():
         console.say(f"note: {warning}")
@@ -142,7 +152,7 @@ def collect(
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
     _finish(result, f"collected into {store}", as_json)
-    if result["missing"]:
+    if result["missing"] > result["left_out"]:
         raise typer.Exit(console.FAILED)
 
 

@@ -41,13 +41,14 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
             session.on_trial = lambda trial, outcome: bar.advance(1, f"{trial.id} {outcome}")
             with stopping.signals():  # Prefect has handlers of its own inside a flow
                 session.rig.connect()
-                size = MOCK_BATCH if wanted.rig.simulated else 1
+                size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
                 for start in range(0, len(trials), size):
                     take_trials(Parcel(session), Parcel(trials[start : start + size]))
         return {
             **campaign_counts(wanted, session.campaign),
             "taken": session.taken,
             "retaken": session.retaken,
+            "left_out": work.left_out,
         }
 
 
@@ -57,4 +58,4 @@ def collect(order: Order) -> dict[str, Any]:
     if pending_trials(order.plan, store.campaign(order.campaign)):
         check_disk([order])
         return run(collect_flow, Parcel(order))
-    return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0}
+    return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

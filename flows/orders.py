@@ -38,6 +38,12 @@ class Order:
     campaign: str
     enable: tuple[str, ...]
     bench: Bench = Bench()
+    most: int | None = None
+    """Trials that were asked for at most."""
+
+    def wanted(self, campaign: Campaign) -> list[Trial]:
+        """Trials to take now, in the plan's order."""
+        return pending_trials(self.plan, campaign)[: self.most]
 
 
 def make_order(
@@ -48,6 +54,7 @@ def make_order(
     enable: tuple[str, ...] = (),
     campaign: str | None = None,
     bench: Bench = Bench(),
+    most: int | None = None,
 ) -> Order:
     """Read and check everything that can be known before anything moves.
 
@@ -59,7 +66,7 @@ def make_order(
     rig_file, rig_text = load_rig_file(rig)
     check_plan(rig_file, plan, str(rig))
     if plan.protocol.collection.plate is not None and not rig_file.has_plate:
-        raise InputError(rig, "mock.plate", None, f"is needed: {protocol} moves a sliding plate")
+        raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
     begun = None
     if (store / "store.json").exists():
@@ -68,7 +75,7 @@ def make_order(
     # one campaign, one physics: a level of a factor that is added later must not change it
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
-    order = Order(plan, rig_file, rig_text, store, name, enable, bench)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most)
     if begun:
         _check_same(order, begun)
     return order
@@ -115,7 +122,7 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
         "rig": order.rig.name,
         "rig_hash": rig_hash(order.rig_text),
         "simulated": order.rig.simulated,
-        "scene_level": order.rig.mock.scene.level if order.rig.simulated else None,
+        "scene_level": order.rig.scene.scene.level if order.rig.simulated else None,
         "enabled": list(order.enable),
     }
     campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)
@@ -124,7 +131,7 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
 
 def missing_bytes(order: Order) -> float:
     """Bytes that the trials still to take are expected to need."""
-    pending = pending_trials(order.plan, Store(order.store).campaign(order.campaign))
+    pending = order.wanted(Store(order.store).campaign(order.campaign))
     done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
     return plan_bytes(order.rig, order.plan, done)
 

@@ -63,7 +63,7 @@ class Variant:
 
 def changed(rig: RigFile, values: Mapping[str, Any]) -> RigFile:
     """A simulated rig's file with other settings: nested mappings under `mock`, not checked."""
-    return rig.model_copy(update={"mock": _changed(rig.mock, values)})
+    return rig.model_copy(update={"mock": _changed(rig.scene, values)})
 
 
 def _changed(model: Any, values: Mapping[str, Any]) -> Any:
@@ -202,7 +202,7 @@ def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> tuple[Onsets, float] 
     start = perf_counter()
     slides = slides_of(alone)
     if slides:
-        onsets = expected_onsets(rig.mock, slides, HIGHEST)[0]
+        onsets = expected_onsets(rig.scene, slides, HIGHEST)[0]
     else:
         mass_kg, steps = plan.mass_kg(trial), plan.program(trial).steps
         moves = [step for step in steps if isinstance(step, Move)]
@@ -212,8 +212,8 @@ def closed_form(rig: RigFile, plan: Plan, trial: Trial) -> tuple[Onsets, float] 
             return None
         onsets = np.array(
             retraction_onsets(
-                skin_of(rig.mock), rig.mock.scene.friction.kinetic, mass_kg, pressed.depth_mm,
-                pulled.speed_mm_s, rig.mock.scene.plate.gravity_m_s2,
+                skin_of(rig.scene), rig.scene.scene.friction.kinetic, mass_kg, pressed.depth_mm,
+                pulled.speed_mm_s, rig.scene.scene.plate.gravity_m_s2,
             )
         )  # fmt: skip
     seconds = perf_counter() - start

@@ -77,7 +77,7 @@ def measure_sensitivity(rig: RigFile, plan: Plan, advance: Callable[[], None]) -
     base = _outcome(rig, plan, trials, False, advance)
     rows = []
     for name in CONTACT + CAMERA:
-        value = _value(rig.mock, name)
+        value = _value(rig.scene, name)
         changes: list[dict[str, Any] | None] = []
         for factor in (1.0 - CHANGE, 1.0 + CHANGE):
             if not value:
@@ -115,7 +115,7 @@ def _outcome(
     known_s: np.ndarray[Any, np.dtype[np.float64]] | None = None,
 ) -> _Outcome:
     analysis = plan.protocol.analysis
-    variant = Variant("", 3, rig.mock.scene.step_ms, other_seed=other_seed)
+    variant = Variant("", 3, rig.scene.scene.step_ms, other_seed=other_seed)
     seen: list[Seen] = []
     counted: list[SceneWindows] = []
     for trial in trials[:EVENT_TRIALS]:
@@ -123,7 +123,7 @@ def _outcome(
         counted.append(look(seen[-1], analysis.windows, analysis.samples, trial.seed))
         advance()
     if known_s is None:
-        onsets = [_slide_onsets(rig.mock, plan, trial, variant.seed(trial)) for trial in trials]
+        onsets = [_slide_onsets(rig.scene, plan, trial, variant.seed(trial)) for trial in trials]
         slides = [onset for onset in onsets if onset is not None]
         # a falling plate has no contact-only run: whole ones tell
         told = slides or [_seen_onsets(item) for item in seen]

@@ -228,6 +228,8 @@ class Session:
                 "centre": 0,
             },
         }
+        if told := self.rig.describe():
+            record["devices"] = told
         if run.truth is not None:
             record["simulation_truth"] = run.truth
         return record

@@ -26,10 +26,12 @@ from storage.store import Campaign, Store
 
 @dataclass(frozen=True)
 class Stretch:
-    """A session that is about to begin, and the trials that its store lacks."""
+    """A session that is about to begin, and the trials that it is to take."""
 
     session: Session
     trials: list[Trial]
+    left_out: int = 0
+    """Trials that the store lacks besides, and that were not asked for."""
 
 
 @contextmanager
@@ -63,11 +65,12 @@ def stretch(order: Order) -> Iterator[Stretch]:
         campaign.sweep()
         rig = build_rig(order.rig)
         rig.should_stop = stopping.requested
-        trials = pending_trials(order.plan, campaign)
+        trials = order.wanted(campaign)
+        left_out = len(pending_trials(order.plan, campaign)) - len(trials)
         campaign.add_bench_record(_bench_record(order))
         session = Session(order.plan, order.rig, rig, campaign, order.bench.operator)
         try:
-            yield Stretch(session, trials)
+            yield Stretch(session, trials, left_out)
         finally:
             rig.close()
 
@@ -103,6 +106,7 @@ def _bench_record(order: Order) -> dict[str, Any]:
         "rig": order.rig.name,
         "sensor": order.rig.sensor,
         "skin": skin.serial,
+        "calibration": order.rig.calibration.model_dump(mode="json", exclude_none=True),
         "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
         "simulated": order.rig.simulated,
     }

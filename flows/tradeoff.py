@@ -88,7 +88,7 @@ def variants_of(rig: RigFile, plan: Plan, steps: Sequence[int]) -> dict[str, lis
     With a plate that may fall the contact steps by a millisecond whatever the rig file says, so
     only the rig's own step is there.
     """
-    told = rig.mock.scene.step_ms
+    told = rig.scene.scene.step_ms
     if falls(plan):
         steps = (told,)
     return {
@@ -186,7 +186,7 @@ def _measure(
         "simulated": True,
         "protocol": plan.protocol.name,
         "rig": rig.name,
-        "rig_step_ms": rig.mock.scene.step_ms,
+        "rig_step_ms": rig.scene.scene.step_ms,
         "trials": [trial.id for trial in trials],
         "variants": rows,
         "seeds": asdict(mean_error(seeds)),

@@ -93,7 +93,7 @@ class SyncGates(StrictModel):
     exposure_line: PositiveSeconds = Decimal("0.001")
     device_time_stamps: PositiveSeconds = Decimal("0.005")
     host_arrival: PositiveSeconds = Decimal("0.03")
-    digital_input: PositiveSeconds = Decimal("0.001")
+    digital_input: PositiveSeconds = Decimal("0.003")
     host_time: PositiveSeconds = Decimal("0.015")
 
     def limit_s(self, grade: str) -> float:

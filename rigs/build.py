@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
 
+from rigs.capabilities import FrameCamera, Operator, Plate, RigError, Simulation
+from rigs.devices import DeviceSettings
+from rigs.host_clock import HostClock
 from rigs.mock.devices import MockDevices, build_mock
+from rigs.operator import ConsoleOperator
+from rigs.people import PersonAtPlate
 from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig
 from rigs.rig_file import RigFile
@@ -32,13 +38,21 @@ class _MockSimulation:
 
 
 def build_rig(file: RigFile) -> Rig:
-    """The rig that a rig file describes, not connected yet."""
-    return simulated_rig(file, build_mock(file.mock, file.timing))
+    """The rig that a rig file describes, its arm not connected yet.
+
+    Raises:
+        RigError: a device that has to be there before a rig is, such as a camera, is not.
+    """
+    if file.driver == "mock":
+        return simulated_rig(file, build_mock(file.scene, file.timing))
+    assert file.devices is not None
+    if file.driver == "loopback":
+        return _loopback_rig(file, file.devices)
+    return _real_rig(file, file.devices)
 
 
 def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
     """The rig that a rig file describes, on simulated devices that somebody else made."""
-    plane = file.calibration.contact_plane
     return Rig(
         name=file.name,
         clock=devices.clock,
@@ -47,10 +61,104 @@ def simulated_rig(file: RigFile, devices: MockDevices) -> Rig:
         frames=devices.frames,
         sync=devices.sync,
         operator=devices.operator,
-        frame=PlateFrame.taught((plane.centre, plane.right, plane.above)),
+        frame=taught_frame(file),
         poll_s=float(file.poll),
         timing=file.timing,
         touch_mm=file.calibration.touch_depth,
+        centre_px=file.calibration.centre_px,
         plate=devices.plate,
         simulation=_MockSimulation(devices),
     )
+
+
+def taught_frame(file: RigFile) -> PlateFrame:
+    """The plate's frame as it was taught."""
+    plane = file.calibration.contact_plane
+    taught = PlateFrame.taught((plane.centre, plane.right, plane.above))
+    return taught.with_zero(file.calibration.zero_mm)
+
+
+def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
+    console = ConsoleOperator()
+    person = PersonAtPlate(console, devices.plate.mass_kg) if devices.plate else None
+    return _driven_rig(file, devices, person or console, person, None, None, ())
+
+
+def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
+    """Real drivers; stand-ins in a process of their own show the simulated scene."""
+    from rigs.wire.live_basler import LiveBasler
+    from rigs.wire.loopback import Loopback
+
+    with ExitStack() as undo:
+        stage = Loopback(file.scene, file.timing, devices.arm)
+        undo.callback(stage.close)
+        exposure_ns = file.scene.frame_camera.exposure_us * 1000
+        camera = LiveBasler(stage, exposure_ns // 2, devices.frame_camera.sync_line or 1)
+        rig = _driven_rig(
+            file, stage.reached_by(devices), stage, stage, stage, camera, (stage.close,)
+        )
+        undo.pop_all()
+    return rig
+
+
+def _driven_rig(
+    file: RigFile,
+    devices: DeviceSettings,
+    operator: Operator,
+    plate: Plate | None,
+    simulation: Simulation | None,
+    camera: Any,
+    ending: tuple[Any, ...],
+) -> Rig:
+    """A rig of drivers; whatever was opened is closed again if one of them fails.
+
+    Args:
+        camera: the device behind the frame camera's driver, None to search for it.
+        ending: called when the rig is closed, last.
+    """
+    from rigs.arms import build_arm
+    from rigs.cameras import build_event_camera, build_frame_camera
+    from rigs.sync_box import SerialSyncBox
+
+    assert devices.sync_box is not None
+    scale = {"px_per_mm": file.frame_camera.scale_px_per_mm}
+    with ExitStack() as undo:
+        frames = build_frame_camera(devices.frame_camera.model_copy(update=scale), camera)
+        undo.callback(frames.close)
+        _check_grade(file, frames)
+        events = build_event_camera(devices.event_camera)
+        undo.callback(events.close)
+        rig = Rig(
+            name=file.name,
+            clock=HostClock(),
+            arm=build_arm(devices.arm),
+            events=events,
+            frames=frames,
+            sync=SerialSyncBox(devices.sync_box),
+            operator=operator,
+            frame=taught_frame(file),
+            poll_s=float(file.poll),
+            timing=file.timing,
+            touch_mm=file.calibration.touch_depth,
+            plate=plate,
+            simulation=simulation,
+            ending=ending,
+        )
+        undo.pop_all()
+    return rig
+
+
+def _check_grade(file: RigFile, frames: FrameCamera) -> None:
+    """The rig file must not promise a better grade than the camera can keep, nor another one.
+
+    Raises:
+        RigError: it does.
+    """
+    stamping = getattr(frames, "stamping", None)
+    if stamping is not None and stamping.grade != file.timing.frames:
+        raise RigError(
+            "frame camera",
+            f"its times are of the grade '{stamping.grade}' ({stamping.means}), and the rig file "
+            f"says timing.frames: {file.timing.frames}; wire and set it so, or write "
+            f"timing.frames: {stamping.grade}",
+        )

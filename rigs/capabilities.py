@@ -86,6 +86,23 @@ class Progress:
     done: bool
 
 
+@dataclass(frozen=True)
+class DeviceHealth:
+    """What a device says of itself, read without starting it; `unknown` where it does not say."""
+
+    device: str
+    """Its part in the rig, as `RigError` names it."""
+    model: str
+    serial: str
+    firmware: str
+    temperature_c: float | None
+    """Degrees Celsius; None where it has no thermometer that can be read."""
+    clock: str
+    """What stamps the times of its data."""
+    notes: tuple[str, ...] = ()
+    """What else a person may want to see: region, buffers, speed of the link."""
+
+
 @runtime_checkable
 class Clock(Protocol):
     """The host's monotonic clock; the simulated one is virtual."""
@@ -188,6 +205,9 @@ class FrameCamera(Protocol):
 @runtime_checkable
 class SyncBox(Protocol):
     """Ticks at a fixed rate: triggers frames, and sends a pulse on each tick with a code bit 1."""
+
+    def connect(self) -> None:
+        """See that a box answers; anew after a fault. Raises RigError."""
 
     def start(self, rate_hz: float, seed: int, code: Code) -> None:
         """Begin ticks and a code of `rigs.pulse_code` from `seed`, 1 to 65,535."""

@@ -54,7 +54,7 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
     """The level of physics for a plan on a simulated rig; None on a real one."""
     if not rig.simulated:
         return None
-    told = rig.mock.scene.level
+    told = rig.scene.scene.level
     if told != "auto":
         return Choice(int(told[1]), "told so by the rig file (mock.scene.level)")
     slides = slides_of(plan)
@@ -64,8 +64,8 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
             "onsets under a falling plate have no closed form at the higher levels, so nothing "
             "is left out",
         )
-    onsets = {level: expected_onsets(rig.mock, slides, level) for level in (1, 2, 3)}
-    seeds = _seeds_differ(rig.mock, slides)
+    onsets = {level: expected_onsets(rig.scene, slides, level) for level in (1, 2, 3)}
+    seeds = _seeds_differ(rig.scene, slides)
     level, differences = 1, []
     for level in (1, 2):
         difference = np.abs(onsets[level] - onsets[level + 1]).mean(axis=0)
@@ -92,8 +92,8 @@ def with_level(rig: RigFile, plan: Plan) -> RigFile:
 
 def at_level(rig: RigFile, name: str) -> RigFile:
     """A simulated rig's file with the scene at the level `name`, such as L2."""
-    scene = rig.mock.scene.model_copy(update={"level": name})
-    return rig.model_copy(update={"mock": rig.mock.model_copy(update={"scene": scene})})
+    scene = rig.scene.scene.model_copy(update={"level": name})
+    return rig.model_copy(update={"mock": rig.scene.model_copy(update={"scene": scene})})
 
 
 def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
@@ -105,7 +105,7 @@ def slip_expected(rig: RigFile, plan: Plan) -> dict[str, Any] | None:
     slides = slides_of(plan)
     if not rig.simulated or not slides:
         return None
-    onsets = expected_onsets(rig.mock, slides, HIGHEST)
+    onsets = expected_onsets(rig.scene, slides, HIGHEST)
     incipient = onsets[:, 1] - onsets[:, 0]
     return {
         "simulated": True,

@@ -7,12 +7,9 @@ protective stop.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
 from protocols.timing import Timing
@@ -21,6 +18,7 @@ from rigs.capabilities import (
     ArmFault,
     ArmState,
     Clock,
+    DeviceHealth,
     EventCamera,
     FrameCamera,
     Operator,
@@ -31,13 +29,12 @@ from rigs.capabilities import (
     SyncBox,
 )
 from rigs.plate_frame import PlateFrame
+from rigs.touching import LOOK_S, QUIET_S, RateTouch, count_central
 from storage.streams import Json, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """How long cameras are read after the last pulse: they send in blocks."""
-TOUCH_HALF_PX = 30
-"""Half the side of the square in which touching off looks for the centre papilla."""
 _MOVE_GRACE_S = 10.0
 
 
@@ -83,7 +80,9 @@ class Rig:
         poll_s: how often streams are read and stop requests looked at.
         timing: which signal reaches which device, and so what else has to be read.
         touch_mm: how deep the centre papilla is when touching off notices it.
+        centre_px: where the event camera sees that papilla; by default in its picture's centre.
         simulation: the world behind a simulated rig, None on a real one.
+        ending: called last when the rig is closed.
     """
 
     name: str
@@ -97,12 +96,15 @@ class Rig:
     poll_s: float
     timing: Timing = field(default_factory=Timing)
     touch_mm: float = 0.0
+    centre_px: tuple[float, float] | None = None
     plate: Plate | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
+    ending: tuple[Callable[[], None], ...] = ()
 
     def connect(self) -> None:
-        """Connect the arm; cameras connect when they are built. Raises ArmFault."""
+        """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
+        self.sync.connect()
         self.arm.connect()
 
     def close(self) -> None:
@@ -115,6 +117,28 @@ class Rig:
         for device in (self.arm, self.events, self.frames, self.sync):
             with suppress(RigError):
                 device.close()
+        for end in self.ending:
+            end()
+
+    def health(self) -> list[DeviceHealth]:
+        """What the connected devices say of themselves; simulated ones have nothing to say.
+
+        Raises:
+            RigError: one does not answer.
+        """
+        devices = (self.arm, self.events, self.frames, self.sync)
+        return [device.health() for device in devices if hasattr(device, "health")]
+
+    def describe(self) -> dict[str, Json]:
+        """What drivers tell of the trial that just ran, by device: settings, counts, losses."""
+        told = {}
+        for name, device in (("event_camera", self.events), ("frame_camera", self.frames)):
+            if hasattr(device, "describe"):
+                told[name] = device.describe()
+        losses = getattr(self.sync, "losses", None)
+        if losses is not None:
+            told["sync_box"] = {"losses": vars(losses)}
+        return told
 
     def run_trial(
         self,
@@ -130,7 +154,7 @@ class Rig:
             StopRequested: `should_stop` became true; the arm is stopped and clear.
             RigError: anything failed; the arm is stopped.
         """
-        with self._safely(program.home):
+        with self.safely(program.home):
             if frame_px is not None:
                 self.frames.set_region(*frame_px)
             self._home(program.home, seed)
@@ -160,19 +184,18 @@ class Rig:
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm the skin up: press at the plate's centre and let go, `times` times."""
         home = Position(0.0, 0.0, -clearance_mm)
-        with self._safely(home):
-            self._move(Move("home", home, RETRACT_SPEED_MM_S), self._position(), None)
+        with self.safely(home):
+            self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
             for _ in range(times):
                 deep = Position(0.0, 0.0, depth_mm)
-                self._move(Move("warm up", deep, speed_mm_s), home, None)
-                self._move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
+                self.move(Move("warm up", deep, speed_mm_s), home, None)
+                self.move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
 
     def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
         """Find depth zero: creep in until the event rate says that the centre papilla touches.
 
-        Only events round the image's centre count. Their rate in 0.5 s of standing still is the
-        noise; a touch is a count in 50 ms above its mean by eight standard deviations (Poisson)
-        and ten events. A skin is noticed only some way in: `touch_mm` of the rig's calibration.
+        See `rigs.touching.RateTouch`. A skin is noticed only some way in: `touch_mm` of the rig's
+        calibration.
 
         Args:
             search_mm: hard limit beyond the taught plane.
@@ -185,17 +208,13 @@ class Rig:
         """
         self.frame = self.frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
-        with self._safely(start):
+        with self.safely(start):
             self._home(start, seed)
             self.events.start()
-            try:
-                self._wait(0.5)
-                quiet = self._central_events() * 0.1  # per 50 ms
-                limit = quiet + 8 * quiet**0.5 + 10
-                zero = self._creep(search_mm, speed_mm_s, limit)
-            finally:
-                self.events.stop()
-            self._move(Move("release", start, RETRACT_SPEED_MM_S), self._position(), None)
+            self.wait(QUIET_S)
+            zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
+            self.events.stop()
+            self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
         self.frame = self.frame.with_zero(zero)
         return zero
 
@@ -205,53 +224,54 @@ class Rig:
             self.simulation.begin_trial(0)
         try:
             self._start_streams(0, rate_hz, False)
-            self._wait(seconds, sink)
+            self.wait(seconds, sink)
             self._stop_streams(sink, False)
         finally:
             self.sync.stop()
             self.events.stop()
 
-    def _creep(self, search_mm: float, speed_mm_s: float, limit: float) -> float:
+    def _creep(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
         self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])
-        recent: deque[int] = deque(maxlen=5)  # of 10 ms each
         while not self.arm.progress().done:
-            self._wait(0.01)
+            self.wait(LOOK_S)
             depth = self.frame.position(self.arm.pose().xyz_mm).depth_mm
-            recent.append(self._central_events())
-            if sum(recent) > limit:
+            if rate.touched(self.central_events()):
                 self.arm.stop()
-                middle = depth - speed_mm_s * 0.025  # of those 50 ms
-                return middle - self.touch_mm
+                return depth - speed_mm_s * rate.LATE_S - self.touch_mm
         state = self.arm.state()
         if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
-            raise _fault(state, "touching off")
+            raise arm_fault(state, "touching off")
         raise RigError(
             "arm",
             f"touching off met nothing within {search_mm:g} mm of the taught plane; "
             "teach the contact plane again",
         )
 
-    def _central_events(self) -> int:
+    def central_events(self) -> int:
         """New events where the event camera sees the centre papilla."""
-        chunk = self.events.read()
-        x = np.abs(chunk.x.astype(np.int64) - self.events.width // 2)
-        y = np.abs(chunk.y.astype(np.int64) - self.events.height // 2)
-        return int(np.count_nonzero((x < TOUCH_HALF_PX) & (y < TOUCH_HALF_PX)))
+        size = self.events.width, self.events.height
+        return count_central(self.events.read(), size, self.centre_px)
 
     def _step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
         start = self.arm.now_ns()
         if isinstance(step, Move):
-            start, end = self._move(step, at, sink)
+            start, end = self.move(step, at, sink)
             return StepTimes(index, step.phase, start, end)
         if isinstance(step, PlateStep):
             if self.plate is None:
                 raise RigError("plate", f"this rig has no sliding plate to {step.action}")
             self.plate.act(step.action, step.seconds)
-        self._wait(step.seconds, sink)
+        self.wait(step.seconds, sink)
         return StepTimes(index, step.phase, start, self.arm.now_ns())
 
-    def _move(self, step: Move, at: Position, sink: Sink | None) -> tuple[int, int]:
+    def move(self, step: Move, at: Position, sink: Sink | None = None) -> tuple[int, int]:
+        """Move from `at`, where the arm stands, and wait for the end; controller times, ns.
+
+        Raises:
+            StopRequested: as `wait`; the arm still moves then, and `safely` stops it.
+            ArmFault: it stopped, or did not come to an end in time.
+        """
         start = self.arm.now_ns()
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         if seconds == 0:
@@ -260,19 +280,23 @@ class Rig:
         deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
         while not (progress := self.arm.progress()).done:
             if not progress.state.healthy:
-                raise _fault(progress.state, step.phase)
+                raise arm_fault(progress.state, step.phase)
             if self.clock.now_ns() > deadline:
                 raise ArmFault("arm", f"did not end the phase '{step.phase}' in time")
             left = seconds - (self.arm.now_ns() - start) / 1e9
-            self._wait(min(self.poll_s, max(left, 1e-3)), sink)
+            self.wait(min(self.poll_s, max(left, 1e-3)), sink)
         if not progress.state.healthy:
-            raise _fault(progress.state, step.phase)
+            raise arm_fault(progress.state, step.phase)
         if not progress.finished:
             raise ArmFault("arm", f"was stopped from outside in the phase '{step.phase}'")
         return progress.finished[-1]
 
-    def _wait(self, seconds: float, sink: Sink | None = None) -> None:
-        """Let time pass in polls; streams are read and stop requests looked at in each."""
+    def wait(self, seconds: float, sink: Sink | None = None) -> None:
+        """Let time pass in polls; streams are read and stop requests looked at in each.
+
+        Raises:
+            StopRequested: `should_stop` became true.
+        """
         end = self.clock.now_ns() + round(seconds * 1e9)
         while (left := end - self.clock.now_ns()) > 0:
             self.clock.wait(min(self.poll_s, left / 1e9))
@@ -298,7 +322,7 @@ class Rig:
         if with_frames and self.timing.frames == "exposure line":
             self.frames.stop()
         self.sync.stop()
-        self._wait(TAIL_S, sink)
+        self.wait(TAIL_S, sink)
         self.events.stop()
         if with_frames:
             self.frames.stop()
@@ -319,7 +343,7 @@ class Rig:
 
     def _home(self, home: Position, seed: int) -> None:
         """To where a motion begins; only then is a simulated trial's randomness drawn."""
-        self._move(Move("home", home, RETRACT_SPEED_MM_S), self._position(), None)
+        self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
 
@@ -327,11 +351,12 @@ class Rig:
         places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
         return Way(times.start_ns, times.end_ns, *places)
 
-    def _position(self) -> Position:
+    def position(self) -> Position:
+        """Where the tool centre point is now, in plate coordinates."""
         return self.frame.position(self.arm.pose().xyz_mm)
 
     @contextmanager
-    def _safely(self, clear: Position) -> Iterator[None]:
+    def safely(self, clear: Position) -> Iterator[None]:
         """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
 
         A device that fails while it is stopped does not keep the others from being stopped. Then
@@ -359,7 +384,7 @@ class Rig:
         """Straight out along the plate's normal, only with a healthy arm, bounded in time."""
         if not self.arm.state().healthy:
             return
-        at = self._position()
+        at = self.position()
         out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
         if at.distance_mm(out) == 0:
             return
@@ -372,7 +397,7 @@ class Rig:
         self.arm.stop()
 
 
-def _fault(state: ArmState, phase: str) -> ArmFault:
+def arm_fault(state: ArmState, phase: str) -> ArmFault:
     """What happened, and what a person must do about it; nothing is unlocked from here."""
     return ArmFault(
         "arm",

@@ -7,60 +7,23 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from protocols.errors import InputError
 from protocols.hashing import hash_text
 from protocols.plan import Plan
 from protocols.program import Move
-from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed, parse
+from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
 from protocols.timing import Timing
 from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from rigs.calibration import Calibration, without_taught
+from rigs.devices import DeviceSettings
 from rigs.mock.promises import check_promises
 from rigs.mock.settings import MockSettings
 from rigs.rig_inheritance import read_rig, rig_path
 
-
-def _mm(raw: object) -> float:
-    return float(parse(raw, "mm"))
-
-
-Millimetre = Annotated[float, BeforeValidator(_mm)]
-Point = tuple[Millimetre, Millimetre, Millimetre]
-
-
-class ContactPlane(StrictModel):
-    """The plate, taught by touching three points with the sensor's centre papilla."""
-
-    centre: Point
-    right: Point
-    """Any point at least 5 mm to the right of the centre, as the sensor sees the plate."""
-    above: Point
-    """Any point at least 5 mm above the centre."""
-    taught: date
-
-    @model_validator(mode="after")
-    def _spans(self) -> ContactPlane:
-        """Three points that are a plane; the frame itself is made by `rigs.plate_frame`."""
-        right, above = (
-            [b - a for a, b in zip(self.centre, point, strict=True)]
-            for point in (self.right, self.above)
-        )
-        lengths = math.hypot(*right), math.hypot(*above)
-        if min(lengths) < 5.0:
-            raise ValueError("needs points at least 5 mm from the centre")
-        cosine = sum(a * b for a, b in zip(right, above, strict=True)) / (lengths[0] * lengths[1])
-        if abs(cosine) > 0.98:
-            raise ValueError("has its three points almost on one line")
-        return self
-
-
-class Calibration(StrictModel):
-    """What was measured on this rig."""
-
-    contact_plane: ContactPlane
-    touch_depth: Millimetre = 0.0
-    """How deep the centre papilla is when touching off notices it, found once with a gauge."""
+SCALE_ERROR = 0.005
+"""How far a measured scale may be from the true one, as a share."""
 
 
 class RigLimits(StrictModel):
@@ -129,7 +92,9 @@ class RigFile(StrictModel):
     rig: Literal[1]
     """Version of the file format."""
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,47}$")]
-    driver: Literal["mock"]
+    driver: Literal["mock", "devices", "loopback"]
+    """`mock`: simulated devices in this program, as fast as it goes. `devices`: the real ones.
+    `loopback`: the real drivers in real time, with stand-ins that show the simulated scene."""
     poll: PositiveSeconds
     """How often streams are read and stop requests looked at."""
     sensor: str = Field(min_length=1, max_length=40)
@@ -141,7 +106,44 @@ class RigFile(StrictModel):
     estimates: Estimates
     timing: Timing = Timing()
     """Which signal reaches which device, and how good their clocks are."""
-    mock: MockSettings
+    devices: DeviceSettings | None = None
+    """Which drivers reach the devices; not for `mock`."""
+    mock: MockSettings | None = None
+    """The simulated scene and devices; not for `devices`."""
+
+    @model_validator(mode="after")
+    def _has_its_sections(self) -> RigFile:
+        wanted = {
+            "mock": self.driver != "devices",
+            "devices": self.driver != "mock",
+        }
+        for name, needed in wanted.items():
+            found = getattr(self, name)
+            if needed and found is None:
+                raise KeyedError(name, None, f"is needed by driver: {self.driver}")
+            if not needed and found is not None:
+                raise KeyedError(name, "...", f"has no meaning with driver: {self.driver}")
+        if self.driver == "devices" and self.devices is not None and self.devices.sync_box is None:
+            raise KeyedError("devices.sync_box.port", None, "is needed: name its serial port")
+        return self
+
+    @model_validator(mode="after")
+    def _loopback_can_show_it(self) -> RigFile:
+        if self.driver != "loopback" or self.mock is None or self.devices is None:
+            return self
+        exposure_us = self.mock.frame_camera.exposure_us
+        for key, value, right in (
+            (
+                "devices.frame_camera.exposure_us",
+                self.devices.frame_camera.exposure_us,
+                exposure_us,
+            ),
+            ("timing.frames", self.timing.frames, "hardware trigger"),
+            ("mock.frame_camera.level", self.mock.frame_camera.level, "video"),
+        ):
+            if value != right:
+                raise KeyedError(key, value, f"must be {right}: that is what stand-ins show")
+        return self
 
     @model_validator(mode="after")
     def _poll_is_short(self) -> RigFile:
@@ -151,9 +153,11 @@ class RigFile(StrictModel):
 
     @model_validator(mode="after")
     def _scales_agree(self) -> RigFile:
-        """The simulated camera draws at the scale that the rig file promises."""
+        """The simulated camera draws at the scale that the rig file promises, or has measured."""
+        if self.mock is None:
+            return self
         told, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
-        if told != drawn:
+        if abs(told - drawn) > SCALE_ERROR * drawn:
             raise KeyedError(
                 "frame_camera.scale_px_per_mm",
                 told,
@@ -164,23 +168,40 @@ class RigFile(StrictModel):
     @model_validator(mode="after")
     def _promises_are_kept(self) -> RigFile:
         """The simulated clocks are no worse than `timing` says."""
-        check_promises(self.mock, self.timing)
+        if self.mock is not None:
+            check_promises(self.mock, self.timing)
         return self
 
     @property
     def simulated(self) -> bool:
         """Whether everything that comes from this rig is a simulation."""
+        return self.driver != "devices"
+
+    @property
+    def in_virtual_time(self) -> bool:
+        """Whether its time runs as fast as it can, and not with the clock on the wall."""
         return self.driver == "mock"
+
+    @property
+    def scene(self) -> MockSettings:
+        """The simulated scene and devices.
+
+        Raises:
+            ValueError: a real rig has none.
+        """
+        if self.mock is None:
+            raise ValueError(f"the rig {self.name} is real: there is no simulated scene")
+        return self.mock
 
     @property
     def has_plate(self) -> bool:
         """Whether the plate hangs on a slider that can be raised, released and caught."""
-        return self.driver == "mock"
+        return self.simulated or (self.devices is not None and self.devices.plate is not None)
 
     @property
     def frame_source(self) -> str:
         """``video`` or ``tracks``: what the outside camera hands over."""
-        return self.mock.frame_camera.level
+        return self.mock.frame_camera.level if self.mock is not None else "video"
 
     def frame_bytes(self, with_plate: bool) -> float:
         """What one frame is expected to take on disk, with or without the plate's marker."""
@@ -224,7 +245,7 @@ def same_rig(one: str, other: str) -> bool:
     """Whether two contents of rig files describe one rig.
 
     The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
-    ended goes on without it.
+    ended goes on without it. So does one whose plate was taught anew.
     """
     if one == other:
         return True
@@ -232,7 +253,7 @@ def same_rig(one: str, other: str) -> bool:
     for data in (first, second):
         if isinstance(data.get("mock"), dict):
             data["mock"].pop("faults", None)
-    return first == second
+    return without_taught(first) == without_taught(second)
 
 
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:

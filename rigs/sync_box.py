@@ -14,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from protocols.timing import Code
-from rigs.capabilities import RigError
+from rigs.capabilities import DeviceHealth, RigError
 from rigs.pulse_code import SEEDS
-from rigs.sync_line import LEAST_HZ, MOST_HZ
-from rigs.sync_port import DEVICE, SyncBoxFault, SyncBoxSettings, SyncPort, began_anew
+from rigs.sync_line import LEAST_HZ, MOST_HZ, NAME
+from rigs.sync_port import DEVICE, SyncBoxFault, SyncPort, began_anew
+from rigs.sync_settings import SyncBoxSettings
 from rigs.sync_train import Losses, Train
 from storage.streams import ClockReads, PulseChunk
 
@@ -72,6 +73,24 @@ class SerialSyncBox:
         if self._port is not None:
             self._port.close()
         self._port, self._train, self._running, self._clock_us = None, None, False, 0
+
+    def health(self) -> DeviceHealth:
+        """What the box says of itself, and how far its clock has come since it got power.
+
+        Raises:
+            SyncBoxFault: no answer.
+        """
+        clock = self.read_clock()
+        took_us = (int(clock.after_ns[0]) - int(clock.before_ns[0])) / 1000
+        return DeviceHealth(
+            device=DEVICE,
+            model="sync box",
+            serial=self._settings.port,
+            firmware=NAME,
+            temperature_c=None,
+            clock="its own, 1 us",
+            notes=(f"answers in {took_us:.0f} us",),
+        )
 
     def start(self, rate_hz: float, seed: int, code: Code = "lfsr") -> None:
         """Begin ticks and code; a train that runs is given up, and what it sent is dropped.

@@ -16,6 +16,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -168,8 +169,36 @@ def json_text(data: Any) -> str:
     Raises:
         ValueError: as `write_json`.
     """
-    text = json.dumps(data, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
-    return text + "\n"
+    return _indented(data, 0) + "\n"
+
+
+def _indented(data: Any, depth: int) -> str:
+    """JSON with one space a level: `json` itself does without its fast encoder where it indents."""
+    if not isinstance(data, dict | list | tuple) or not data:
+        return _encoder(depth).encode(data)
+    parts = data.values() if isinstance(data, dict) else data
+    margin = "\n" + " " * depth
+    if not any(isinstance(part, dict | list | tuple) for part in parts):
+        text = _encoder(depth + 1).encode(data)
+        return f"{text[0]}{margin} {text[1:-1]}{margin}{text[-1]}"
+    if isinstance(data, dict):
+        # what a key looks like is for `json` to say: it may be a number
+        items = (
+            f"{_encoder(0).encode({key: 0})[1:-1].removesuffix('0')}{_indented(part, depth + 1)}"
+            for key, part in sorted(data.items())
+        )
+        return "{" + margin + " " + f",{margin} ".join(items) + margin + "}"
+    inside = f",{margin} ".join(_indented(part, depth + 1) for part in data)
+    return f"[{margin} {inside}{margin}]"
+
+
+@cache
+def _encoder(depth: int) -> json.JSONEncoder:
+    """Of what holds nothing nested."""
+    return json.JSONEncoder(
+        sort_keys=True, allow_nan=False, ensure_ascii=False,
+        separators=(",\n" + " " * depth, ": "),
+    )  # fmt: skip
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
+from storage.spool import Spool
 from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
 from storage.video import VideoWriter
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
+SPOOL = "frames.raw"
 CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
 
 
@@ -43,8 +46,7 @@ class TrialWriter:
         self._streams = StreamFile(folder / DATA)
         self._frame_px = frame_px
         self._rate_hz = rate_hz
-        self._spool = folder / "frames.raw" if spool and frame_px else None
-        self._spool_file = self._spool.open("wb") if self._spool else None
+        self._spool = Spool(folder / SPOOL) if spool and frame_px else None
         self._video: VideoWriter | None = None
         self._sealed = False
 
@@ -92,8 +94,8 @@ class TrialWriter:
         self._streams.add_frame_times(chunk)
         if chunk.markers_px is not None:
             self._streams.add_tracks(chunk)
-        elif self._spool_file is not None:
-            self._spool_file.write(np.ascontiguousarray(chunk.images).data)
+        elif self._spool is not None:
+            self._spool.write(chunk.images)
         else:
             if self._video is None:
                 self._video = VideoWriter(self.folder / FRAMES, *self._frame_px, self._rate_hz)
@@ -109,9 +111,9 @@ class TrialWriter:
             return self.folder
         self._sealed = True
         self._streams.finish()
-        if self._spool_file is not None and self._spool is not None and self._frame_px is not None:
-            self._spool_file.close()
-            self._encode_spool(self._spool, self._frame_px)
+        if self._spool is not None and self._frame_px is not None:
+            self._spool.close()
+            self._encode_spool(self._spool.path, self._frame_px)
         if self._video is not None:
             self._video.close()
         return self.folder
@@ -173,8 +175,9 @@ class TrialWriter:
         if not self._sealed:
             self._sealed = True
             self._streams.abandon()
-            if self._spool_file is not None:
-                self._spool_file.close()
+            if self._spool is not None:
+                with suppress(OSError):
+                    self._spool.close()
             if self._video is not None:
                 self._video.close()
 

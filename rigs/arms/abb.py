@@ -17,12 +17,13 @@ from rigs.arms.abb_egm import EgmPose, EgmReceiver
 from rigs.arms.abb_program import PAUSE_S, motion_program
 from rigs.arms.abb_rws import REQUEST_S, WebError, WebServices, WebStatus
 from rigs.arms.guard import Guard
+from rigs.arms.health import abb_health
 from rigs.arms.pose import compose, distance_mm
 from rigs.arms.run import Run
 from rigs.arms.segments import SegmentWatch, is_at
 from rigs.arms.settings import AbbSettings
 from rigs.arms.stream import PoseStream, Sample
-from rigs.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
+from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
 from storage.streams import PoseChunk, PulseChunk
 
 MONITOR_S = 0.2
@@ -123,6 +124,19 @@ class AbbArm:
         if not self._is_stale(last):
             return last.t_ns
         return last.t_ns + time.monotonic_ns() - last.host_ns
+
+    def health(self) -> DeviceHealth:
+        """What the controller says of itself; takes at most 5 `REQUEST_S`.
+
+        Raises:
+            ArmFault: it does not answer.
+        """
+        if self._web is None:
+            raise self._fault(ArmState.DISCONNECTED, "cannot be asked")
+        try:
+            return abb_health(self._web)
+        except WebError as error:
+            raise ArmFault("arm", str(error)) from None
 
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path`: checked against the limits, uploaded, started.

@@ -34,6 +34,10 @@ class WebError(RuntimeError):
     """The web services did not answer in time, or refused; the text says which."""
 
 
+class WebRefused(WebError):
+    """The web services answered, and not with what was asked for."""
+
+
 class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
     """An HTTP adapter that never waits without a bound."""
 
@@ -97,6 +101,18 @@ class WebServices:
         joints: list[float] = self._ask(self._rws.get_jointtarget).robax.tolist()
         return joints
 
+    def about(self, resource: str) -> dict[str, str]:
+        """What a resource such as ``rw/system`` says, by name; empty where it is not there.
+
+        Raises:
+            WebError: no answer.
+        """
+        try:
+            answer = self._ask(lambda: self._rws._do_get(resource))
+            return {key: str(value) for key, value in answer["_embedded"]["_state"][0].items()}
+        except (WebRefused, KeyError, IndexError, TypeError):
+            return {}
+
     def start(self, program: MotionProgram) -> None:
         """Upload a motion program and start it. Raises WebError."""
         self._ask(lambda: self._client.execute_motion_program(program, self._task, wait=False))
@@ -116,6 +132,6 @@ class WebServices:
         except requests.RequestException as error:
             raise WebError(f"the controller's web services do not answer: {error}") from None
         except ABBException as error:
-            raise WebError(f"the controller refused: {error}") from None
+            raise WebRefused(f"the controller refused: {error}") from None
         except Exception as error:  # the client raises bare exceptions for what it does not like
-            raise WebError(str(error)) from None
+            raise WebRefused(str(error)) from None

@@ -18,12 +18,13 @@ from functools import partial
 from typing import TypeVar
 
 from rigs.arms.guard import Guard
+from rigs.arms.health import socket_health
 from rigs.arms.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
 from rigs.arms.rapid_socket import Command, RapidError, RapidSocket
 from rigs.arms.run import Run
 from rigs.arms.settings import AbbSocketSettings
 from rigs.arms.stream import PoseStream, Sample
-from rigs.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
+from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
 from storage.streams import PoseChunk, PulseChunk
 
 T = TypeVar("T")
@@ -52,6 +53,7 @@ class AbbSocketArm:
         self._stream = PoseStream()
         self._link: RapidSocket | None = None
         self._lost: str | None = "not connected"
+        self._info = ""
         self._run = Run((), done=True)
         self._one = threading.Lock()
 
@@ -67,7 +69,7 @@ class AbbSocketArm:
         frame = Pose(tool.tcp_mm, tool.tcp_rotvec_deg)
         try:
             self._link = RapidSocket(settings.host, settings.port, ANSWER_S)
-            self._link.info(ANSWER_S)
+            self._info = self._link.info(ANSWER_S)
             self._ask(Command.SET_TCP, frame.xyz_mm, quaternion(frame))
             self._ask(Command.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
             self._look()
@@ -103,6 +105,10 @@ class AbbSocketArm:
     def now_ns(self) -> int:
         """The host's monotonic clock, which is what this arm's times are told by, ns."""
         return time.monotonic_ns()
+
+    def health(self) -> DeviceHealth:
+        """What the server said of itself when it was reached."""
+        return socket_health(self._info)
 
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path` in pieces of at most `segment_s` each.

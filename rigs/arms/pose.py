@@ -10,7 +10,7 @@ of at most 180 degrees, and w >= 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -87,13 +87,27 @@ def distance_mm(one: Pose, other: Pose) -> float:
 
 def between(one: Pose, other: Pose, share: float) -> Pose:
     """The pose at `share` (0 to 1) of the straight way with the shortest turn."""
-    x, y, z = (a + share * (b - a) for a, b in zip(one.xyz_mm, other.xyz_mm, strict=True))
+    return way(one, other)(share)
+
+
+def way(one: Pose, other: Pose) -> Callable[[float], Pose]:
+    """The straight way with the shortest turn from one pose to the other, by its share."""
+    (x, y, z), (u, v, w) = one.xyz_mm, other.xyz_mm
+
+    def place(share: float) -> tuple[float, float, float]:
+        return x + share * (u - x), y + share * (v - y), z + share * (w - z)
+
     if one.rotvec_deg == other.rotvec_deg:
-        return Pose((x, y, z), one.rotvec_deg)
-    turn = (_rotation(one).inv() * _rotation(other)).as_rotvec() * share
-    rotation = _rotation(one) * Rotation.from_rotvec(turn)
-    a, b, c = np.degrees(rotation.as_rotvec()).tolist()
-    return Pose((x, y, z), (a, b, c))
+        return lambda share: Pose(place(share), one.rotvec_deg)
+    begin = _rotation(one)
+    turn = (begin.inv() * _rotation(other)).as_rotvec()
+
+    def pose(share: float) -> Pose:
+        rotation = begin * Rotation.from_rotvec(turn * share)
+        a, b, c = np.degrees(rotation.as_rotvec()).tolist()
+        return Pose(place(share), (a, b, c))
+
+    return pose
 
 
 def _rotation(pose: Pose) -> Rotation:

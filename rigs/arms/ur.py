@@ -20,6 +20,7 @@ from typing import Any
 
 from rigs.arms import ur_ports
 from rigs.arms.guard import Guard
+from rigs.arms.health import ur_health
 from rigs.arms.pose import MM_PER_M, distance_mm, to_ur
 from rigs.arms.rtde import Packet, RtdeError, RtdeReader
 from rigs.arms.run import Run
@@ -27,7 +28,7 @@ from rigs.arms.settings import UrSettings
 from rigs.arms.stream import PoseStream, Sample
 from rigs.arms.ur_control import WATCHDOG_HZ, ControlError, ControlProcess
 from rigs.arms.ur_state import OUTPUTS, UrStatus, status_of
-from rigs.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
+from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
 from storage.streams import PoseChunk, PulseChunk
 
 ANSWER_S = 3.0
@@ -138,6 +139,18 @@ class UrArm:
     def now_ns(self) -> int:
         """The controller's clock in the last packet, ns. Raises ArmFault without one."""
         return self._last().t_ns
+
+    def health(self) -> DeviceHealth:
+        """What the controller says of itself; takes at most 8 s.
+
+        Raises:
+            ArmFault: it does not answer.
+        """
+        notes = (f"sync line on digital input {self._settings.sync_input}",)
+        try:
+            return ur_health(self._settings.host, notes)
+        except ur_ports.PortError as error:
+            raise ArmFault("arm", f"{error}; check its power and network") from None
 
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path`: checked against all limits, first move taken by the controller.

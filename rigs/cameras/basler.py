@@ -9,28 +9,24 @@ means stands in `stamps.py`; what was never tried on a real camera stands in doc
 from __future__ import annotations
 
 import math
-import time
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from rigs.cameras.grabbing import Grab, GrabCounts, GrabSettings
-from rigs.cameras.nodes import DEVICE, Nodes
+from rigs.cameras.counts import GrabCounts
+from rigs.cameras.grabbing import Grab, GrabSettings
+from rigs.cameras.health import basler_health
+from rigs.cameras.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
 from rigs.cameras.settings import BaslerSettings
 from rigs.cameras.stamps import Abilities, choose
-from rigs.capabilities import RigError
+from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import ClockReads, FrameChunk, Json
 
 TRIGGER_READY_MS = 1000
 """How long a software trigger waits for the camera to be ready for it, ms."""
 _LEAST_BUFFERS = 8
 _END_OF_EXPOSURE = "EventExposureEndData"
-# command, value and ticks a second of the clock, by family; None: nanoseconds
-_LATCHES = (
-    ("TimestampLatch", "TimestampLatchValue", None),
-    ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
-)
 
 
 def find_camera(serial: str | None) -> Any:
@@ -65,7 +61,7 @@ class BaslerCamera:
     """
 
     def __init__(self, settings: BaslerSettings, device: Any = None) -> None:
-        self.settings, self.px_per_mm = settings, settings.px_per_mm
+        self.settings, self.px_per_mm = settings, settings.px_per_mm or math.nan
         self._device = device if device is not None else find_camera(settings.serial)
         self._grab: Grab | None = None
         self._running = False
@@ -136,7 +132,7 @@ class BaslerCamera:
             chunk=chunk,
             result=result,
             event=event,
-            latch=any(nodes.has(command) for command, _, _ in _LATCHES),
+            latch=has_latch(nodes),
             sync_level=level,
             exposure_line=settings.exposure_line is not None,
         )
@@ -196,6 +192,20 @@ class BaslerCamera:
             "counts": vars(self.counts) | {"lost": self.counts.lost},
         }
 
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, grabbing or not.
+
+        Raises:
+            RigError: the camera is gone.
+        """
+        return basler_health(self._device, self._nodes, self.stamping, self._shape, self._buffers)
+
+    @property
+    def _buffers(self) -> int:
+        """Of pylon; as many frames fit into the queue."""
+        half = math.ceil(self.settings.rate_hz * self.settings.back_pressure_s / 2)
+        return max(half, _LEAST_BUFFERS)
+
     def set_region(self, width_px: int, height_px: int) -> None:
         """Read out a centred region only.
 
@@ -204,23 +214,7 @@ class BaslerCamera:
         """
         if self._running:
             raise RigError(DEVICE, "the region cannot change while it grabs; stop first")
-        nodes = self._nodes
-        for size, offset, wanted in (
-            ("Width", "OffsetX", width_px),
-            ("Height", "OffsetY", height_px),
-        ):
-            nodes.put(0, offset)
-            most, step = nodes.limit(size, "Max"), nodes.limit(size, "Inc")
-            least = nodes.limit(size, "Min")
-            if not least <= wanted <= most or (wanted - least) % step:
-                raise RigError(
-                    DEVICE,
-                    f"{size.lower()} of {wanted} px: must lie between {least} and {most} px "
-                    f"in steps of {step}",
-                )
-            nodes.put(wanted, size)
-            step = nodes.limit(offset, "Inc")
-            nodes.put((most - wanted) // 2 // step * step, offset)
+        centre_region(self._nodes, width_px, height_px)
         self._shape = (height_px, width_px)
 
     def start(self) -> None:
@@ -234,10 +228,9 @@ class BaslerCamera:
         if self._running:
             raise RigError(DEVICE, "it grabs already; stop first")
         settings = self.settings
-        half = max(math.ceil(settings.rate_hz * settings.back_pressure_s / 2), _LEAST_BUFFERS)
         self._ends.clear()
         try:
-            self._device.MaxNumBuffer.Value = half
+            self._device.MaxNumBuffer.Value = self._buffers
             self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
         except self._genicam.GenericException as error:
             raise RigError(DEVICE, f"it does not begin to grab: {error}") from None
@@ -249,9 +242,9 @@ class BaslerCamera:
             period_ns=0 if settings.trigger == "software" else round(1e9 / settings.rate_hz),
             late_ns=round(settings.late_s * 1e9),
             sync_bit=(settings.sync_line or 1) - 1 if wired else None,
-            queue=half,
+            queue=self._buffers,
+            first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
             stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
-            stall_from_start=settings.trigger == "free run",
         )
         self._grab, self._running = Grab(self._device, told, self._ends), True
 
@@ -287,7 +280,10 @@ class BaslerCamera:
                 np.empty((0, *self._shape), np.uint8), none, none, none, np.empty(0, np.uint8)
             )
         return FrameChunk(
-            np.stack([frame.image for frame in frames]),
+            # one frame, as a quick loop finds it, is handed on as it is
+            np.stack([frame.image for frame in frames])
+            if len(frames) > 1
+            else frames[0].image[np.newaxis],
             np.array([frame.number for frame in frames], np.int64),
             np.array([frame.t_ns for frame in frames], np.int64),
             np.array([frame.host_ns for frame in frames], np.int64),
@@ -300,18 +296,7 @@ class BaslerCamera:
         Raises:
             RigError: this camera has no clock that the host can read.
         """
-        nodes = self._nodes
-        for command, value, frequency in _LATCHES:
-            if not nodes.has(command):
-                continue
-            per_s = int(nodes.get(frequency)) if frequency else 10**9
-            before_ns = time.monotonic_ns()
-            nodes.execute(command)
-            after_ns = time.monotonic_ns()
-            # the latch is what happened between the two; reading it out may take its time
-            row = (int(nodes.get(value)) * 10**9 // per_s, before_ns, after_ns)
-            return ClockReads(*(np.array([each], np.int64) for each in row))
-        raise RigError(DEVICE, "this camera has no clock that the host can read")
+        return latch_clock(self._nodes)
 
     def stop(self) -> None:
         """Stop grabbing; frames exposed before can still be read. Bounded by `STOP_S`."""

@@ -11,49 +11,31 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import timedelta
 from typing import Any
 
 import numpy as np
 
+from rigs.cameras.counts import EventCounts
 from rigs.cameras.event_source import DEVICE, EventSource, open_source
+from rigs.cameras.health import dvxplorer_health
+from rigs.cameras.patience import Patience
 from rigs.cameras.settings import DvxplorerSettings
-from rigs.capabilities import RigError
+from rigs.capabilities import DeviceHealth, RigError
 from storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
 """The pause after a look that found nothing, s."""
 SETTLE_S = 1.0
 """The longest that `start` and `stop` wait until all is taken that came before, s."""
+HANG_S = 5.0
+"""The library, which answers at once, must have answered by then, s."""
 CLOSE_S = 3.0
 """The longest that `close` waits for the thread, s."""
 _EVENT_BYTES = 13
-
-
-@dataclass
-class EventCounts:
-    """What one run received.
-
-    Attributes:
-        events: kept, read or not.
-        pulses: rising edges.
-        gaps: silences of more than `gap_s` between events, on the camera's clock.
-        longest_gap_us: the longest silence between two events.
-        filtered: dropped by the noise filter, if it is on.
-        overflowed: dropped because nobody read; the run ends with an error then.
-        other_triggers: triggers that are no rising edges.
-        before: events thrown away before the run.
-    """
-
-    events: int = 0
-    pulses: int = 0
-    gaps: int = 0
-    longest_gap_us: int = 0
-    filtered: int = 0
-    overflowed: int = 0
-    other_triggers: int = 0
-    before: int = 0
+_LOOK_NS = 10_000_000
+"""The most that one look which found nothing counts as silence, ns."""
 
 
 class DvxplorerCamera:
@@ -89,7 +71,9 @@ class DvxplorerCamera:
         self._last_pulse_us: int | None = None
         self._counts = EventCounts()
         self._fault: RigError | None = None
-        self._heard_ns = time.monotonic_ns()
+        self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
+        self._silent_ns = 0
 
     @property
     def counts(self) -> EventCounts:
@@ -106,6 +90,16 @@ class DvxplorerCamera:
             "counts": asdict(self.counts),
         }
 
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, streaming or not.
+
+        Raises:
+            RigError: the camera is gone, or does not answer.
+        """
+        if self._closed:
+            raise RigError(DEVICE, "it is closed; open it again")
+        return dvxplorer_health(self._source, self.settings)
+
     def start(self) -> None:
         """Begin to stream; what came before is dropped. Returns within `SETTLE_S`.
 
@@ -120,7 +114,7 @@ class DvxplorerCamera:
         self._source.run(True)
         self._want(True)
         with self._lock:
-            self._heard_ns = time.monotonic_ns()
+            self._silent_ns = 0
             if self._fault is not None:
                 raise self._fault
 
@@ -180,7 +174,10 @@ class DvxplorerCamera:
     def _check(self) -> None:
         if self._fault is not None:
             raise self._fault
-        silent_s = (time.monotonic_ns() - self._heard_ns) / 1e9
+        silent_s = self._silent_ns / 1e9
+        hung_s = self._patience.waited_s(self._asked_ns)
+        if self._keep and hung_s > HANG_S:
+            raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:
             raise RigError(
                 DEVICE, f"neither event nor pulse for {silent_s:.1f} s; look at cable and lens"
@@ -210,15 +207,19 @@ class DvxplorerCamera:
                     self._take_events(events)
                 if triggers is not None:
                     self._take_triggers(triggers)
+                now_ns = time.monotonic_ns()
                 if events is None and triggers is None:
                     with self._lock:
                         self._keep = wanted
+                        # silence is what was listened to: a computer that stood still heard nothing
+                        self._silent_ns += min(now_ns - self._asked_ns, _LOOK_NS)
                     if wanted == self._wanted:
                         self._settled.set()
                     if not (source.events.isRunning() and source.triggers.isRunning()):
                         self._fail("the connection is gone; look at its cable and open it again")
                         break
                     self._closing.wait(POLL_S)
+                self._asked_ns = now_ns
             except Exception as error:
                 self._fail(f"reading failed: {error}")
                 break
@@ -248,7 +249,7 @@ class DvxplorerCamera:
             np.ascontiguousarray(rows["timestamp"], np.int64),
         )
         with self._lock:
-            counts, self._heard_ns = self._counts, time.monotonic_ns()
+            counts, self._silent_ns = self._counts, 0
             counts.filtered += filtered
             if not len(chunk) or self._fault is not None:
                 counts.overflowed += len(chunk) if counts.overflowed else 0
@@ -284,7 +285,7 @@ class DvxplorerCamera:
         if not self._keep:
             return
         with self._lock:
-            self._heard_ns = time.monotonic_ns()
+            self._silent_ns = 0
             for trigger in batch:
                 at, kind = int(trigger.timestamp), trigger.type
                 if kind == self._reset:

@@ -11,10 +11,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
+from rigs.cameras.counts import GrabCounts
 from rigs.cameras.nodes import DEVICE
+from rigs.cameras.patience import Patience
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import RigError
 from storage.streams import U8
@@ -23,42 +25,14 @@ POLL_MS = 100
 """The longest that the thread waits in pylon before it looks round, ms."""
 EVENT_WAIT_S = 0.5
 """A frame whose exposure-end event has not come by then is given up, s."""
+HANG_S = 5.0
+"""Pylon, asked for `POLL_MS`, must have answered by then, s."""
 STOP_S = 3.0
 """The longest that a grab takes to end, s."""
 _DRAIN_ROUNDS = 2
 """Empty looks in a row after which a stopped camera has nothing more to say."""
 NO_ID = (1 << 64) - 1
 """A block id of pylon that says there is none."""
-
-
-@dataclass
-class GrabCounts:
-    """What became of the frames of one run.
-
-    Attributes:
-        grabbed: whole frames in order, handed on or still in the queue.
-        failed: came incomplete.
-        skipped: missing in the camera's ids, or overwritten in pylon.
-        late: arrived later after their time than `late_s` allows; they are handed on.
-        out_of_order: came after a later one or twice; they are not handed on.
-        unstamped: their time never came; they are not handed on.
-    """
-
-    grabbed: int = 0
-    failed: int = 0
-    skipped: int = 0
-    late: int = 0
-    out_of_order: int = 0
-    unstamped: int = 0
-
-    @property
-    def lost(self) -> int:
-        """Frames that were exposed, as far as one can tell, and not handed on."""
-        return self.failed + self.skipped + self.out_of_order + self.unstamped
-
-    def copy(self) -> GrabCounts:
-        """As they are now."""
-        return GrabCounts(*(getattr(self, field.name) for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -89,8 +63,8 @@ class GrabSettings:
         period_ns: between two frames, where the camera runs by itself or is triggered at a rate.
         sync_bit: of the line status chunk; None where the sync line is not wired.
         queue: frames that the queue holds.
-        stall_ns: silence that is a fault; 0 where the camera need not send by itself.
-        stall_from_start: whether silence before the first frame counts too.
+        first_ns: silence before the first frame that is a fault; 0 where it may wait for ever.
+        stall_ns: silence after it that is a fault; 0 where the camera need not send by itself.
     """
 
     stamping: Stamping
@@ -100,8 +74,8 @@ class GrabSettings:
     late_ns: int
     sync_bit: int | None
     queue: int
+    first_ns: int
     stall_ns: int
-    stall_from_start: bool
 
 
 class Grab:
@@ -122,7 +96,9 @@ class Grab:
         self._last = -1
         self._shortest_ns: int | None = None
         self._before: tuple[int, int] | None = None
-        self._begun_ns = self._heard_ns = time.monotonic_ns()
+        self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
+        self._silent_ns = 0
         self._heard = False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="frame camera", daemon=True)
@@ -140,15 +116,16 @@ class Grab:
         with self._changed:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
-            silent_ns = time.monotonic_ns() - self._heard_ns
-            limit = self._settings.stall_ns
-            counts_now = self._heard or self._settings.stall_from_start
-            # while the queue is full nobody listens, and silence says nothing
-            full = len(self._ready) >= self._settings.queue
-            if limit and counts_now and not full and silent_ns > limit:
+            silent_ns = self._silent_ns
+            hung_s = self._patience.waited_s(self._asked_ns)
+            limit = self._settings.stall_ns if self._heard else self._settings.first_ns
+            if hung_s > HANG_S:
+                return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
+            if limit and silent_ns > limit:
+                what = "no frame" if self._heard else "not one frame since the start,"
                 return RigError(
                     DEVICE,
-                    f"no frame for {silent_ns / 1e9:.1f} s; look at its cable, its power and "
+                    f"{what} for {silent_ns / 1e9:.1f} s; look at its cable, its power and "
                     "its trigger",
                 )
             return None
@@ -175,19 +152,20 @@ class Grab:
             raise RigError(DEVICE, f"grabbing has not ended within {STOP_S:g} s")
 
     def _run(self) -> None:
-        empty = 0
+        from pypylon import pylon
+
+        empty, looked_ns, wait = 0, 0, pylon.TimeoutHandling_Return
         try:
             while self._waiting or empty < _DRAIN_ROUNDS or not self._stopping.is_set():
                 if not self._room():
                     continue
-                if self._device.IsCameraDeviceRemoved():
-                    raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
-                from pypylon import pylon
-
-                result = self._device.RetrieveResult(POLL_MS, pylon.TimeoutHandling_Return)
+                asked_ns = self._asked_ns = time.monotonic_ns()
+                result = self._device.RetrieveResult(POLL_MS, wait)
                 now_ns = time.monotonic_ns()
                 if result is None or not result.IsValid():
                     empty += 1
+                    # silence is what was listened to: a computer that stood still heard nothing
+                    self._silent_ns += min(now_ns - asked_ns, POLL_MS * 1_000_000)
                 else:
                     empty = 0
                     try:
@@ -195,6 +173,11 @@ class Grab:
                     finally:
                         result.Release()
                 self._give(now_ns)
+                # not at every frame: each call into pylon gives up the interpreter, and a busy
+                # one is slow to give it back
+                if now_ns - looked_ns > POLL_MS * 1_000_000:
+                    looked_ns = now_ns
+                    self._look()
         except RigError as error:
             self._fail(error)
         except Exception as error:
@@ -208,10 +191,13 @@ class Grab:
             if len(self._ready) < self._settings.queue or self._stopping.is_set():
                 return True
             self._changed.wait(POLL_MS / 1000)
-            self._heard_ns = time.monotonic_ns()
-            if self._device.IsCameraDeviceRemoved():
-                raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
+            self._asked_ns = time.monotonic_ns()
+            self._look()
             return len(self._ready) < self._settings.queue
+
+    def _look(self) -> None:
+        if self._device.IsCameraDeviceRemoved():
+            raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
 
     def _fail(self, error: RigError) -> None:
         with self._changed:
@@ -224,7 +210,7 @@ class Grab:
         number = counted - (self._settings.first_id if block != NO_ID else 0)
         counts = self._counts
         with self._changed:
-            self._heard, self._heard_ns = True, now_ns
+            self._heard, self._silent_ns = True, 0
             if number <= self._last:
                 counts.out_of_order += 1
                 return

@@ -5,11 +5,21 @@ Names differ between families (`ExposureTime`, `ExposureTimeAbs`); SFNC 2 names 
 
 from __future__ import annotations
 
+import time
+from contextlib import suppress
 from typing import Any
 
+import numpy as np
+
 from rigs.capabilities import RigError
+from storage.streams import ClockReads
 
 DEVICE = "frame camera"
+# command, value and ticks a second of the clock, by family; None: nanoseconds
+_LATCHES = (
+    ("TimestampLatch", "TimestampLatchValue", None),
+    ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
+)
 
 
 class Nodes:
@@ -27,7 +37,7 @@ class Nodes:
     def has(self, name: str) -> bool:
         """Whether a setting is there and may be written now."""
         node = self._map.GetNode(name)
-        return node is not None and bool(self._genicam.IsWritable(node))
+        return node is not None and node.GetAccessMode() in (self._genicam.RW, self._genicam.WO)
 
     def offers(self, name: str, choice: str) -> bool:
         """Whether a setting can be set and `choice` is one of its values."""
@@ -43,6 +53,17 @@ class Nodes:
             return self._map.GetNode(name).Value
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} cannot be read: {_short(error)}") from None
+
+    def peek(self, *names: str) -> Any:
+        """The value of the first of `names` that can be read now; None where none can."""
+        for name in names:
+            node = self._map.GetNode(name)
+            if node is None:
+                continue
+            if node.GetAccessMode() in (self._genicam.RW, self._genicam.RO):
+                with suppress(self._genicam.GenericException):
+                    return node.Value
+        return None
 
     def limit(self, name: str, which: str) -> int:
         """`Min`, `Max` or `Inc` of a whole number."""
@@ -72,6 +93,46 @@ class Nodes:
             self._map.GetNode(name).Execute()
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} failed: {_short(error)}") from None
+
+
+def centre_region(nodes: Nodes, width_px: int, height_px: int) -> None:
+    """Read out a centred region only. Raises RigError where the sensor cannot."""
+    for size, offset, wanted in (
+        ("Width", "OffsetX", width_px),
+        ("Height", "OffsetY", height_px),
+    ):
+        nodes.put(0, offset)
+        most, step = nodes.limit(size, "Max"), nodes.limit(size, "Inc")
+        least = nodes.limit(size, "Min")
+        if not least <= wanted <= most or (wanted - least) % step:
+            raise RigError(
+                DEVICE,
+                f"{size.lower()} of {wanted} px: must lie between {least} and {most} px "
+                f"in steps of {step}",
+            )
+        nodes.put(wanted, size)
+        step = nodes.limit(offset, "Inc")
+        nodes.put((most - wanted) // 2 // step * step, offset)
+
+
+def has_latch(nodes: Nodes) -> bool:
+    """Whether the host can read the camera's clock."""
+    return any(nodes.has(command) for command, _, _ in _LATCHES)
+
+
+def latch_clock(nodes: Nodes) -> ClockReads:
+    """Latch the camera's clock and read it: one row. Raises RigError where it has none."""
+    for command, value, frequency in _LATCHES:
+        if not nodes.has(command):
+            continue
+        per_s = int(nodes.get(frequency)) if frequency else 10**9
+        before_ns = time.monotonic_ns()
+        nodes.execute(command)
+        after_ns = time.monotonic_ns()
+        # the latch is what happened between the two; reading it out may take its time
+        row = (int(nodes.get(value)) * 10**9 // per_s, before_ns, after_ns)
+        return ClockReads(*(np.array([each], np.int64) for each in row))
+    raise RigError(DEVICE, "this camera has no clock that the host can read")
 
 
 def _short(error: Exception) -> str:

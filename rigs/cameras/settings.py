@@ -19,10 +19,11 @@ Readout = Literal[
 class BaslerSettings(StrictModel):
     """The camera that looks through the plate."""
 
+    driver: Literal["basler"] = "basler"
     serial: str | None = None
     """Serial number; the first camera found where none is given."""
-    px_per_mm: float = Field(gt=0, le=1000)
-    """Pixels for a millimetre of the plate."""
+    px_per_mm: float | None = Field(default=None, gt=0, le=1000)
+    """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
     exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
     """Exposure, microseconds; the camera may round it, and what it says then counts."""
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
@@ -39,8 +40,11 @@ class BaslerSettings(StrictModel):
     """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
     late_s: float = Field(default=0.1, gt=0, le=10)
     """A frame that arrives by this much after its time counts as late, seconds."""
+    first_frame_s: float = Field(default=5.0, ge=0.2, le=60)
+    """In free run, no frame for so long after the start is a fault, seconds: a camera and pylon
+    need time to set up buffers. Triggered, it may wait for ever for its first trigger."""
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
-    """A running camera that gives no frame for so long is a fault, seconds."""
+    """Silence for so long after the first frame is a fault, seconds."""
 
 
 class UsbCamera(StrictModel):
@@ -70,6 +74,7 @@ class NetworkStream(StrictModel):
 class DvxplorerSettings(StrictModel):
     """The event camera inside the sensor."""
 
+    driver: Literal["dvxplorer"] = "dvxplorer"
     source: Annotated[UsbCamera | NetworkStream, Field(discriminator="kind")] = UsbCamera()
     noise_filter_us: int | None = Field(default=None, ge=1, le=1_000_000)
     """Drop events without a neighbour within so many microseconds; None keeps all of them."""

@@ -39,6 +39,22 @@ class TrialClocks:
     sync_box_ppb: int
     """The sync box counts from its own start: it has a drift and no offset."""
 
+    def after(self, past_ns: int) -> TrialClocks:
+        """The same clocks when `past_ns` of true time have passed, with that moment as time 0."""
+        return replace(
+            self,
+            arm=shifted(self.arm, past_ns),
+            event_camera=shifted(self.event_camera, past_ns),
+            frame_camera=shifted(self.frame_camera, past_ns),
+        )
+
+
+def shifted(clock: ClockMap, past_ns: int) -> ClockMap:
+    """`clock`, with the moment that was `past_ns` as time 0."""
+    return ClockMap(
+        tuple(time - past_ns for time in clock.device_ns), clock.reference_ns, clock.drift
+    )
+
 
 def trial_clocks(settings: Clocks, rig_seed: int, trial_seed: int) -> TrialClocks:
     """Drifts that belong to the rig's seed, offsets that belong to the trial's."""
@@ -238,20 +254,27 @@ class Noise:
 
     def of(self, numbers: I64) -> F64:
         """Standard normal, cut at four, for the instants `numbers` (not negative), (n, width)."""
-        result = np.empty((len(numbers), self._width))
         if not len(numbers):
-            return result
+            return np.empty((0, self._width))
+        first, last = int(numbers.min()) // JITTER_BLOCK, int(numbers.max()) // JITTER_BLOCK
+        if first == last:
+            # a new array, for the numbers are picked by an array
+            return self._block(first)[numbers - first * JITTER_BLOCK]
+        result = np.empty((len(numbers), self._width))
         block, inside = np.divmod(numbers, JITTER_BLOCK)
-        for index in range(int(block.min()), int(block.max()) + 1):
-            if index not in self._blocks:
-                if len(self._blocks) > 1:
-                    self._blocks.pop(min(self._blocks))
-                rng = generator(self._seed, self._purpose, index)
-                draw = rng.standard_normal((JITTER_BLOCK, self._width))
-                self._blocks[index] = np.clip(draw, -4.0, 4.0)
+        for index in range(first, last + 1):
             here = block == index
-            result[here] = self._blocks[index][inside[here]]
+            result[here] = self._block(index)[inside[here]]
         return result
+
+    def _block(self, index: int) -> F64:
+        if index not in self._blocks:
+            if len(self._blocks) > 1:
+                self._blocks.pop(min(self._blocks))
+            rng = generator(self._seed, self._purpose, index)
+            draw = rng.standard_normal((JITTER_BLOCK, self._width))
+            self._blocks[index] = np.clip(draw, -4.0, 4.0)
+        return self._blocks[index]
 
 
 class Jitter:

@@ -22,6 +22,7 @@ from rigs.mock.frame_faults import FrameFaults
 from rigs.mock.free_run import FreeRun, Trigger
 from rigs.mock.settings import MockSettings
 from rigs.mock.world import World
+from rigs.scene.board import BoardCamera, BoardPlace, BoardPrint, draw_board
 from rigs.scene.exposure import Exposures, expose
 from rigs.scene.frames import FrameOptics, PlateView
 from rigs.scene.randomness import generator
@@ -31,6 +32,7 @@ from storage.streams import ClockReads, FrameChunk
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
 _NEVER = 1 << 62
 _NOISE_FRAMES = 256
 """Frames whose centroid noise is drawn together."""
@@ -57,6 +59,7 @@ class MockFrameCamera:
         """From the start of an exposure, which is its tick, to its middle."""
         self._size = (settings.width, settings.height)
         self._view: PlateView | None = None
+        self._shown: tuple[tuple[BoardPlace, tuple[int, int]], U8] | None = None
         self._begin()
         world.on_begin.append(self._begin)
 
@@ -137,6 +140,9 @@ class MockFrameCamera:
             )
         width, height = self._size
         images = np.empty((len(ticks), height, width), np.uint8)
+        if world.board is not None:
+            images[:] = self._board(world.board)
+            return FrameChunk(images, number, stamp, host, sync)
         marked = seen.plate_mm if world.plate_marked else None
         self._view.draw(images, seen.tips_mm, marked, number, world.seed, seen.ways)
         return FrameChunk(images, number, stamp, host, sync)
@@ -171,6 +177,20 @@ class MockFrameCamera:
         _blank_cut(plate[:, None], whole, *self._size)
         plate += settings.plate_noise_px * noise[:, 0]
         return markers.astype(np.float32), plate.astype(np.float32)
+
+    def _board(self, place: BoardPlace) -> U8:
+        """The board that is held before the camera; it hides what is behind it."""
+        if self._shown is None or self._shown[0] != (place, self._size):
+            optics = self._world.settings.frame_camera
+            camera = BoardCamera(
+                optics.px_per_mm, *self._size, optics.tilt_deg, (optics.k1,), optics.distance_mm
+            )
+            looks = optics.ground_level, optics.tip_level
+            picture = draw_board(camera, place, BoardPrint(), dark=looks[0], bright=looks[1])
+            draw = generator(self._world.settings.seed, "board noise")
+            noisy = picture + optics.noise * draw.standard_normal(picture.shape)
+            self._shown = (place, self._size), np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        return self._shown[1]
 
     def _centroid_noise(self, number: I64) -> F64:
         """Unit noise of the plate's marker and every papilla, (k, 1 + m, 2), by frame number."""

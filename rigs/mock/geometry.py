@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -49,12 +50,14 @@ class ContactPlane:
     Right, up and into make a right-handed frame as the outside camera sees it, from behind.
     """
 
-    def __init__(self, origin_mm: F64, rotation: F64) -> None:
+    def __init__(self, origin_mm: F64, rotation: F64, tip_mm: F64 | None = None) -> None:
+        """`tip_mm`: where the tip truly is from the reported tool centre point, in tool axes."""
         self.origin_mm = origin_mm
         self.rotation = rotation
+        self.tip_mm = np.zeros(3) if tip_mm is None else tip_mm
 
     @classmethod
-    def from_settings(cls, contact: Contact) -> ContactPlane:
+    def from_settings(cls, contact: Contact, tip_mm: Sequence[float] = (0, 0, 0)) -> ContactPlane:
         """The nominal plane, tilted about an axis in it and set back along its normal."""
         nominal = matrix(contact.nominal_rotvec_deg)
         azimuth = math.radians(contact.tilt_axis_deg)
@@ -63,11 +66,12 @@ class ContactPlane:
         ))  # fmt: skip
         rotation = nominal @ tilt
         origin = np.asarray(contact.nominal_origin_mm) + contact.offset_mm * rotation[:, 2]
-        return cls(origin, rotation)
+        return cls(origin, rotation, np.asarray(tip_mm, np.float64))
 
     def pose(self, x_mm: float, y_mm: float, depth_mm: float) -> Pose:
         """The tool pose that puts the sensor squarely there."""
-        x, y, z = (self.origin_mm + self.rotation @ np.array([x_mm, y_mm, depth_mm])).tolist()
+        place = np.array([x_mm, y_mm, depth_mm]) - self.tip_mm
+        x, y, z = (self.origin_mm + self.rotation @ place).tolist()
         return Pose((x, y, z), rotvec_deg(self.rotation))
 
     def sensor(self, pose: Pose) -> F64:
@@ -75,8 +79,8 @@ class ContactPlane:
 
         Turning about the plate's normal is left out: the skin looks much the same after it.
         """
-        place = self.rotation.T @ (np.asarray(pose.xyz_mm) - self.origin_mm)
         tool = self.rotation.T @ matrix(pose.rotvec_deg)
+        place = self.rotation.T @ (np.asarray(pose.xyz_mm) - self.origin_mm) + tool @ self.tip_mm
         return np.array([*place, tool[2, 0], tool[2, 1]])
 
     def turned_deg(self, pose: Pose) -> float:

@@ -109,22 +109,7 @@ class ArmPath:
 
     def stirred(self, t_ns: I64) -> F64:
         """How much the arm trembles at rising times, 0 to 1: it fades in and out with motion."""
-        if not len(t_ns):
-            return np.zeros(0)
-        runs: list[tuple[int, int]] = []
-        for leg in self.legs:
-            if runs and runs[-1][1] == leg.start_ns:
-                runs[-1] = (runs[-1][0], leg.end_ns)
-            else:
-                runs.append((leg.start_ns, leg.end_ns))
-        result = np.zeros(len(t_ns))
-        for start, end in runs:
-            if start > t_ns[-1] or end + FADE_NS < t_ns[0]:
-                continue
-            risen = np.clip((np.minimum(t_ns, end) - start) / FADE_NS, 0.0, 1.0)
-            fallen = np.maximum(t_ns - end, 0) / FADE_NS
-            np.maximum(result, risen - fallen, out=result)
-        return result
+        return stirred([(leg.start_ns, leg.end_ns) for leg in self.legs], t_ns)
 
     def moving(self, now_ns: int) -> bool:
         """Whether a leg is yet to end."""
@@ -132,3 +117,23 @@ class ArmPath:
 
     def _state(self, pose: Pose) -> F64:
         return np.concatenate([pose.xyz_mm, pose.rotvec_deg, self._plane.sensor(pose)])
+
+
+def stirred(moves: Sequence[tuple[int, int]], t_ns: I64) -> F64:
+    """Strength of the tremor, 0 to 1, at rising times (n,), for moves from one time to another."""
+    if not len(t_ns):
+        return np.zeros(0)
+    runs: list[tuple[int, int]] = []
+    for start, end in moves:
+        if runs and runs[-1][1] == start:
+            runs[-1] = (runs[-1][0], end)
+        else:
+            runs.append((start, end))
+    result = np.zeros(len(t_ns))
+    for start, end in runs:
+        if start > t_ns[-1] or end + FADE_NS < t_ns[0]:
+            continue
+        risen = np.clip((np.minimum(t_ns, end) - start) / FADE_NS, 0.0, 1.0)
+        fallen = np.maximum(t_ns - end, 0) / FADE_NS
+        np.maximum(result, risen - fallen, out=result)
+    return result

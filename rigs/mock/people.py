@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 from protocols.program import PlateAction
-from rigs.capabilities import ArmState, RigError
+from rigs.capabilities import ArmState
+from rigs.mock.jogging import hold_board, jog
 from rigs.mock.world import World
-
-_MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
+from rigs.people import mass_of
 
 
 class VirtualClock:
@@ -60,7 +59,8 @@ class SimulatedOperator:
     """Does at once what it is asked, and says so.
 
     `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
-    stop at the pendant. Everything else is only confirmed.
+    stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
+    the camera (`rigs.mock.jogging`). Everything else is only confirmed.
     """
 
     def __init__(self, world: World) -> None:
@@ -75,10 +75,11 @@ class SimulatedOperator:
         """
         self.asked.append(Asked(task, prompt, expected))
         if task == "changeover":
-            match = _MASS.fullmatch(expected)
-            if match is None or float(match[1]) <= 0.0:
-                raise RigError("operator", f"cannot mount {expected!r}; expected such as 0.205 kg")
-            self._world.mass_kg = float(match[1]) * (0.001 if match[2] == "g" else 1.0)
+            self._world.mass_kg = mass_of(expected)
         elif task == "protective_stop":
             self._world.arm_state = ArmState.READY
+        elif task == "jog":
+            return jog(self._world, expected)
+        elif task == "board":
+            hold_board(self._world, expected)
         return True

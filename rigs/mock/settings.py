@@ -253,6 +253,9 @@ class Arm(StrictModel):
     """Its frequencies lie within 30 % of this one."""
     input_sampling_us: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Grid on which the digital input is sampled; 0 stamps each edge when it comes."""
+    tip_offset_mm: Triple = (0.0, 0.0, 0.0)
+    """Where the centre papilla's tip truly is from the reported tool centre point, in the tool's
+    axes: what pivoting has to find out."""
     start_xyz_mm: Triple | None = None
     """Where the arm stands when the rig is switched on; left out, 60 mm clear of the plate."""
 

@@ -54,15 +54,21 @@ class MockSyncBox:
         self._bits: U8 = np.zeros(0, np.uint8)
         self._reports = _PulseFaults(self._world, self, "sync_box")
 
-    def start(self, rate_hz: float, seed: int, code: Code = "lfsr") -> None:
-        """Begin ticks and code; a train that runs is given up."""
+    def connect(self) -> None:
+        """It is there."""
+
+    def start(
+        self, rate_hz: float, seed: int, code: Code = "lfsr", at_ns: int | None = None
+    ) -> None:
+        """Begin ticks and code, now or at a true time to come; a train that runs is given up."""
         if not 0.0 < rate_hz <= 10_000.0:
             raise RigError("sync box", f"rate {rate_hz} Hz: must lie between 0 and 10,000")
         if not 1 <= seed <= SEEDS:
             raise RigError("sync box", f"seed {seed}: must lie between 1 and {SEEDS}")
         world = self._world
         self.run += 1
-        self.rate_hz, self.started_ns, self.stopped_ns, self._read = rate_hz, world.now_ns, None, 0
+        self.started_ns = world.now_ns if at_ns is None else at_ns
+        self.rate_hz, self.stopped_ns, self._read = rate_hz, None, 0
         clock = ClockMap.line(self.started_ns, 0, world.clocks.sync_box_ppb)
         self.clock = faulty(clock, "sync_box", world.faults)
         self._code, self._bits = (seed, code), code_bits(seed, _BITS, code)
@@ -99,10 +105,10 @@ class MockSyncBox:
         """The box's clock now, whole microseconds: one row."""
         return self._clock_reader.read(self.clock, 1000)
 
-    def stop(self) -> None:
-        """Stop the ticks; pulses sent before can still be read."""
+    def stop(self, at_ns: int | None = None) -> None:
+        """Stop the ticks, now or at a true time; pulses sent before can still be read."""
         if self.stopped_ns is None:
-            self.stopped_ns = self._world.now_ns
+            self.stopped_ns = self._world.now_ns if at_ns is None else at_ns
 
     def close(self) -> None:
         """Give the device back."""
@@ -125,7 +131,7 @@ class MockSyncBox:
         if self.rate_hz == 0.0:
             return 0
         box = undisturbed(self.clock).to_reference(true_ns)
-        guess = max(int(box * self.rate_hz / 1e9) - 1, 0)
+        guess = max(int(box * self.rate_hz / 1e9) + 1, 0)
         while guess and self._true_of(guess - 1) >= true_ns:
             guess -= 1
         while self._true_of(guess) < true_ns:

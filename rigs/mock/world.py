@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from protocols.program import PlateAction
-from rigs.capabilities import ArmFault, ArmState, RigError, Segment
+from rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
 from rigs.mock.deviation import Deviation
 from rigs.mock.fault_settings import PlateStuck
@@ -26,6 +26,7 @@ from rigs.mock.path import SENSOR, ArmPath, Leg
 from rigs.mock.physics import Physics
 from rigs.mock.settings import MockSettings
 from rigs.mock.skins import skin_of
+from rigs.scene.board import BoardPlace
 from rigs.scene.skin import Skin
 from rigs.scene.vibration import Vibration
 
@@ -37,6 +38,15 @@ MOST_TURNED_DEG = 20.0
 NEAR_MM = 5.0
 
 
+def start_pose(settings: MockSettings) -> Pose:
+    """Where the arm stands when the rig is switched on."""
+    plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+    start = plane.pose(0.0, 0.0, -CLEARANCE_MM)
+    if settings.arm.start_xyz_mm is not None:
+        return Pose(settings.arm.start_xyz_mm, start.rotvec_deg)
+    return start
+
+
 class World:
     """What is really there. Devices ask it; nothing outside the mock rig does.
 
@@ -44,20 +54,26 @@ class World:
         now_ns: true time since the trial began, which is also the host's monotonic clock.
         past_ns: true time spent in earlier trials.
         trials: how often `begin_trial` was called.
+        board: where a printed board is held before the outside camera, if it is.
         plate_marked: whether the sliding plate with its ArUco marker stands there.
+
+    Args:
+        path: where the arm is, if it is driven from outside; left out, it follows `start_arm`.
+        run_on: the devices' clocks go on from trial to trial, as real ones do; else each trial
+            finds them at a time of its own.
     """
 
-    def __init__(self, settings: MockSettings) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: MockSettings, path: ArmPath | None = None, *, run_on: bool = False
+    ) -> None:
+        self.settings, self._run_on = settings, run_on
         self.skin: Skin = skin_of(settings)
-        self.plane = ContactPlane.from_settings(settings.scene.contact)
+        self.plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self.mass_kg = settings.scene.plate.mass_kg
         self.now_ns = self.past_ns = 0
         self.trials = 0
-        start = self.plane.pose(0.0, 0.0, -CLEARANCE_MM)
-        if settings.arm.start_xyz_mm is not None:
-            start = type(start)(settings.arm.start_xyz_mm, start.rotvec_deg)
-        self.path = ArmPath(self.plane, start)
+        self.board: BoardPlace | None = None
+        self.path = path or ArmPath(self.plane, start_pose(settings))
         self.arm_state = ArmState.READY
         self.on_begin: list[Callable[[], None]] = []
         self._prepare(settings.seed)
@@ -85,7 +101,11 @@ class World:
         settings = self.settings
         self.seed = seed
         self.faults = FaultBook(settings.faults, self.trials)
-        clocks = trial_clocks(settings.clocks, settings.seed, seed)
+        clocks = trial_clocks(
+            settings.clocks, settings.seed, settings.seed if self._run_on else seed
+        )
+        if self._run_on:
+            clocks = clocks.after(self.past_ns)
         self.clocks: TrialClocks = with_faults(clocks, self.faults)
         self.path.deviation = Deviation(self.faults, self.plane, self.path.commanded)
         self._vibration = Vibration(

@@ -23,7 +23,7 @@ from rigs.wire.abb_http import HttpServer, Reply
 from rigs.wire.abb_program import MoveL, ProgramError, Wait, read_program
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.loop import START_S
-from rigs.wire.motion import ControllerClock, Motion, StraightMotion
+from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
 
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
@@ -47,6 +47,7 @@ class AbbStandIn:
         cycle_hz: EGM packets a controller second; 250 from the real one.
         egm_point: what EGM tells: the tool centre point, or the flange.
         faults: what will go wrong.
+        clock: the controller's; one of its own, at `rate`, if left out.
     """
 
     def __init__(
@@ -60,10 +61,11 @@ class AbbStandIn:
         egm_point: str = "tool",
         faults: Sequence[Fault] = (),
         joints_deg: Sequence[float] = JOINTS_DEG,
+        clock: CycleClock | None = None,
     ) -> None:
         self.host, self.port, self._egm = host, port, egm
         self.motion = motion or StraightMotion(HOME)
-        self.clock = ControllerClock(time.monotonic, rate)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
         self.faults = list(faults)
         self.controller, self.mode = "motoron", "AUTO"
         self.running = False
@@ -260,6 +262,8 @@ class AbbStandIn:
                 "cycle": "once",
             },
             "rw/panel/ctrlstate": lambda: {"ctrlstate": self.controller},
+            "rw/system": lambda: {"name": "IRB120 stand-in", "rwversion": "6.08.00.01"},
+            "ctrl/identity": lambda: {"ctrl-name": "IRB120 stand-in", "ctrl-id": "120-000000"},
             "rw/panel/opmode": lambda: {"opmode": self.mode},
             "rw/elog/0/": self._log_entry,
             "rw/rapid/tasks": lambda: {

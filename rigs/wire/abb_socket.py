@@ -17,7 +17,7 @@ from rigs.arms.rapid_socket import ARGUMENTS, Command
 from rigs.capabilities import Pose
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.loop import Connections, LoopThread
-from rigs.wire.motion import ControllerClock, StraightMotion
+from rigs.wire.motion import ControllerClock, CycleClock, StraightMotion
 
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
@@ -35,14 +35,22 @@ class RapidStandIn:
         port: of the server.
         rate: controller seconds a host second.
         faults: what will go wrong.
+        motion: where the tool centre point is.
+        clock: the controller's; one of its own, at `rate`, if left out.
     """
 
     def __init__(
-        self, host: str, port: int = 5000, rate: float = 1.0, faults: Sequence[Fault] = ()
+        self,
+        host: str,
+        port: int = 5000,
+        rate: float = 1.0,
+        faults: Sequence[Fault] = (),
+        motion: StraightMotion | None = None,
+        clock: CycleClock | None = None,
     ) -> None:
         self.host, self.port = host, port
-        self.motion = StraightMotion(HOME)
-        self.clock = ControllerClock(time.monotonic, rate)
+        self.motion = motion or StraightMotion(HOME)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
         self.faults = list(faults)
         self.tool = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._speed_mm_s = 10.0

@@ -88,6 +88,8 @@ class LossyDevice:
 
     def __init__(self, device: Any) -> None:
         self._device, self._drop, self._mute = device, 0, False
+        self.dropped = 0
+        """Results lost on request so far, those of a silent camera too."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._device, name)
@@ -108,5 +110,6 @@ class LossyDevice:
         if not result.IsValid() or not (self._drop or self._mute):
             return result
         self._drop = max(self._drop - 1, 0)
+        self.dropped += 1
         result.Release()
         return pylon.GrabResult()

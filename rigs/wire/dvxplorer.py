@@ -1,17 +1,14 @@
 """A DVXplorer without a camera: a process that serves events and triggers on the network.
 
-It writes with dv-processing's own `NetworkWriter` (2.0.4), one port for events and one for
-triggers, and says at its end what it sent, so that both ends can be compared. It is a process of
-its own for two reasons: writer and reader in one process can wait for each other when they close,
-and a writer that is taken down may wait for ever, so the process ends without taking it down.
+It serves dv's two network streams, one port for events and one for triggers, and says at its end
+what it sent, so that both ends can be compared. It is a process of its own because the library's
+reader holds Python's lock while it connects, and a server beside it could not answer.
 """
 
 from __future__ import annotations
 
 import os
-import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,17 +20,19 @@ import numpy as np
 
 from rigs.cameras.settings import DvxplorerSettings, NetworkStream
 from rigs.scene.events import EventOptics, MarkerSensor
+from rigs.wire.dv_server import DvServer
+from rigs.wire.dv_stream import events_header, events_packet, triggers_header, triggers_packet
 from storage.streams import I64, EventChunk
 
 Packet = tuple[EventChunk, I64]
 """Events, and the rising edges that came with them, us of the camera's clock."""
 Source = Callable[[], Iterable[Packet]]
-READY_S = 180.0
+READY_S = 600.0
 """The longest that it takes to make all packets, s."""
 CLIENT_S = 30.0
 """The longest that it waits for its client, and for what is queued to leave, s."""
-_LOOK_S = 0.001
-_TRIES = 5
+_MOST_WAITING = 256
+"""Packets that may wait for the client before the next one is made to wait."""
 
 
 @dataclass(frozen=True)
@@ -183,14 +182,15 @@ def _serve(
     stall_after: int | None,
     size: tuple[int, int],
 ) -> None:
-    """The process; it never returns, for taking a writer down may wait for ever."""
+    """The process; it never returns."""
     status = 1
     try:
         packets = [_made(*packet) for packet in source()]
-        writers, ports = _open_writers(size)
-        pipe.send(("ready", ports))
+        events = DvServer(events_header(size, "stand-in"))
+        triggers = DvServer(triggers_header("stand-in"))
+        pipe.send(("ready", (events.port, triggers.port)))
         if pipe.recv() == "go":
-            pipe.send(("sent", _send(pipe, packets, writers, realtime, stall_after)))
+            pipe.send(("sent", _send(pipe, packets, (events, triggers), realtime, stall_after)))
             pipe.recv()  # ends when the other side closes
     except (EOFError, ConnectionError):
         status = 0
@@ -202,66 +202,37 @@ def _serve(
 
 @dataclass(frozen=True)
 class _Made:
-    store: Any
-    triggers: Any
+    """A packet as it goes on the wire, for each of the two streams."""
+
+    on_events: bytes
+    on_triggers: bytes
     events: int
     pulses: int
     end_us: int
 
 
 def _made(chunk: EventChunk, pulses_us: I64) -> _Made:
-    import dv_processing as dv
-
-    store = dv.EventStore()
-    columns = (chunk.t_us, chunk.x, chunk.y, chunk.p.astype(bool))
-    # the quickest way in; there is none for whole arrays
-    deque(map(store.push_back, *(column.tolist() for column in columns)), maxlen=0)
-    rising = dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
-    triggers = dv.TriggerPacket.TriggersVector(
-        [dv.Trigger(at, rising) for at in pulses_us.tolist()]
-    )
     ends = [int(times[-1]) for times in (chunk.t_us, pulses_us) if len(times)]
-    return _Made(store, triggers, len(chunk), len(pulses_us), max(ends, default=0))
-
-
-def _open_writers(size: tuple[int, int]) -> tuple[tuple[Any, Any], tuple[int, int]]:
-    """Writers of events and of triggers on ports that are free, and the ports."""
-    import dv_processing as dv
-
-    streams = (
-        dv.io.Stream.EventStream(0, "events", "stand-in", size),
-        dv.io.Stream.TriggerStream(0, "triggers", "stand-in"),
+    return _Made(
+        events_packet(chunk) if len(chunk) else b"",
+        triggers_packet(pulses_us) if len(pulses_us) else b"",
+        len(chunk),
+        len(pulses_us),
+        max(ends, default=0),
     )
-    for attempt in range(_TRIES):
-        ports = _free_port(), _free_port()
-        try:
-            events, triggers = (
-                dv.io.NetworkWriter("127.0.0.1", port, stream)
-                for port, stream in zip(ports, streams, strict=True)
-            )
-            return (events, triggers), ports
-        except RuntimeError:
-            if attempt == _TRIES - 1:
-                raise
-    raise AssertionError
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def _send(
     pipe: Connection,
     packets: list[_Made],
-    writers: tuple[Any, Any],
+    servers: tuple[DvServer, DvServer],
     realtime: bool,
     stall_after: int | None,
 ) -> Sent:
-    events, triggers = writers
-    _await(pipe, lambda: events.getClientCount() > 0 and triggers.getClientCount() > 0)
+    events, triggers = servers
+    for server in servers:
+        if not server.wait_for_client(CLIENT_S):
+            raise TimeoutError(f"no client has come in {CLIENT_S:g} s")
     began = time.monotonic()
     first_us = packets[0].end_us if packets else 0
     sent_events = sent_pulses = 0
@@ -274,18 +245,14 @@ def _send(
         if realtime and wait > 0 and pipe.poll(wait):
             pipe.recv()
         if packet.events:
-            events.writeEvents(packet.store)
+            events.send(packet.on_events)
         if packet.pulses:
-            triggers.writeTriggers(packet.triggers)
+            triggers.send(packet.on_triggers)
+        if events.waiting > _MOST_WAITING and not events.drain(CLIENT_S):
+            raise TimeoutError(f"the client has done nothing for {CLIENT_S:g} s")
         sent_events += packet.events
         sent_pulses += packet.pulses
-    _await(pipe, lambda: not (events.getQueuedPacketCount() or triggers.getQueuedPacketCount()))
-    return Sent(sent_events, sent_pulses, len(packets), time.monotonic() - began)
-
-
-def _await(pipe: Connection, done: Callable[[], bool]) -> None:
-    end = time.monotonic() + CLIENT_S
-    while not done():
-        if time.monotonic() > end:
+    for server in servers:
+        if not server.drain(CLIENT_S):
             raise TimeoutError(f"the client has done nothing for {CLIENT_S:g} s")
-        pipe.poll(_LOOK_S)
+    return Sent(sent_events, sent_pulses, len(packets), time.monotonic() - began)

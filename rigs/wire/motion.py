@@ -9,12 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 from typing import Protocol
 
-from rigs.arms.pose import angle_deg, between, distance_mm
+import numpy as np
+import numpy.typing as npt
+
+from rigs.arms.pose import angle_deg, between, distance_mm, way
 from rigs.capabilities import Pose
 
+F64 = npt.NDArray[np.float64]
 _OFF_LINE_MM = 0.01
 
 
@@ -68,27 +73,57 @@ class Ramp:
             return self.length - self.acceleration * left * left / 2, self.acceleration * left
         return self.peak * (t - up / 2), self.peak
 
+    def shares(self, t: F64) -> F64:
+        """Shares of the way gone at times after the start, (n,)."""
+        if self.length == 0:
+            return np.ones(len(t))
+        up = self.peak / self.acceleration
+        t = np.clip(t, 0.0, self.seconds)
+        left = self.seconds - t
+        gone = self.peak * (t - up / 2)
+        gone = np.where(left < up, self.length - self.acceleration * left * left / 2, gone)
+        gone = np.where(t < up, self.acceleration * t * t / 2, gone)
+        result: F64 = np.where(left == 0.0, 1.0, gone / self.length)
+        return result
+
+
+STILL = Ramp(0.0, 1.0, 1.0)
+"""No way at all."""
+
 
 @dataclass(frozen=True)
-class _Line:
+class Line:
+    """One straight way from a time on, s."""
+
     begin: Pose
     end: Pose
     ramp: Ramp
     start_s: float
 
     def pose(self, t_s: float) -> Pose:
+        """Where the tool centre point is."""
         gone, _ = self.ramp.at(t_s - self.start_s)
         if self.ramp.length == 0 or gone >= self.ramp.length:
             return self.end
-        return between(self.begin, self.end, gone / self.ramp.length)
+        return self._way(gone / self.ramp.length)
+
+    @cached_property
+    def _way(self) -> Callable[[float], Pose]:
+        return way(self.begin, self.end)
 
 
 class StraightMotion:
-    """The `Motion` of a stand-in by itself. May be asked from any thread."""
+    """The `Motion` of a stand-in by itself. May be asked from any thread.
 
-    def __init__(self, at: Pose) -> None:
-        self._lock = Lock()
-        self._line = _Line(at, at, Ramp(0.0, 1.0, 1.0), 0.0)
+    Args:
+        on_line: told of every new way and since when it holds, s; in the thread that moves.
+    """
+
+    def __init__(
+        self, at: Pose, on_line: Callable[[Line, float], None] = lambda line, t_s: None
+    ) -> None:
+        self._lock, self._on_line = Lock(), on_line
+        self._line = Line(at, at, STILL, 0.0)
         self._rest_s = 0.0
 
     def pose(self, t_s: float) -> Pose:
@@ -106,8 +141,7 @@ class StraightMotion:
         with self._lock:
             begin = self._line.pose(t_s)
             length = distance_mm(begin, to) or angle_deg(begin, to)
-            self._line = _Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s)
-            self._rest_s = t_s + self._line.ramp.seconds
+            self._follow(Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s)
 
     def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
         """Run on to `to` without a rest, if the way there goes on straight at the same speed.
@@ -124,8 +158,7 @@ class StraightMotion:
             braking = speed_mm_s / ramp.acceleration
             if distance_mm(on_line, line.end) > _OFF_LINE_MM or t_s > self._rest_s - braking:
                 return False
-            self._line = replace(line, end=to, ramp=ramp)
-            self._rest_s = line.start_s + ramp.seconds
+            self._follow(replace(line, end=to, ramp=ramp), t_s)
             return True
 
     def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
@@ -140,20 +173,33 @@ class StraightMotion:
             target = between(line.begin, line.end, share)
             if way <= 0 or speed <= 0:
                 here = line.pose(t_s)
-                self._line = _Line(here, here, Ramp(0.0, 1.0, 1.0), t_s)
-                self._rest_s = t_s
+                self._follow(Line(here, here, STILL, t_s), t_s)
                 return
             # A ramp down is the second half of a short way twice as long that began in the past.
             brake = speed * speed / (2 * way)
             past = _backwards(line, gone, way)
             ramp = Ramp(2 * way, speed, brake)
-            self._line = _Line(past, target, ramp, t_s - ramp.seconds / 2)
-            self._rest_s = self._line.start_s + ramp.seconds
+            self._follow(Line(past, target, ramp, t_s - ramp.seconds / 2), t_s)
+
+    def _follow(self, line: Line, t_s: float) -> None:
+        self._line, self._rest_s = line, line.start_s + line.ramp.seconds
+        self._on_line(line, t_s)
 
 
-def _backwards(line: _Line, gone: float, way: float) -> Pose:
+def _backwards(line: Line, gone: float, way: float) -> Pose:
     """The pose `way` behind where the line is, beyond its begin if need be."""
     return between(line.begin, line.end, (gone - way) / line.ramp.length)
+
+
+class CycleClock(Protocol):
+    """What a stand-in's controller counts its cycles by."""
+
+    @property
+    def rate(self) -> float:
+        """Controller seconds a host second."""
+
+    def now_s(self) -> float:
+        """The controller's time, s."""
 
 
 class ControllerClock:

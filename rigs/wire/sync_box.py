@@ -13,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import get_args
 
 from protocols.timing import Code
@@ -33,7 +34,24 @@ class _Plan:
 
     millihertz: int
     last: int
-    bits: Bits
+    seed: int
+    code: Code
+
+    @cached_property
+    def bits(self) -> Bits:
+        """The code, tick by tick."""
+        return Bits(self.seed, self.code)
+
+
+@dataclass(frozen=True)
+class Train:
+    """A train of pulses that the box began, as the rest of a simulated scene sees it."""
+
+    first_ns: int
+    """Tick 0 on the clock that drives the box, ns."""
+    rate_hz: float
+    seed: int
+    code: Code
 
 
 class PtySyncBox:
@@ -43,15 +61,20 @@ class PtySyncBox:
         now_ns: the box's clock; any origin, it shows 0 when the box gets power or is reset.
         exposure_us: where the camera's output is wired, exposures begin this long after each
             tick; None where it is not.
+        on_train: told of every train before its first tick; and with None and the number of ticks
+            sent when it has ended. In the box's thread.
 
     Attributes:
         port: name of the pty.
     """
 
     def __init__(
-        self, now_ns: Callable[[], int] = time.monotonic_ns, exposure_us: int | None = None
+        self,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        exposure_us: int | None = None,
+        on_train: Callable[[Train | None, int], None] = lambda train, sent: None,
     ) -> None:
-        self._now_ns, self._exposure_us = now_ns, exposure_us
+        self._now_ns, self._exposure_us, self._on_train = now_ns, exposure_us, on_train
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -59,6 +82,8 @@ class PtySyncBox:
         self._lock = threading.RLock()
         self._ending = threading.Event()
         self._silent, self._corrupt, self._drop = False, 0, 0
+        self._train: _Plan | None = None
+        self._sent = 0
         self._power_on()
         self._thread = threading.Thread(target=self._work, name="pty sync box", daemon=True)
         self._thread.start()
@@ -104,11 +129,20 @@ class PtySyncBox:
 
     # -- the box ---------------------------------------------------------------------------
 
+    def _announce(self, plan: _Plan) -> None:
+        first_ns = self._origin_ns + self._first_us * 1000
+        self._on_train(Train(first_ns, plan.millihertz / 1000, plan.seed, plan.code), 0)
+
+    def _end(self) -> None:
+        if self._train is not None:
+            self._train = None
+            self._on_train(None, self._sent)
+
     def _power_on(self) -> None:
+        self._end()
         self._origin_ns = self._now_ns()
         self._lines = LineReader()
         self._armed: _Plan | None = None
-        self._train: _Plan | None = None
         self._first_us = self._sent = self._exposed = self._dropped = self._told = 0
         self._stamps: list[int] = []
 
@@ -167,7 +201,7 @@ class PtySyncBox:
                     self._stamps.append(us + self._exposure_us)
             self._sent = max(self._sent, due)
             if train.last and self._sent == train.last:
-                self._train = None
+                self._end()
         while self._stamps and self._stamps[0] <= now_us:
             self._report(f"X {self._exposed} {self._stamps.pop(0)}")
             self._exposed += 1
@@ -187,13 +221,15 @@ class PtySyncBox:
             if self._armed is not None:
                 self._train, self._armed = self._armed, None
                 self._first_us = self._us() + LEAD_US
+                self._announce(self._train)
             if self._train is None:
                 self._say("E not armed")
             else:
                 self._say(f"OK GO {self._first_us}")
         elif body == "STOP":
             self._tick()
-            self._train = self._armed = None
+            self._end()
+            self._armed = None
             self._say(f"OK STOP {self._sent}")
         else:
             self._say("E unknown")
@@ -207,7 +243,7 @@ class PtySyncBox:
         elif code not in CODES:
             self._say("E code must be lfsr, irregular or regular")
         else:
-            self._armed = _Plan(round(float(hz) * 1000), int(ticks), Bits(int(seed), CODES[code]))
+            self._armed = _Plan(round(float(hz) * 1000), int(ticks), int(seed), CODES[code])
             self._sent = self._exposed = self._dropped = self._told = 0
             self._stamps = []
             self._say("OK ARM")

@@ -30,7 +30,7 @@ from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.capabilities import Pose
 from rigs.wire.faults import Fault, Kind, Stage
 from rigs.wire.loop import Connections, LoopThread
-from rigs.wire.motion import ControllerClock, Motion, StraightMotion
+from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
 from rigs.wire.ur_client import Client, send
 from rigs.wire.ur_program import Safety, UrProgram
 
@@ -56,6 +56,7 @@ class UrStandIn:
         faults: what will go wrong.
         reach_mm: poses further from the base are outside its safety limits.
         joints_deg: what `actual_q` says.
+        clock: the controller's; one of its own, at `rate`, if left out.
     """
 
     def __init__(
@@ -68,11 +69,14 @@ class UrStandIn:
         faults: Sequence[Fault] = (),
         reach_mm: float = 850.0,
         joints_deg: Sequence[float] = JOINTS_DEG,
+        clock: CycleClock | None = None,
     ) -> None:
         self.host, self._cycle_hz = host, cycle_hz
         self.motion = motion or StraightMotion(HOME)
-        self.clock = ControllerClock(time.monotonic, rate)
-        self.program = UrProgram(self.motion, reach_mm, joints_deg, digital_inputs, self._cut, rate)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        self.program = UrProgram(
+            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate
+        )
         self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
@@ -118,6 +122,13 @@ class UrStandIn:
         self._thread.call(self._connections.cut)
         self._silent = False
         self._thread.call(self._listen)
+
+    def restore(self) -> None:
+        """A person has put everything right: safety, remote control and link."""
+        self.unlock()
+        self.set_remote(True)
+        if self._silent:
+            self.restore_link()
 
     def set_remote(self, on: bool) -> None:
         """A person turns remote control on (or off, without ending the program)."""
@@ -229,6 +240,7 @@ class UrStandIn:
             program.unlock()
             return "Protective stop releasing"
         answers = {
+            "get robot model": "UR5",
             "get serial number": "20205500000",
             "PolyscopeVersion": "URSoftware " + ".".join(map(str, VERSION)) + " (Jan 01 2021)",
             "is in remote control": str(program.remote).lower(),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from rigs.arms.rtde import HEADER, TYPES
@@ -36,6 +36,7 @@ class Client:
     streaming: bool = False
     _names: list[str] = field(default_factory=list)
     _kinds: list[str] = field(default_factory=list)
+    _readers: list[Callable[[float], int | float | list[float]]] = field(default_factory=list)
     _layout: struct.Struct = field(default_factory=lambda: struct.Struct(">"))
     _recipes: dict[int, list[str]] = field(default_factory=dict)
 
@@ -43,7 +44,7 @@ class Client:
         """The answer to a request for outputs: recipe 1 and the type of each."""
         (hz,) = struct.unpack_from(">d", body)
         self._names = [name for name in body[8:].decode().split(",") if name]
-        self._kinds = [_kind(name) for name in self._names]
+        self._kinds, self._readers = [_kind(name) for name in self._names], []
         self.every = max(1, round(cycle_hz / hz))
         self._layout = struct.Struct(">" + "".join(_LAYOUT[kind] for kind in self._kinds))
         return b"\x01" + ",".join(self._kinds).encode()
@@ -74,9 +75,11 @@ class Client:
 
     def packet(self, program: UrProgram, t_s: float) -> bytes:
         """The body of one packet of outputs."""
+        if len(self._readers) != len(self._names):
+            self._readers = [program.reader(name) for name in self._names]
         flat: list[int | float] = []
-        for name, kind in zip(self._names, self._kinds, strict=True):
-            value = program.value(name, t_s)
+        for read, kind in zip(self._readers, self._kinds, strict=True):
+            value = read(t_s)
             if kind in _COUNT:
                 flat.extend(value if isinstance(value, list) else [0] * _COUNT[kind])
             else:

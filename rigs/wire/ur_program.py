@@ -8,6 +8,7 @@ No sockets here; `rigs.wire.ur` carries what this says.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -83,6 +84,7 @@ class UrProgram:
         self._left_from: Pose | None = None
         self._t = 0.0
         self._here = motion.pose(0.0).xyz_mm
+        self._tcp_at: tuple[float, list[float]] = (math.nan, [])
         self._speed_mm_s = [0.0, 0.0, 0.0]
         self.hung = False
         """The program says that it runs and takes no command."""
@@ -96,7 +98,8 @@ class UrProgram:
 
     def cycle(self, t_s: float) -> None:
         """Advance to controller time `t_s`."""
-        here = self.motion.pose(t_s).xyz_mm
+        x, y, z = (value * MM_PER_M for value in self._tcp(t_s)[:3])
+        here = (x, y, z)
         seconds = max(t_s - self._t, 1e-9)
         self._speed_mm_s = [(b - a) / seconds for a, b in zip(self._here, here, strict=True)]
         self._here, self._t = here, t_s
@@ -183,26 +186,45 @@ class UrProgram:
 
     def value(self, name: str, t_s: float) -> int | float | list[float]:
         """The value of an RTDE output at `t_s`; what is not modelled is 0."""
+        return self.reader(name)(t_s)
+
+    def reader(self, name: str) -> Callable[[float], int | float | list[float]]:
+        """What gives the value of an RTDE output at a controller time."""
         kind, _, index = name.rpartition("_")
         if kind == "output_int_register":
-            return self.ints_out[int(index)]
+            return lambda t_s, k=int(index): self.ints_out[k]  # type: ignore[misc]
         if kind == "output_double_register":
-            return self.doubles_out[int(index)]
-        known: dict[str, Callable[[], int | float | list[float]]] = {
-            "timestamp": lambda: t_s,
-            "actual_TCP_pose": lambda: to_ur(self.motion.pose(t_s)),
-            "target_TCP_pose": lambda: to_ur(self.motion.pose(t_s)),
-            "target_TCP_speed": lambda: [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0],
-            "target_speed_fraction": lambda: self.speed_fraction,
-            "actual_q": lambda: [angle * 0.017453292519943295 for angle in self.joints_deg],
-            "actual_digital_input_bits": lambda: self.digital_inputs(t_s),
-            "robot_status_bits": lambda: 1 | (2 if self.program_running else 0),
-            "safety_status_bits": lambda: int(self.safety),
-            "runtime_state": lambda: int(self.runtime),
-            "robot_mode": lambda: 7,
-            "payload": lambda: self.payload_kg,
+            return lambda t_s, k=int(index): self.doubles_out[k]  # type: ignore[misc]
+        known: dict[str, Callable[[float], int | float | list[float]]] = {
+            "timestamp": lambda t_s: t_s,
+            "actual_TCP_pose": self._tcp,
+            "target_TCP_pose": self._tcp,
+            "target_TCP_speed": lambda _: [
+                *(v / MM_PER_M for v in self._speed_mm_s),
+                0.0,
+                0.0,
+                0.0,
+            ],
+            "target_speed_fraction": lambda _: self.speed_fraction,
+            "actual_q": lambda _: [angle * 0.017453292519943295 for angle in self.joints_deg],
+            "actual_digital_input_bits": self.digital_inputs,
+            "robot_status_bits": lambda _: 1 | (2 if self.program_running else 0),
+            "safety_status_bits": lambda _: int(self.safety),
+            "runtime_state": lambda _: int(self.runtime),
+            "robot_mode": lambda _: 7,
+            "payload": lambda _: self.payload_kg,
         }
-        return known[name]() if name in known else 0
+        return known.get(name, lambda _: 0)
+
+    def _velocity(self, t_s: float) -> list[float]:
+        """Of the tool centre point in the last cycle, m/s; turning is left out."""
+        return [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0]
+
+    def _tcp(self, t_s: float) -> list[float]:
+        """The tool centre point as RTDE says it; computed once a cycle."""
+        if self._tcp_at[0] != t_s:
+            self._tcp_at = t_s, to_ur(self.motion.pose(t_s))
+        return self._tcp_at[1]
 
     def _command(self, command: int) -> None:
         if command == 0:

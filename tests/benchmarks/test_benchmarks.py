@@ -43,7 +43,7 @@ PROMISED = {
     },
     "acquisition": {
         "frames_lost", "events_lost", "pulses_lost", "memory_growth_mb", "saturation_x_realtime",
-        "encode_s_per_trial",
+        "encode_s_per_trial", "frames_per_s", "dropped_on_purpose", "dropped_noticed",
     },
     "labels": {
         "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
@@ -80,6 +80,8 @@ def test_a_benchmark_gives_what_is_promised(
     if name == "acquisition":
         lost = [found["figures"][f"{what}_lost"] for what in ("frames", "events", "pulses")]
         assert lost == [0, 0, 0]
+        dropped = [found["figures"][f"dropped_{what}"] for what in ("on_purpose", "noticed")]
+        assert dropped == [25, 25]
     if name == "clocks":
         assert (found["figures"]["accepted_share"], found["figures"]["wrong_accepted"]) == (1, 0)
 

@@ -23,7 +23,8 @@ from protocols.timing import Code
 from rigs.pulse_code import code_bits
 from rigs.sync_box import SerialSyncBox
 from rigs.sync_line import ALL_TO_HZ, BAUD, MOST_HZ, NAME, LineReader, seal
-from rigs.sync_port import SyncBoxFault, SyncBoxSettings
+from rigs.sync_port import SyncBoxFault
+from rigs.sync_settings import SyncBoxSettings
 from tests.conftest import ROOT
 
 FIRMWARE = ROOT / "rigs" / "firmware"

@@ -258,8 +258,10 @@ def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
     rig = make_rig(
         faults=[{"kind": "arm_protective_stop", "trial": 1, "at_s": 1.0, "since": "trial"}]
     )
+    notes = watched(rig)
     with pytest.raises(ArmFault, match="protective stop in the phase 'touching off'"):
         rig.touch_off(0.5, 1.5, 1)
+    assert notes.index("arm.stop") < notes.index("events.stop")
     assert rig.frame.zero_mm == 0.0
 
 

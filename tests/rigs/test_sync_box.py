@@ -15,7 +15,8 @@ from rigs.capabilities import RigError, SyncBox
 from rigs.pulse_code import code_bits
 from rigs.sync_box import SerialSyncBox
 from rigs.sync_line import LineReader, seal, unseal
-from rigs.sync_port import TRIES, SyncBoxFault, SyncBoxSettings
+from rigs.sync_port import TRIES, SyncBoxFault
+from rigs.sync_settings import SyncBoxSettings
 from rigs.sync_train import Train
 from rigs.wire.sync_box import PtySyncBox
 

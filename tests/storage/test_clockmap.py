@@ -16,6 +16,7 @@ from storage.clockmap import BILLION, DRIFT_UNITS, IDENTITY, MAX_DRIFT, ClockMap
 DRIFTS = st.integers(-(10**17), 10**17) | st.integers(-(10**8), 10**8).map(lambda d: d * BILLION)
 TIMES = st.integers(-(2**62), 2**62)
 SPANS = st.integers(-(2**61), 2**61)
+HOURS = st.integers(-(10**13), 10**13)
 NINE_YEARS = st.integers(-(2**58), 2**58)
 
 
@@ -32,7 +33,10 @@ def half_up(value: Fraction) -> int:
     return floor(value + Fraction(1, 2))
 
 
-@given(anchor=TIMES, image=SPANS, drift=DRIFTS, spans=st.lists(SPANS, min_size=1, max_size=20))
+@given(
+    anchor=TIMES, image=SPANS, drift=DRIFTS,
+    spans=st.lists(SPANS, min_size=1, max_size=20) | st.lists(HOURS, min_size=1, max_size=20),
+)  # fmt: skip
 def test_every_time_is_the_exact_one_rounded(
     anchor: int, image: int, drift: int, spans: list[int]
 ) -> None:
@@ -41,6 +45,8 @@ def test_every_time_is_the_exact_one_rounded(
     expected = [half_up(exact(clock, time)) for time in times]
     assert [clock.to_reference(time) for time in times] == expected
     assert clock.to_reference(np.array(times, np.int64)).tolist() == expected
+    # many times are mapped by arrays
+    assert clock.to_reference(np.array(times * 9, np.int64)).tolist() == expected * 9
 
 
 @given(
@@ -90,7 +96,7 @@ def test_known_values() -> None:
 def test_a_hair_below_the_half_is_rounded_down(drift: int) -> None:
     # rest * drift = 499,999,999 modulo 1e9: a float division cannot tell that from the half
     rest = 499_999_999 * pow(drift, -1, 10**9) % 10**9
-    times = 2**53 + np.arange(5, dtype=np.int64) * 10**9 + rest
+    times = 2**53 + np.arange(20, dtype=np.int64) * 10**9 + rest
     clock = ClockMap.line(2**53, 0, drift)
     assert clock.to_reference(times).tolist() == [half_up(exact(clock, int(t))) for t in times]
 
@@ -203,7 +209,7 @@ def test_floats_are_refused() -> None:
             IDENTITY.to_reference(times)  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("times", [2**62, np.array([0, 2**62])])
+@pytest.mark.parametrize("times", [2**62, np.array([0, 2**62]), np.array(10 * [2**62])])
 def test_overflow_is_an_error_and_not_a_wrap(times: int) -> None:
     with pytest.raises(OverflowError, match="int64"):
         ClockMap.line(0, 2**62).to_reference(times)

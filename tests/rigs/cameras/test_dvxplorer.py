@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -109,7 +108,8 @@ def test_a_stalled_camera_is_noticed_and_may_come_back(until: Until) -> None:
         camera.start()
         server.go()
         server.await_stall(20.0)
-        began = time.monotonic()
+        before = int(np.count_nonzero(chunk.t_us < chunk.t_us[0] + 20_000))
+        until(lambda: camera.counts.events == before)
         got = 0
 
         def read() -> bool:
@@ -117,10 +117,9 @@ def test_a_stalled_camera_is_noticed_and_may_come_back(until: Until) -> None:
             got += len(camera.read())
             return False
 
-        with pytest.raises(RigError, match="neither event nor pulse"):
+        with pytest.raises(RigError, match=r"neither event nor pulse for \d\.\d s"):
             until(read)
-        assert time.monotonic() - began < 1.5
-        assert got == np.count_nonzero(chunk.t_us < chunk.t_us[0] + 20_000)
+        assert got == before
         server.resume()
         server.finish(20.0)
         until(lambda: camera.counts.events == len(chunk))

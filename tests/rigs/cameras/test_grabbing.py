@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,8 +26,8 @@ CHUNKS = GrabSettings(
     late_ns=100_000_000,
     sync_bit=2,
     queue=100,
+    first_ns=0,
     stall_ns=0,
-    stall_from_start=False,
 )
 
 
@@ -167,6 +168,17 @@ def test_a_full_queue_waits_for_its_reader_and_loses_nothing(until: Until) -> No
         until(lambda: grab.counts.grabbed == 10)
         got += [frame.number for frame in grab.take()]
         assert got == list(range(10))
+
+
+def test_a_pylon_that_hangs_is_an_error(until: Until, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rigs.cameras.grabbing.HANG_S", 0.3)
+    go = threading.Event()
+    device = Device()
+    monkeypatch.setattr(device, "RetrieveResult", lambda *_: go.wait(60.0) and None)
+    with grabbing(device) as grab:
+        until(lambda: grab.fault is not None)
+        assert "has not answered" in str(grab.fault)
+        go.set()
 
 
 def test_whatever_pylon_raises_is_a_rigs_error(until: Until) -> None:

@@ -1,0 +1,170 @@
+"""Loops over pulses that a fit goes through many times, compiled.
+
+A train is a thousand pulses, for which numpy takes longer to begin than to compute. Sums are made
+in the order in which numpy makes them, so that compiled or not a map is the same to the bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def median(values: Floats) -> float:
+    """As np.median, of numbers of which there is at least one and none is NaN."""
+    half = values.size // 2
+    parted = np.partition(values, half)
+    middle = float(parted[half])
+    return middle if values.size % 2 else 0.5 * (float(parted[:half].max()) + middle)
+
+
+def quantile(values: NDArray[np.float64 | np.int64], share: float) -> float:
+    """As np.quantile, of numbers of which there is at least one and none is NaN."""
+    place = (values.size - 1) * share
+    below = int(place)
+    above = min(below + 1, values.size - 1)
+    parted = np.partition(values, above)
+    high = parted[above]
+    low = parted[:above].max() if below < above else high
+    part = place - below
+    between = high - low
+    return float(high - between * (1 - part) if part >= 0.5 else low + between * part)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pair(predicted, y, gate):  # type: ignore[no-untyped-def]
+    """Pulses that are each other's nearest and closer than `gate`.
+
+    Args:
+        predicted, y: (m,) and (n,) times, ascending, ns; neither empty. Of two that are equally
+            near the earlier one counts.
+
+    Returns:
+        their indices in both, ascending.
+    """
+    m, n = predicted.size, y.size
+    i, j = np.empty(m, np.int64), np.empty(m, np.int64)
+    found = after = 0
+    for k in range(m):
+        p = predicted[k]
+        while after < n and y[after] < p:
+            after += 1
+        right = min(max(after, 1), n - 1)
+        near = right - 1 if n > 1 and p - y[right - 1] <= y[right] - p else right
+        q = y[near]
+        if p < q:
+            mutual = k == m - 1 or q - p <= predicted[k + 1] - q
+        else:
+            mutual = k == 0 or q - predicted[k - 1] > p - q
+        if mutual and abs(q - p) <= gate:
+            i[found], j[found] = k, near
+            found += 1
+    return i[:found], j[:found]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def partners(predicted, y, reach):  # type: ignore[no-untyped-def]
+    """Indices of all pairs of pulses less than `reach` ns apart (as far, if y is the earlier)."""
+    low = high = count = 0
+    for k in range(predicted.size):
+        while low < y.size and y[low] < predicted[k] - reach:
+            low += 1
+        while high < y.size and y[high] < predicted[k] + reach:
+            high += 1
+        count += high - low
+    which, partner = np.empty(count, np.int64), np.empty(count, np.int64)
+    low = high = count = 0
+    for k in range(predicted.size):
+        while low < y.size and y[low] < predicted[k] - reach:
+            low += 1
+        while high < y.size and y[high] < predicted[k] + reach:
+            high += 1
+        for j in range(low, high):
+            which[count], partner[count] = k, j
+            count += 1
+    return which, partner
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fullest(ordered, window):  # type: ignore[no-untyped-def]
+    """Of ascending numbers the first from which on the most lie within `window`; 0 of none."""
+    best, start, end = 0, 0.0, 0
+    for k in range(ordered.size):
+        while end < ordered.size and ordered[end] <= ordered[k] + window:
+            end += 1
+        if end - k > best:
+            best, start = end - k, ordered[k]
+    return start
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def places_of(x, knots):  # type: ignore[no-untyped-def]
+    """The piece between two knots on which each of rising x lies, and where on it, from 0 to 1."""
+    piece, share = np.empty(x.size, np.int64), np.empty(x.size)
+    k = 0
+    for j in range(x.size):
+        while k < knots.size - 2 and x[j] >= knots[k + 1]:
+            k += 1
+        piece[j], share[j] = k, (x[j] - knots[k]) / (knots[k + 1] - knots[k])
+    return piece, share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def normal_equations(piece, share, y, residuals, gate, limit, n):  # type: ignore[no-untyped-def]
+    """Of the values at n knots: the matrix (n, n) and the right side (n,).
+
+    Args:
+        piece, share: (m,) see `places_of`.
+        residuals: (m,) those beyond `gate` have no weight, those beyond `limit` less than 1.
+    """
+    before, after, both = np.zeros(n - 1), np.zeros(n - 1), np.zeros(n - 1)
+    left, right = np.zeros(n), np.zeros(n)
+    for j in range(y.size):
+        size = abs(residuals[j])
+        weight = min(1.0, limit / max(size, 1e-9)) if size <= gate else 0.0
+        k, s = piece[j], share[j]
+        u = 1.0 - s
+        before[k] += weight * (u * u)
+        after[k] += weight * (s * s)
+        both[k] += weight * s * u
+        left[k] += weight * u * y[j]
+        right[k + 1] += weight * s * y[j]
+    matrix = np.zeros((n, n))
+    for k in range(n - 1):
+        matrix[k, k] += before[k]
+        matrix[k + 1, k + 1] = after[k]
+        matrix[k, k + 1] = matrix[k + 1, k] = both[k]
+    return matrix, left + right
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def residuals_at(piece, share, y, values):  # type: ignore[no-untyped-def]
+    """y less the line at every pulse."""
+    result = np.empty(y.size)
+    for j in range(y.size):
+        low, high = values[piece[j]], values[piece[j] + 1]
+        result[j] = y[j] - (low + share[j] * (high - low))
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def most_off(width, fits, low, high, at_ends):  # type: ignore[no-untyped-def]
+    """Of windows of `width` reference pulses: how many are off the line while the device has some.
+
+    Args:
+        fits: (n + 1,) pulses on the line before each.
+        low, high: (n,) the device's first pulse near each, and the one behind the last.
+        at_ends: only the first window and the last one.
+    """
+    most = 0
+    final = low.size - width
+    for first in range(0, final + 1, max(final, 1) if at_ends else 1):
+        there = high[first + width - 1] - low[first]
+        # a device that reports few pulses lost some: no doubt about its clock. Where it reports
+        # far too many, noise hides what the clock does
+        if there <= 1.5 * width:
+            most = max(most, min(width, there) - (fits[first + width] - fits[first]))
+    return most

@@ -1,0 +1,35 @@
+"""The devices of a real rig as its rig file names them: which driver, and how to reach it.
+
+Cheap to import: `sliplab plan` reads rig files, and no maker's library is needed for that.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from protocols.yaml_file import StrictModel
+from rigs.arms.settings import ArmSettings
+from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
+from rigs.sync_settings import SyncBoxSettings
+
+
+class OperatedPlate(StrictModel):
+    """A plate on its slider that a person raises, releases and catches when asked."""
+
+    driver: Literal["person"] = "person"
+    mass_kg: Annotated[float, Field(gt=0, le=5)]
+    """Mounted when the session begins, kg; a changeover asks for another one."""
+
+
+class DeviceSettings(StrictModel):
+    """The `devices:` section of a rig file."""
+
+    arm: Annotated[ArmSettings, Field(discriminator="driver")]
+    event_camera: DvxplorerSettings = DvxplorerSettings()
+    frame_camera: BaslerSettings
+    sync_box: SyncBoxSettings | None = None
+    """Needed by a real rig; a rig of stand-ins brings its own."""
+    plate: OperatedPlate | None = None
+    """Left out, the rig has no sliding plate, and takes kinematic protocols only."""

@@ -1,0 +1,84 @@
+"""Whether a rig's devices can be reached, without taking control of any of them."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable
+
+from rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
+from rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
+from rigs.devices import DeviceSettings
+from rigs.sync_settings import SyncBoxSettings
+
+ANSWER_S = 1.0
+"""For each connection, s."""
+_UR_PORT = 30004
+
+
+def reach(devices: DeviceSettings) -> dict[str, str | None]:
+    """By device: None if it can be reached, else why not, and what to look at.
+
+    Nothing is opened for longer than it takes to see that somebody answers; takes some seconds.
+    """
+    box = devices.sync_box
+    looks: dict[str, Callable[[], str | None]] = {
+        "arm": lambda: _arm(devices.arm),
+        "event camera": lambda: _event_camera(devices.event_camera),
+        "frame camera": lambda: _frame_camera(devices.frame_camera),
+        "sync box": lambda: _sync_box(box) if box is not None else "no port is named",
+    }
+    found = {}
+    for name, look in looks.items():
+        try:
+            found[name] = look()
+        except Exception as error:  # a maker's library may raise anything
+            found[name] = str(error) or type(error).__name__
+    return found
+
+
+def _arm(settings: ArmSettings) -> str | None:
+    if isinstance(settings, UrSettings):
+        port = _UR_PORT
+    else:
+        port = settings.rws_port if isinstance(settings, AbbSettings) else settings.port
+    return _listens(settings.host, port)
+
+
+def _listens(host: str, port: int) -> str | None:
+    try:
+        with socket.create_connection((host, port), ANSWER_S):
+            return None
+    except OSError as error:
+        return f"{host}:{port}: {error}; look at its power, its cable and the address"
+
+
+def _event_camera(settings: DvxplorerSettings) -> str | None:
+    source = settings.source
+    if isinstance(source, NetworkStream):
+        return _listens(source.host, source.events_port)
+    import dv_processing as dv
+
+    there = [str(camera) for camera in dv.io.camera.discover()]
+    if not there or (source.serial and not any(source.serial in name for name in there)):
+        wanted = f"serial {source.serial}" if source.serial else "a camera"
+        return f"{wanted} was not found; there: {', '.join(there) or 'none'}; look at its cable"
+    return None
+
+
+def _frame_camera(settings: BaslerSettings) -> str | None:
+    from pypylon import pylon
+
+    there = [info.GetSerialNumber() for info in pylon.TlFactory.GetInstance().EnumerateDevices()]
+    if not there or (settings.serial and settings.serial not in there):
+        wanted = f"serial {settings.serial}" if settings.serial else "a camera"
+        return f"{wanted} was not found; there: {', '.join(there) or 'none'}; look at its cable"
+    return None
+
+
+def _sync_box(settings: SyncBoxSettings) -> str | None:
+    if not os.path.exists(settings.port):
+        return f"there is no {settings.port}; look at its cable, and at /dev/serial/by-id"
+    if not os.access(settings.port, os.R_OK | os.W_OK):
+        return f"{settings.port} may not be opened; add yourself to its group (dialout)"
+    return None

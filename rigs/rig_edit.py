@@ -1,0 +1,199 @@
+"""Writing what was measured into a rig file: its comments stay, a copy of the old file is kept.
+
+The new text is checked as a rig file before it takes the old one's place, in one rename.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from protocols.errors import InputError
+from protocols.yaml_file import parse_yaml, read_text, validate
+from rigs.rig_file import RigFile
+from rigs.rig_inheritance import KEY, read_rig, shipped_rigs
+from storage.files import write_text
+
+_WIDEST = 1 << 20
+"""Lines are not folded."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written, and where the file that stood there before is kept."""
+
+    path: Path
+    kept: Path | None
+
+
+def writable_target(rig: Path, out: Path | None) -> Path:
+    """The file that an entry is written to: `out`, or the rig file itself.
+
+    Raises:
+        InputError: that file ships with the package; or `out` is no YAML file, or in no folder.
+    """
+    target = out or rig
+    if any(path.resolve() == target.resolve() for path in shipped_rigs().values()):
+        raise InputError(
+            "--out",
+            "",
+            None if out is None else str(out),
+            f"is needed: {target.name} ships with SlipLab and is never overwritten; "
+            "write to a file of your own",
+        )
+    if target.suffix not in {".yaml", ".yml"}:
+        raise InputError("--out" if out else rig, "", str(target), "must end in .yaml")
+    if not target.parent.is_dir():
+        raise InputError("--out", "", str(target), "its folder does not exist")
+    if target.exists() and target.resolve() != rig.resolve():
+        raise InputError("--out", "", str(target), "exists: give it as --rig, or another name")
+    return target.resolve()
+
+
+def write_entries(
+    rig: Path,
+    target: Path,
+    changes: Mapping[str, Any],
+    *,
+    today: date,
+    remove: Sequence[str] = (),
+    expected: str | None = None,
+) -> Written:
+    """Set keys of a rig file.
+
+    Args:
+        rig: the file to begin with.
+        target: where the result goes; see `writable_target`.
+        changes: by path of a key, such as ``calibration.lens``; mappings replace what is there.
+        today: what a copy of an old file is named after.
+        remove: keys to take away, if they are there.
+        expected: the rig's content as it was read before measuring (`load_rig_file`).
+
+    Raises:
+        InputError: the rig file has changed since, or the result would be none.
+    """
+    source = read_rig(rig)
+    if expected is not None and source.text != expected:
+        raise InputError(rig, "", None, "was changed while measuring; nothing was written")
+    text = read_text(rig, "rig file")
+    own, changes = parse_yaml(text, rig), dict(changes)
+    for key in remove:
+        if _stands(source.data, key) and not _stands(own, key):
+            changes[key] = None  # it stands in a file that this one extends
+    if rig.parent.resolve() != target.parent.resolve() and KEY in own:
+        text = source.text  # elsewhere, what it extends would not be found
+    new = edited(text, changes, remove)
+    _check(rig, target, new)
+    kept = _keep(target, today) if target.exists() else None
+    write_text(target, new)
+    return Written(target, kept)
+
+
+def edited(text: str, changes: Mapping[str, Any], remove: Sequence[str] = ()) -> str:
+    """YAML text with some keys set or removed; comments and the rest stay as they are.
+
+    Lists of numbers and texts are written in one line.
+    """
+    yaml = _yaml()
+    data = yaml.load(text)
+    for key in remove:
+        *parents, last = key.split(".")
+        found: Any = data
+        for part in parents:
+            found = found.get(part) if isinstance(found, CommentedMap) else None
+        if isinstance(found, CommentedMap) and last in found:
+            del found[last]
+    for key, value in changes.items():
+        *parents, last = key.split(".")
+        here = data
+        for part in parents:
+            if not isinstance(here.get(part), CommentedMap):
+                here[part] = CommentedMap()
+            here = here[part]
+        _put(here, last, value)
+    stream = io.StringIO()
+    yaml.dump(data, stream)
+    return stream.getvalue()
+
+
+def _stands(data: Any, key: str) -> bool:
+    for part in key.split("."):
+        if not isinstance(data, dict) or data.get(part) is None:
+            return False
+        data = data[part]
+    return True
+
+
+def _put(here: CommentedMap, key: str, value: Any) -> None:
+    """Set one key; a mapping that is there keeps its place and its comments.
+
+    A new key goes before the last one: a comment or an empty line after a mapping belongs to its
+    last key, and would stand in the middle.
+    """
+    there = here.get(key)
+    if isinstance(value, Mapping) and isinstance(there, CommentedMap):
+        for old in [name for name in there if name not in value]:
+            del there[old]
+        for name, item in value.items():
+            _put(there, name, item)
+    elif key in here or not here:
+        here[key] = _plain(value)
+    else:
+        here.insert(len(here) - 1, key, _plain(value))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        result = CommentedMap()
+        for key, item in value.items():
+            result[key] = _plain(item)
+        return result
+    if isinstance(value, list | tuple):
+        items = CommentedSeq([_plain(item) for item in value])
+        items.fa.set_flow_style()
+        return items
+    if isinstance(value, float):
+        return round(value, 6)
+    return value
+
+
+def _check(rig: Path, target: Path, text: str) -> None:
+    """Whether `text` at `target` would be a rig file."""
+    aside = target.with_name(f".{target.name}.new")
+    write_text(aside, text)
+    try:
+        validate(RigFile, read_rig(aside).data, aside)
+    except InputError as error:
+        raise InputError(
+            target, error.key, error.value, f"{error.expected}; {rig} is as it was"
+        ) from None
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _keep(path: Path, today: date) -> Path:
+    """A copy of `path` beside it, named after the day."""
+    number, text = 1, read_text(path, "rig file")
+    while True:
+        more = f"-{number}" if number > 1 else ""
+        copy = path.with_name(f"{path.stem}.before-{today.isoformat()}{more}{path.suffix}")
+        if not copy.exists():
+            break
+        number += 1
+    write_text(copy, text)
+    return copy
+
+
+def _yaml() -> YAML:
+    yaml = YAML()
+    yaml.preserve_quotes = True
+    yaml.width = _WIDEST
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    return yaml

@@ -1,0 +1,265 @@
+"""pylon's emulated camera as the camera of a simulated scene that goes on elsewhere.
+
+Every frame of the scene is one software trigger of the emulated camera, so that it passes through
+pylon's own buffers, threads and results; only the picture, its number and its chunks, which the
+emulation does not have, are the scene's. What pylon loses on the way is lost here too.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from rigs.cameras.basler import find_camera
+from rigs.wire.basler import emulate
+from storage.streams import U8, FrameChunk
+
+TRIES = 3
+MISSED_S = 0.2
+"""A trigger whose picture has not come by then was missed, s."""
+LOOK_S = 0.001
+LOOK_MS = 100
+READY_S = 2.0
+"""The longest that the emulated camera takes to be ready for the next trigger, s."""
+EXPOSURE_US = 100.0
+"""Of the emulated camera; the scene's own is in its pictures."""
+FEED_S = 5.0
+"""The longest that the feeding thread takes to end, s."""
+
+
+_Frame = tuple[U8, int, int, int]
+"""Picture, number, middle of the exposure in ns, and level of the sync line."""
+
+
+class Scene(Protocol):
+    """Where the frames come from."""
+
+    on_frames: Callable[[FrameChunk], None]
+
+    def grab(self, width_px: int, height_px: int) -> None:
+        """Frames of that size come from now on."""
+
+    def stop_grabbing(self) -> None:
+        """No frame comes any more."""
+
+
+class LiveBasler:
+    """An `InstantCamera` of pypylon whose pictures are those of a scene.
+
+    Whatever is not listed here is the emulated camera's own.
+
+    Args:
+        scene: asked for frames when the camera grabs.
+        mid_exposure_ns: from a frame's start to its middle, which is what the scene's times say.
+        sync_line: number of the input that shows the sync line's level.
+
+    Attributes:
+        fed: frames that pylon took since the grab began.
+    """
+
+    def __init__(self, scene: Scene, mid_exposure_ns: int, sync_line: int) -> None:
+        emulate(1)
+        self._device = find_camera(None)
+        self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
+        self._coming: deque[_Frame | None] = deque()
+        self._came = threading.Condition()
+        self._fed: deque[tuple[int, _Frame]] = deque()
+        self._triggers = self._retrieved = 0
+        self._feeder: threading.Thread | None = None
+        self._drop, self._gone = 0, False
+        self.fed = 0
+        scene.on_frames = self._take
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+    # -- faults ----------------------------------------------------------------------------
+
+    def drop_frames(self, count: int) -> None:
+        """Lose the next `count` results."""
+        self._drop += count
+
+    def unplug(self) -> None:
+        """The cable is pulled."""
+        self._gone = True
+
+    # -- as pylon's ------------------------------------------------------------------------
+
+    def GetNodeMap(self) -> Any:
+        """The emulated camera's settings, and the chunks and lines that it does not have."""
+        return _NodeMap(self._device.GetNodeMap())
+
+    def IsCameraDeviceRemoved(self) -> bool:
+        """Whether it was unplugged."""
+        return self._gone or bool(self._device.IsCameraDeviceRemoved())
+
+    def StartGrabbing(self, strategy: Any) -> None:
+        """Begin: the scene sends frames of the region that was set."""
+        nodes = self._device.GetNodeMap()
+        nodes.GetNode("TriggerSource").Value = "Software"
+        nodes.GetNode("ExposureTimeAbs").Value = EXPOSURE_US
+        self._coming.clear()
+        self._fed.clear()
+        self._triggers = self._retrieved = self.fed = 0
+        self._device.StartGrabbing(strategy)
+        self._feeder = threading.Thread(target=self._feed, name="scene's frames", daemon=True)
+        self._feeder.start()
+        self._scene.grab(nodes.GetNode("Width").Value, nodes.GetNode("Height").Value)
+
+    def StopGrabbing(self) -> None:
+        """Stop; frames that came before were given to pylon."""
+        if self._feeder is not None:
+            self._scene.stop_grabbing()
+            with self._came:
+                self._coming.append(None)
+                self._came.notify()
+            self._feeder.join(FEED_S)
+            self._feeder = None
+        self._device.StopGrabbing()
+
+    def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
+        """The next result of pylon's, with the scene's picture in it."""
+        result = self._device.RetrieveResult(timeout_ms, handling)
+        if result is None or not result.IsValid():
+            return result
+        with self._came:
+            # a trigger that pylon's camera missed gave no result
+            while self._fed[0][0] < result.BlockID:
+                self._fed.popleft()
+            frame = self._fed.popleft()[1]
+            self._retrieved += 1
+            self._came.notify()
+        if self._drop:
+            from pypylon import pylon
+
+            self._drop -= 1
+            result.Release()
+            return pylon.GrabResult()
+        return _Result(result, *frame, self._mid_exposure_ns, self._bit)
+
+    # --------------------------------------------------------------------------------------
+
+    def _take(self, frames: FrameChunk) -> None:
+        """In the thread that the scene's frames come by."""
+        rows = zip(
+            frames.images,
+            frames.number.tolist(),
+            frames.t_ns.tolist(),
+            frames.sync.tolist(),
+            strict=True,
+        )
+        with self._came:
+            self._coming.extend(rows)
+            self._came.notify()
+
+    def _feed(self) -> None:
+        from pypylon import genicam
+
+        while True:
+            with self._came:
+                if not self._came.wait_for(lambda: self._coming, READY_S):
+                    continue
+                frame = self._coming.popleft()
+            if frame is None:
+                return
+            try:
+                self._give(frame)
+            except genicam.GenericException:
+                return  # it grabs no more: what comes now is lost, and its number is missing
+
+    def _give(self, frame: _Frame) -> None:
+        """One trigger for one frame; the emulation misses some, which no camera's line would."""
+        for _ in range(TRIES):
+            if self._gone or not self._ready():
+                return
+            with self._came:
+                self._fed.append((self._triggers, frame))
+                self._triggers += 1
+            self._device.ExecuteSoftwareTrigger()
+            end = time.monotonic() + MISSED_S
+            while time.monotonic() < end:
+                with self._came:
+                    if self._retrieved + self._device.NumReadyBuffers.Value > self.fed:
+                        self.fed += 1
+                        return
+                    self._came.wait(LOOK_S)
+
+    def _ready(self) -> bool:
+        """Whether the next trigger may come, after waiting for it."""
+        from pypylon import pylon
+
+        end = time.monotonic() + READY_S
+        while time.monotonic() < end:
+            # right after the start it says no at once
+            if self._device.WaitForFrameTriggerReady(LOOK_MS, pylon.TimeoutHandling_Return):
+                return True
+        return False
+
+
+class _Value:
+    """One of the values that a chunk is read by."""
+
+    def __init__(self, value: int) -> None:
+        self.Value = value
+
+
+class _Result:
+    """A result of pylon's with another picture and with chunks."""
+
+    def __init__(
+        self,
+        result: Any,
+        image: U8,
+        number: int,
+        t_ns: int,
+        sync: int,
+        mid_exposure_ns: int,
+        bit: int,
+    ) -> None:
+        self._result = result
+        self.Array, self.BlockID, self.ImageNumber = image, number, number + 1
+        self.NumberOfSkippedImages = 0  # the numbers say it
+        self.TimeStamp = t_ns - mid_exposure_ns
+        self.ChunkTimestamp = _Value(self.TimeStamp)
+        self.ChunkLineStatusAll = _Value(sync << bit)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)
+
+
+class _Choice:
+    """A setting that the emulation lacks: it takes what it is given."""
+
+    def __init__(self, symbolics: tuple[str, ...] = ()) -> None:
+        self.Symbolics, self.Value = symbolics, None
+
+    def GetAccessMode(self) -> int:
+        """Can be read and written."""
+        from pypylon import genicam
+
+        mode: int = genicam.RW
+        return mode
+
+
+class _NodeMap:
+    """Settings of an emulated camera, with chunks and with lines to be triggered by."""
+
+    def __init__(self, node_map: Any) -> None:
+        self._map = node_map
+        self._own = {
+            "ChunkModeActive": _Choice(),
+            "ChunkSelector": _Choice(("Timestamp", "LineStatusAll")),
+            "ChunkEnable": _Choice(),
+            # the emulated exposure stays short, so that no trigger comes too soon
+            "ExposureTime": _Choice(),
+            "ExposureTimeAbs": _Choice(),
+            "TriggerSource": _Choice(("Software", "Line1", "Line2", "Line3")),
+        }
+
+    def GetNode(self, name: str) -> Any:
+        """A setting by its name."""
+        own = self._own.get(name)
+        return own if own is not None else self._map.GetNode(name)

@@ -1,0 +1,305 @@
+"""One simulated scene on one real-time clock, behind stand-ins that speak the devices' wires.
+
+What a stand-in sends is what the simulated devices of `rigs.mock` would have handed over: the same
+world, the same noise, the same faults by name. Only the way to the host differs, so a trial looks
+the same through either. The world follows the host's monotonic clock a little behind it, so that a
+controller's move never lies in the world's past.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from protocols.program import PlateAction
+from protocols.timing import Timing
+from rigs.arms.settings import ArmSettings
+from rigs.capabilities import ArmState, Pose, RigError, Segment
+from rigs.mock.clocks import trial_clocks
+from rigs.mock.devices import build_mock
+from rigs.mock.event_camera import MockEventCamera
+from rigs.mock.frame_camera import MockFrameCamera
+from rigs.mock.geometry import ContactPlane
+from rigs.mock.people import MockPlate, SimulatedOperator
+from rigs.mock.settings import MockSettings
+from rigs.mock.sync import MockSyncBox
+from rigs.mock.truth import truth_of
+from rigs.mock.world import World, start_pose
+from rigs.pulse_code import code_bits
+from rigs.wire.faults import Kind
+from rigs.wire.live_dvxplorer import LiveDvxplorer
+from rigs.wire.motion_path import MotionPath
+from rigs.wire.standing_arm import StandingArm, standing_arm
+from rigs.wire.sync_box import PtySyncBox, Train
+from storage.clockmap import ClockMap
+from storage.streams import FrameChunk
+
+I64 = npt.NDArray[np.int64]
+LAG_NS = 20_000_000
+"""How far the world is behind the host's clock: longer than a controller's cycle."""
+PULSE_NS = 5_000_000
+"""Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
+REST_S = 2.0
+"""The longest that a trial's begin waits for the arm to be at rest."""
+_BITS = 1 << 12
+
+
+class SyncLevel:
+    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
+
+    Args:
+        box: true time of all trials to the box's clock, ns.
+    """
+
+    def __init__(self, box: ClockMap) -> None:
+        self._box = box
+        self._train: Train | None = None
+        self._bits = np.zeros(0, np.uint8)
+        self._ticks: int | None = None
+
+    def follow(self, train: Train | None, sent: int) -> None:
+        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
+        if train is None:
+            self._ticks = sent
+        else:
+            self._bits = np.zeros(0, np.uint8)
+            self._ticks, self._train = None, train
+
+    def high(self, total_ns: int) -> bool:
+        """Whether the line is high at a true time of all trials."""
+        train, ticks = self._train, self._ticks
+        if train is None:
+            return False
+        passed = self._box.to_reference(total_ns) - train.first_ns
+        period = 1e9 / train.rate_hz
+        tick = int(passed // period)
+        if tick < 0 or (ticks is not None and tick >= ticks):
+            return False
+        if tick >= len(self._bits):
+            self._bits = code_bits(train.seed, max(2 * tick, _BITS), train.code)
+        return bool(self._bits[tick]) and passed - tick * period < min(PULSE_NS, period / 2)
+
+
+class Theatre:
+    """The scene and its stand-ins; `turn` lets it follow the clock, from one thread.
+
+    Args:
+        settings: the simulated scene and devices, with their faults.
+        timing: which signals reach which device; frames by hardware trigger.
+        arm: settings of the arm's driver: a stand-in of its kind listens where it will look.
+        on_frames: is given the frames of each turn.
+
+    Attributes:
+        sent: what was sent since the trial began, by stream.
+    """
+
+    def __init__(
+        self,
+        settings: MockSettings,
+        timing: Timing,
+        arm: ArmSettings,
+        on_frames: Callable[[FrameChunk], None],
+    ) -> None:
+        _rehearse(settings, timing)
+        self._origin_ns = time.monotonic_ns() - LAG_NS
+        clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
+        plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+        self._arm_clock = clocks.arm
+        self._path = MotionPath(plane, start_pose(settings), clocks.arm)
+        self.world = World(settings, self._path, run_on=True)
+        self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
+        self._box = MockSyncBox(self.world)
+        self._events = MockEventCamera(self.world, self._box)
+        self._frames = MockFrameCamera(self.world, self._box, timing.frames)
+        self._plate = MockPlate(self.world)
+        self._operator = SimulatedOperator(self.world)
+        self._on_frames, self._grabbing = on_frames, False
+        self._trains: deque[tuple[Train | None, int]] = deque()
+        self._train: Train | None = None
+        self._level = SyncLevel(self._box_clock)
+        self.sent: Counter[str] = Counter()
+        self._stamps_us: list[I64] = []
+        self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+        self.camera = LiveDvxplorer((settings.event_camera.width, settings.event_camera.height))
+        self.arm: StandingArm = standing_arm(
+            arm, self._path.motion, self._arm_now_s, self._arm_input
+        )
+        self._events.start()
+
+    def close(self) -> None:
+        """Take every stand-in away."""
+        for part in (self.arm, self.camera, self.sync_box):
+            part.close()
+
+    # -- time ------------------------------------------------------------------------------
+
+    def _total_ns(self) -> int:
+        """True time of all trials: the host's clock."""
+        return time.monotonic_ns() - self._origin_ns
+
+    def _box_now_ns(self) -> int:
+        return self._box_clock.to_reference(self._total_ns())
+
+    def _arm_now_s(self) -> float:
+        return self._arm_clock.to_reference(self._total_ns()) / 1e9
+
+    def _arm_input(self, t_s: float) -> bool:
+        return self._level.high(self._arm_clock.to_device(round(t_s * 1e9)))
+
+    def turn(self) -> None:
+        """Let the world follow the clock, and send what its devices have to say."""
+        world = self.world
+        passed = self._total_ns() - LAG_NS - world.past_ns - world.now_ns
+        while self._trains:
+            self._tick(*self._trains.popleft())
+        if passed > 0:
+            world.pass_time(passed)
+        if self._path.cut_ns is not None:
+            self._path.cut_ns = None
+            protective = world.arm_state is ArmState.PROTECTIVE_STOP
+            self.arm.happen(Kind.PROTECTIVE_STOP if protective else Kind.PROGRAM_END)
+        chunk, pulses = self._events.read(), self._events.read_pulses()
+        if len(chunk) or len(pulses.t_ns):
+            self.camera.send(chunk, pulses)
+            self.sent["events"] += len(chunk)
+            self.sent["event_pulses"] += len(pulses.t_ns)
+            self._stamps_us.append(chunk.t_us)
+        if self._grabbing:
+            self._send_frames()
+
+    def _send_frames(self) -> None:
+        frames = self._frames.read()
+        if len(frames.number):
+            self._on_frames(frames)
+            self.sent["frames"] += len(frames.number)
+
+    # -- the sync box ----------------------------------------------------------------------
+
+    def _on_train(self, train: Train | None, sent: int) -> None:
+        """In the box's thread."""
+        self._level.follow(train, sent)
+        self._trains.append((train, sent))
+
+    def _tick(self, train: Train | None, sent: int) -> None:
+        if train is not None:
+            self._train = train
+            first = self._box_clock.to_device(train.first_ns) - self.world.past_ns
+            self._box.start(train.rate_hz, train.seed, train.code, first)
+        elif self._train is not None:
+            # half a tick behind the last one
+            end = self._train.first_ns + round((sent - 0.5) * 1e9 / self._train.rate_hz)
+            self._box.stop(self._box_clock.to_device(end) - self.world.past_ns)
+
+    # -- what a rig asks of a simulation ---------------------------------------------------
+
+    def begin_trial(self, seed: int) -> None:
+        """Draw everything that varies by trial from `seed`; the skin is at rest.
+
+        Raises:
+            RigError: the arm is moving.
+        """
+        end = time.monotonic() + REST_S
+        while True:
+            self.turn()
+            if not self._path.moving(self.world.now_ns) or time.monotonic() > end:
+                break
+        self.world.begin_trial(seed)
+        self._path.begin(self.world.past_ns)
+        self._events.start()
+        self.sent.clear()
+        self._stamps_us.clear()
+
+    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
+        """What really happened after that moment of the arm controller's clock."""
+        self.turn()
+        true_ns = self._arm_clock.to_device(reference_arm_ns) - self.world.past_ns
+        return truth_of(self.world, self._box.clock, true_ns)
+
+    def events_between(self, first_us: int, last_us: int) -> int:
+        """How many events with stamps from the first to the last of these were sent, us."""
+        return sum(
+            int(np.count_nonzero((stamps >= first_us) & (stamps <= last_us)))
+            for stamps in self._stamps_us
+        )
+
+    def act(self, action: PlateAction, seconds: float) -> None:
+        """What the plate does."""
+        self.turn()
+        self._plate.act(action, seconds)
+
+    def mass_kg(self) -> float:
+        """Mass mounted now."""
+        return self._plate.mass_kg()
+
+    def ask(self, task: str, prompt: str, expected: str) -> bool:
+        """What a person does."""
+        if task == "protective_stop":
+            self.arm.restore()
+        return self._operator.ask(task, prompt, expected)
+
+    def grab(self, width_px: int, height_px: int) -> None:
+        """The frame camera begins to grab a region; its counter is at 0."""
+        self.turn()
+        self._frames.stop()
+        self._frames.set_region(width_px, height_px)
+        self._frames.start()
+        self._grabbing = True
+
+    def stop_grabbing(self) -> None:
+        """The frame camera stops; what it exposed before was sent."""
+        if self._grabbing:
+            self.turn()
+            self._frames.stop()
+            self._grabbing = False
+
+    def happen(self, device: str, kind: str) -> None:
+        """Make something go wrong on the wire now.
+
+        Args:
+            device: ``arm``, ``sync_box`` or ``event_camera``.
+            kind: of the arm a value of `rigs.wire.faults.Kind`; of the sync box ``reset``,
+                ``silence`` or ``unplug``; of the event camera ``stall`` or ``unplug``.
+
+        Raises:
+            RigError: no such fault.
+        """
+        known: dict[str, dict[str, Callable[[], None]]] = {
+            "arm": {found.value: lambda k=found: self.arm.happen(k) for found in Kind},  # type: ignore[misc]
+            "sync_box": {
+                "reset": self.sync_box.reset,
+                "silence": self.sync_box.silence,
+                "unplug": self.sync_box.close,
+            },
+            "event_camera": {"stall": self.camera.stall, "unplug": self.camera.close},
+        }
+        try:
+            what = known[device][kind]
+        except KeyError:
+            raise RigError(device, f"no stand-in can show '{kind}' of it") from None
+        what()
+
+
+def _rehearse(settings: MockSettings, timing: Timing) -> None:
+    """Let a world like this one run for a moment: what has to be compiled or loaded is then there.
+
+    Compiling holds Python's lock for seconds, in which no stand-in would answer.
+    """
+    devices = build_mock(settings, timing)
+    devices.arm.connect()
+    devices.begin_trial(1)
+    devices.frames.set_region(64, 64)
+    devices.events.start()
+    devices.frames.start()
+    devices.sync.start(100.0, 1)
+    home = devices.arm.pose()
+    devices.arm.start([Segment(Pose((home.xyz_mm[0] + 1.0, *home.xyz_mm[1:]), home.rotvec_deg), 5)])
+    for _ in range(10):
+        devices.clock.wait(0.05)
+        for read in (devices.events.read, devices.events.read_pulses, devices.frames.read):
+            read()
+    devices.truth(devices.clock.now_ns() - 100_000_000)

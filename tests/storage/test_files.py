@@ -1,0 +1,43 @@
+"""What is written by the project's own hand is what the standard library would write."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from storage.files import json_text, read_json, write_json
+
+LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
+FINITE = LEAVES.filter(lambda value: value not in (float("inf"), float("-inf")))
+TREES = st.recursive(
+    FINITE,
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.lists(inner, max_size=4).map(tuple)
+        | st.dictionaries(st.text(), inner, max_size=4)
+        | st.dictionaries(st.integers(), inner, max_size=4)
+    ),
+    max_leaves=30,
+)
+
+
+@given(data=TREES)
+def test_json_is_that_of_the_standard_library(data: object) -> None:
+    expected = json.dumps(data, indent=1, sort_keys=True, allow_nan=False, ensure_ascii=False)
+    assert json_text(data) == expected + "\n"
+
+
+def test_json_comes_back(tmp_path: Path) -> None:
+    data = {"b": [1, 2.5, {"c": []}], "a": {"ä": None}}
+    write_json(tmp_path / "a.json", data)
+    assert read_json(tmp_path / "a.json") == data
+
+
+@pytest.mark.parametrize("bad", [float("nan"), [1.0, float("inf")], {"a": {"b": [float("nan")]}}])
+def test_json_has_no_word_for_these(bad: object) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        json_text(bad)
