@@ -176,3 +176,14 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
     assert verify(Store.open(store)) == []
     for name, expected in undisturbed.items():
         assert read_json(trials / name / "checksums.json") == expected
+
+
+def test_collect_takes_so_many_trials_and_no_more(tmp_path: Path) -> None:
+    arguments = ("protocols/pilot.yaml", "--rig", "rehearsal", "--store", tmp_path / "s")
+    for taken, left_out in ((2, 34), (1, 33)):
+        done = sliplab("collect", *arguments, "--trials", taken, "--json")
+        assert done.returncode == 0, done.stderr
+        found = json.loads(done.stdout)
+        assert (found["taken"], found["left_out"]) == (taken, left_out)
+    assert (found["committed"], found["missing"]) == (3, 33)
+    assert sliplab("collect", *arguments, "--trials", 0).returncode == 2
