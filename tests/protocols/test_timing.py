@@ -32,7 +32,8 @@ def test_every_grade_has_a_gate() -> None:
     gates = SyncGates()
     for grade in ("hardware trigger", "exposure line", "digital input"):
         assert grade in WIRED
-        assert gates.limit_s(grade) == 0.001
+        # what an arm's input samples every 2 ms is not known better than that
+        assert gates.limit_s(grade) == (0.003 if grade == "digital input" else 0.001)
     assert gates.limit_s("device time stamps") < gates.limit_s("host time")
     assert gates.limit_s("host time") < gates.limit_s("host arrival")
 
