@@ -299,14 +299,19 @@ class Rig:
             self.frames.start()
 
     def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
-        """Stop the pulses, and read what the cameras still hold before they stop."""
+        """Stop the pulses, and read what the cameras still hold before and after they stop.
+
+        Events that come later than `TAIL_S` after the motion tell nothing; a pulse or a frame does.
+        """
         if with_frames and self.timing.frames == "exposure line":
             self.frames.stop()
         self.sync.stop()
         self._wait(TAIL_S, sink)
         self.events.stop()
+        sink.add_event_pulses(self.events.read_pulses())
         if with_frames:
             self.frames.stop()
+            sink.add_frames(self.frames.read())
 
     def _drain(self, sink: Sink) -> None:
         sink.add_events(self.events.read())
