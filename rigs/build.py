@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from rigs.wire.loopback import Loopback
 
 
+DRIVEN_TAIL_S = 0.3
+"""How long real drivers are read after the last pulse, s."""
+
+
 class _MockSimulation:
     """The simulated world, asked on the arm controller's clock."""
 
@@ -154,6 +158,7 @@ def _driven_rig(
             poll_s=float(file.poll),
             timing=file.timing,
             touch_mm=file.calibration.touch_depth,
+            tail_s=DRIVEN_TAIL_S,
             plate=plate,
             simulation=simulation,
             ending=ending,

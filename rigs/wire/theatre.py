@@ -50,6 +50,9 @@ REST_S = 2.0
 CLEAR_MM = 5.0
 PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
 """How far a person moves a stopped arm clear of the plate, and how fast."""
+_NONE = np.empty(0, np.int64)
+NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
+"""What is sent when no more frames come."""
 _BITS = 1 << 12
 
 
@@ -257,11 +260,12 @@ class Theatre:
         self._grabbing = True
 
     def stop_grabbing(self) -> None:
-        """The frame camera stops; what it exposed before was sent."""
+        """The frame camera stops; what it exposed before is sent, and an empty chunk."""
         if self._grabbing:
             self.turn()
             self._frames.stop()
             self._grabbing = False
+        self._on_frames(NO_FRAMES)
 
     # -- what a person at the rig would see and do -----------------------------------------
 
