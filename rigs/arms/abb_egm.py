@@ -51,7 +51,7 @@ class _StampedSocket(socket.socket):
             with suppress(OSError):
                 self.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
-    def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:  # type: ignore[override]
+    def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:
         """The next packet and its sender."""
         data, notes, _, sender = self.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size), flags)
         self.arrived_ns = time.monotonic_ns()

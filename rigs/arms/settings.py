@@ -48,9 +48,13 @@ class Limits(StrictModel):
     def _makes_sense(self) -> Limits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
-                raise KeyedError("limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm")
+                raise KeyedError(
+                    "devices.arm.limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm"
+                )
         if self.plate is None and (self.frame == "plate" or self.depth_mm is not None):
-            raise KeyedError("limits.plate", None, "is needed by limits in the plate's frame")
+            raise KeyedError(
+                "devices.arm.limits.plate", None, "is needed by limits in the plate's frame"
+            )
         return self
 
 

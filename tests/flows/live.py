@@ -1,4 +1,4 @@
-"""What tests of a loopback rig share: a short fast trial, its rig file, sessions on its stand-ins."""
+"""What tests of a loopback rig share: a short trial, a rig file, sessions on its stand-ins."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +46,7 @@ class Taken:
 
 
 @pytest.fixture(scope="module")
-def taken(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Taken]:
+def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
     folder = tmp_path_factory.mktemp("loopback")
     order = order_in(folder / "live", quick(), rig_yaml(folder))
     with stage_of(order.rig) as stage, at_work(order, stage) as (work, campaign):
@@ -65,7 +64,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Taken]:
     rig.connect()
     take_all(Session(mock.plan, file, rig, other))
     (by_mock,) = other.recordings()
-    yield Taken(recording, by_mock, sent, events_sent, order)
+    return Taken(recording, by_mock, sent, events_sent, order)
 
 
 def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:

@@ -120,7 +120,10 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
         until(stage.at_rest, case.bound_s + BUSY_S)
         x_mm, _, depth_mm = stage.arm_place()
         went_on_s = (x_mm - at_mm) / SPEED_MM_S
-        print(f"{case.device} {case.kind}: simulated arm went on for {went_on_s:.2f} s: {raised.value}")
+        print(
+            f"{case.device} {case.kind}: simulated arm went on for {went_on_s:.2f} s; "
+            f"{raised.value}"
+        )
         assert 0 <= went_on_s <= case.bound_s + BUSY_S
         assert x_mm < LENGTH_MM / 2 - 0.5  # not just the end of the slide
         if case.device == "arm":
