@@ -20,6 +20,7 @@ import pytest
 from flows.orders import Order
 from rigs.arms.ur import SILENCE_S, UrArm
 from rigs.arms.ur_control import WATCHDOG_HZ
+from rigs.build import calibrated_arm
 from rigs.capabilities import ArmFault, ArmState, RigError
 from rigs.wire.loopback import Loopback
 from storage.files import read_json
@@ -188,7 +189,7 @@ def test_a_second_program_gets_no_arm_that_slides(
     stage, rig = scene
     order = order_in(tmp_path, quick(LENGTH_MM, SPEED_MM_S), rig)
     assert order.rig.devices is not None
-    second = UrArm(cast("Any", order.rig.devices.arm))
+    second = UrArm(cast("Any", calibrated_arm(order.rig, order.rig.devices)))
 
     def take_it() -> str:
         with pytest.raises(ArmFault) as refused:

@@ -73,7 +73,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
         _without("devices", "arm", "limits"), "devices.arm.limits", "is missing",
     ),
     "limits the wrong way round": (
-        _set("devices", "arm", "limits", "low_mm", to=[330, 30, 275]),
+        _set("devices", "arm", "limits", "low_mm", to=[-20, 30, -70]),
         "devices.arm.limits.low_mm", "y is not below high_mm",
     ),
     "a line that no camera has": (
