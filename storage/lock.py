@@ -37,7 +37,7 @@ class Locked(RuntimeError):
 
 @contextmanager
 def exclusive(
-    path: Path, what: str, *, brief: bool = False, mode: int = 0o644, **more: object
+    path: Path, what: str, *, brief: bool = False, mode: int = 0o644, about: Json | None = None
 ) -> Iterator[None]:
     """Hold the lock file at `path` while the block runs.
 
@@ -45,7 +45,7 @@ def exclusive(
         what: what is locked, for the message.
         brief: the block is over at once; others may wait for that.
         mode: of the file, if it is made.
-        more: what else is said of the holder, such as its store.
+        about: what else is said of the holder, such as its store.
 
     Raises:
         Locked: it is held. Only a brief holder is waited for, `PATIENCE_S` at most.
@@ -56,9 +56,9 @@ def exclusive(
         _acquire(handle, what)
         if os.fstat(handle).st_nlink == 0:  # somebody cleaned the folder up in between
             raise Locked(f"{what}: the lock file {path} was deleted meanwhile; try again")
-        about = json.dumps({**this_process(), "brief": brief, **more}).encode()
+        told = {**this_process(), "brief": brief, **(about or {})}
         os.ftruncate(handle, 0)
-        os.pwrite(handle, about, 0)
+        os.pwrite(handle, json.dumps(told).encode(), 0)
         try:
             yield
         finally:

@@ -60,7 +60,7 @@ def is_here(who: Json) -> bool:
     pid = who.get("pid")
     if not isinstance(pid, int) or who.get("boot") != _boot() or who.get("ticks") is None:
         return False
-    return started_ticks(pid) == who["ticks"]
+    return bool(started_ticks(pid) == who["ticks"])
 
 
 def send(who: Json, number: signal.Signals) -> bool:

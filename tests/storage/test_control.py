@@ -60,7 +60,7 @@ HOLDER = """
 import sys
 from pathlib import Path
 from storage.lock import exclusive
-with exclusive(Path(sys.argv[1]), "the rig", store="somewhere"):
+with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
     print("held", flush=True)
     sys.stdin.read()
 """
