@@ -59,10 +59,14 @@ def stop(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Stop a running collection now, the arm first, as Ctrl-C in its terminal would."""
-    from flows import controlling
+    from flows.halting import halt
     from storage.store import Store
 
-    outcome = controlling.stop(Store.open(store), who=who, why=why, limit_s=wait)
+    opened = Store.open(store)
+    told = halt(store)  # before anything that takes long to load
+    from flows import controlling
+
+    outcome = controlling.note_stop(opened, *told, who=who, why=why, limit_s=wait)
     words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
     _finish([outcome], as_json, words)
 

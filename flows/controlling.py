@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -11,11 +10,12 @@ from difflib import get_close_matches
 from flows import console, stopping
 from flows.boundary import carry_out
 from flows.campaigns import collected
-from flows.stretch import LOCK, owned
+from flows.halting import halt, holder_of
+from flows.stretch import owned
 from protocols import InputError
 from storage import control, process
 from storage.control import Kind, Request
-from storage.lock import Locked, exclusive
+from storage.lock import Locked
 from storage.store import Store
 from storage.streams import Json
 
@@ -75,34 +75,36 @@ def request(
 def stop(store: Store, *, who: str = "", why: str = "", limit_s: float = 60.0) -> Outcome:
     """Stop what collects into the store now, the arm first, and wait until it has ended.
 
-    The signal goes out before anything is written. A collection on another machine gets none: it
-    stops before its next trial.
+    The signal goes out before anything is written. A collection that no signal reaches from here,
+    because it runs on another machine, stops before its next trial.
     """
-    holder = holder_of(store)
+    return note_stop(store, *halt(store.folder), who=who, why=why, limit_s=limit_s)
+
+
+def note_stop(
+    store: Store,
+    holder: Json | None,
+    reached: bool,
+    *,
+    who: str = "",
+    why: str = "",
+    limit_s: float = 60.0,
+) -> Outcome:
+    """What `stop` does once `halt` has sent the signal."""
     if holder is not None and not holder.get("collects"):
-        console.say(f"{process.named(holder)} collects nothing: left alone")
+        console.say(f"{process.named(holder)}: collects nothing and was left alone")
         holder = None
-    sent = holder is not None and process.send(holder, signal.SIGTERM)
     if holder is not None:
-        how = "was told to stop" if sent else "stops before its next trial: it is not on this host"
-        console.say(f"{process.named(holder)} {how}")
+        how = "was told to stop" if reached else "no signal reaches it; it stops at its next trial"
+        console.say(f"{process.named(holder)}: {how}")
     made = control.ask(store, "stop", who=who, why=why)
     if holder is not None and limit_s > 0:
         _wait(store, "waiting until it has stopped (s)", limit_s, None)
-    left = holder_of(store)
+    left = holder_of(store.folder)
     if holder is not None and (left is None or left.get("pid") != holder["pid"]):
         control.answer(store, made, {"stopped": True, "running": True})
     _settle(store)
     return Outcome(made, control.answered(store, made), holder)
-
-
-def holder_of(store: Store) -> Json | None:
-    """Who has the store's lock, None if nobody has."""
-    try:
-        with exclusive(store.folder / LOCK, "the store", brief=True):
-            return None
-    except Locked as error:
-        return error.holder
 
 
 def known_trials(
@@ -140,13 +142,17 @@ def _settle(store: Store) -> Json | None:
 
 
 def _wait(store: Store, title: str, limit_s: float, made: Request | None) -> None:
-    """Until the request is answered, or nobody has the store any more; `limit_s` at most."""
+    """Until the request is answered, or nobody has the store any more; `limit_s` at most.
+
+    Raises:
+        KeyboardInterrupt: somebody does not want to wait any longer; the request stands.
+    """
     begin = time.monotonic()
     with console.bar(title, round(limit_s)) as bar:
         shown = 0.0
         while (gone := time.monotonic() - begin) < limit_s:
             if made is None:
-                if holder_of(store) is None:
+                if holder_of(store.folder) is None:
                     return
             elif control.answered(store, made) is not None or _settle(store) is None:
                 return

@@ -43,7 +43,7 @@ class DiskWatch:
         """Take the size of a trial that was just committed into account."""
         folder = self._campaign.folder / "trials" / trial.id
         took = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-        ratio = took / trial_bytes(self._order.rig, self._order.plan, trial)
+        ratio = took / max(trial_bytes(self._order.rig, self._order.plan, trial), 1.0)
         self._ratio = max(ratio, self._ratio or 0.0)
 
     def needs(self, trial: Trial) -> float:

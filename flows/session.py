@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 
+from flows import stopping
 from flows.boundary import Boundary
 from flows.quality import Assessment, assess
 from protocols import Plan, Task, Trial
@@ -294,6 +295,7 @@ def _installed() -> Json:
 
 def _cause(error: BaseException) -> str:
     """Why a trial ended early, for its quarantine."""
-    if isinstance(error, (KeyboardInterrupt, StopRequested)):
+    # compiled code that a signal interrupts raises an error of its own
+    if isinstance(error, (KeyboardInterrupt, StopRequested)) or stopping.requested():
         return "stopped by a person"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -22,11 +22,9 @@ from rigs.rig_lock import held
 from storage import control
 from storage.errors import disk_explained
 from storage.files import sweep_temporary
-from storage.lock import exclusive
+from storage.lock import STORE_LOCK, exclusive
 from storage.migrate import migrate
 from storage.store import Campaign, Store
-
-LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ def owned(store: Store, *, brief: bool = False, collects: str = "") -> Iterator[
     about = {"collects": collects} if collects else None
     with (
         disk_explained(store.folder, RigError),
-        exclusive(store.folder / LOCK, f"the store {store.folder}", brief=brief, about=about),
+        exclusive(store.folder / STORE_LOCK, f"the store {store.folder}", brief=brief, about=about),
     ):
         migrate(store)
         yield

@@ -17,6 +17,8 @@ from pathlib import Path
 from storage.process import named, this_process
 from storage.streams import Json
 
+STORE_LOCK = ".lock"
+"""Of a store, in its folder."""
 PATIENCE_S = 3.0
 """How long a holder that is done at once (`brief`) is waited for."""
 _LOOK_S = 0.05
