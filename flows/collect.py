@@ -12,12 +12,12 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows import console, stopping
-from flows.boundary import refuse_paused
+from flows.boundary import carry_out, refuse_paused
 from flows.orchestration import Parcel, run
 from flows.orders import Order, campaign_counts, check_disk, pending_trials
 from flows.remaining import Remaining
 from flows.session import Session
-from flows.stretch import refresh, stretch
+from flows.stretch import owned, refresh, stretch
 from flows.timing import timed
 from protocols import Trial
 from storage import control
@@ -75,7 +75,10 @@ def collect(order: Order) -> dict[str, Any]:
     """
     store = Store.create(order.store)
     refuse_paused(store)
-    if pending_trials(order.plan, store.campaign(order.campaign)) or control.open_requests(store):
+    if control.open_requests(store):  # whoever asked was killed before it was done
+        with owned(store):
+            carry_out(store)
+    if pending_trials(order.plan, store.campaign(order.campaign)):
         check_disk([order])
         return run(collect_flow, Parcel(order))
     return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

@@ -135,6 +135,29 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     assert verify(Store.open(store)) == []
 
 
+def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"] = [*range(0, 360, 2)]
+    data["analysis"]["split"] = {"method": "ranked"}
+    protocol, store = write(tmp_path / "p.yaml", data), tmp_path / "store"
+    trials = store / "campaigns" / "tiny" / "trials"
+    with collecting(protocol, store, tmp_path / "messages") as process:
+        wait_for(lambda: trials.is_dir() and any(trials.iterdir()), process)
+        assert asked("pause", store)["did"]["running"]
+        process.kill()
+        process.wait(timeout=60)
+    first = min(path.name for path in trials.iterdir())
+    opened = Store.open(store)
+    control.ask(opened, "again", campaign="tiny", trials=(first,), why="dust")  # and killed, too
+    collect = ("collect", protocol, "--rig", RIG, "--store", store, "--trials", 1)
+    assert sliplab(*collect).returncode == 1
+    assert asked("resume", store)["did"] == {"paused": False, "running": False}
+    assert not (trials / first).exists()
+    assert asked(*collect)["taken"] == 1
+    assert (trials / first).exists()
+    assert verify(opened) == []
+
+
 SLEEPER = "import sys; print('up', flush=True); sys.stdin.read()"
 HOLDER = """
 import json, sys
