@@ -29,6 +29,9 @@ _CHANCE = 1e-4
 """How often a straight clock is given more pieces than it needs."""
 _RUNS = (8, 16, 32)
 _DRAWS = 4096
+_SLOPES = 81
+_UNITS = 0.6
+"""How many units stamps may lie from a line that their unit explains: half of one, and jitter."""
 
 
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
@@ -112,6 +115,38 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         finer[0], finer[-1] = x[0], x[-1]
         values, knots = np.interp(finer, knots, values), finer
     return _judged(x, knots, values, residuals, inside, sigma, resolution, bend_per_ns, straight)
+
+
+def line_within_unit(x: Floats, y: Floats, resolution: float, drift: float) -> ClockLine | None:
+    """The straight line that is never further from a stamp than its unit explains.
+
+    Stamps cut to a unit in step with the ticks, such as 2 ms and 10 ms, stand still until the
+    clocks have drifted past a unit's edge, and then all move by one unit: in a short train a
+    regression takes that for a drift. Every stamp bounds the clock all the same.
+
+    Args:
+        drift: the most that the slope may be, either way.
+
+    Returns:
+        None if no slope that is allowed does it. Its uncertainty holds for every error within
+        the unit: half of it, and how far the stamps lie from the line.
+    """
+    slopes = np.linspace(-drift, drift, _SLOPES)
+    spans = np.array([np.ptp(y - slope * x) for slope in slopes])
+    near = np.flatnonzero(spans <= spans.min() + 1.0)
+    slope = float(slopes[near[near.size // 2]])
+    rest = y - slope * x
+    level, away = float(rest.max() + rest.min()) / 2, float(np.ptp(rest)) / 2
+    if away > _UNITS * resolution:
+        return None
+    knots = x[[0, -1]]
+    residuals = rest - level
+    sigma = max(float(np.sqrt((residuals**2).mean())), 0.5)
+    everything = np.ones(x.size, np.bool_)
+    uncertainty = 1.0 + resolution / 2 + away
+    return ClockLine(
+        knots, slope * knots + level, residuals, everything, sigma, uncertainty, 0.0, True
+    )
 
 
 def _robust(

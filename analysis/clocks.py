@@ -17,7 +17,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.clock_line import ClockLine, fit_line
+from analysis.clock_line import ClockLine, fit_line, line_within_unit
 from analysis.pulse_kernels import median
 from analysis.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
 from analysis.pulse_runs import stray_stretch
@@ -158,6 +158,8 @@ def fit_clock(
     _gate_share(x, y, match)
     px, py = x[match.device], y[match.reference]
     line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
+    if np.abs(line.slopes).max() > max_drift_ppm * 1e-6:
+        line = line_within_unit(px, py - px, resolution_ns, max_drift_ppm * 1e-6) or line
     _gate_line(line, jitter_ns, max_drift_ppm)
     predicted = _extended(line, x)
     inside = line.inside

@@ -60,7 +60,16 @@ def bin_recording(
     events = recording.events()
     starts_us = np.asarray(recording.clock("events").to_device(starts_ns)) // 1000
     width, height = recording.record["geometry"]["event_px"]
-    return bin_events(events.x, events.y, events.p, events.t_us, starts_us, windows, width, height)
+    return bin_events(
+        events.x, events.y, events.p, events.t_us, starts_us, windows, width, height,
+        crop_centre_px(recording),
+    )  # fmt: skip
+
+
+def crop_centre_px(recording: Recording) -> tuple[float, float] | None:
+    """Where the event camera saw the skin's centre, column and row; None where nobody looked."""
+    centre = recording.record["geometry"].get("event_centre_px")
+    return None if centre is None else (float(centre[0]), float(centre[1]))
 
 
 def recorded_span(recording: Recording) -> tuple[int, int]:

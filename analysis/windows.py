@@ -28,11 +28,12 @@ def bin_events(
     settings: Windows,
     width: int = 640,
     height: int = 480,
+    centre_px: tuple[float, float] | None = None,
 ) -> NDArray[np.uint8]:
     """Event counts of windows, by step, polarity and pooled cell.
 
     An event counts in the window [start, start + length), in step ``(t - start) // step``, in the
-    cell of ``pool`` x ``pool`` pixels of the centred square crop that holds its pixel.
+    cell of ``pool`` x ``pool`` pixels of the square crop that holds its pixel.
 
     Args:
         x, y: (k,) unsigned or signed integers, pixel column and row.
@@ -41,6 +42,8 @@ def bin_events(
         starts_us: (n,) int64, the windows' starts on the same clock, any order, may overlap.
         settings: window length, step, crop, pooling and polarity.
         width, height: the sensor's pixels.
+        centre_px: column and row of the crop's middle, as near as it can be without leaving the
+            sensor; the sensor's own middle by default.
 
     Returns:
         (n, steps, channels, cells, cells) uint8, rows before columns; a count over 255 stays 255.
@@ -53,7 +56,7 @@ def bin_events(
     """
     columns = _columns(x, y, p, t_us)
     starts = _times(starts_us, "starts_us")
-    of_x, of_y = _cells(settings, width, height)
+    of_x, of_y = _cells(settings, width, height, centre_px)
     shape = (starts.size, settings.steps, settings.channels, settings.cells, settings.cells)
     out = np.zeros(shape, np.uint8)
     state = _bin(
@@ -72,6 +75,7 @@ def window_totals(
     settings: Windows,
     width: int = 640,
     height: int = 480,
+    centre_px: tuple[float, float] | None = None,
 ) -> NDArray[np.int64]:
     """Events of each window that `bin_events` would count, without its limit of 255.
 
@@ -79,7 +83,7 @@ def window_totals(
     """
     columns = _columns(x, y, p, t_us)
     starts = _times(starts_us, "starts_us")
-    of_x, of_y = _cells(settings, width, height)
+    of_x, of_y = _cells(settings, width, height, centre_px)
     out = np.zeros(starts.size, np.int64)
     state = _total(
         *columns, starts, settings.length_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
@@ -130,20 +134,28 @@ def _times(values: NDArray[Any], name: str) -> NDArray[np.int64]:
     return np.ascontiguousarray(array, np.int64)
 
 
+def first_pixel(size: int, crop: int, centre: float | None) -> int:
+    """Where a crop of `crop` pixels begins along a side of `size` pixels."""
+    if centre is None:
+        return (size - crop) // 2
+    return min(max(round(centre - (crop - 1) / 2), 0), size - crop)
+
+
 def _cells(
-    settings: Windows, width: int, height: int
+    settings: Windows, width: int, height: int, centre_px: tuple[float, float] | None
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The cell column of each x and the cell row of each y; -1 outside the crop."""
     crop, pool = settings.crop_px, settings.pool_px
     if crop > width or crop > height:
         raise ValueError(f"crop_px = {crop}: larger than the sensor's {width} x {height} pixels")
 
-    def along(size: int) -> NDArray[np.int32]:
-        inside = np.arange(size) - (size - crop) // 2
+    def along(size: int, centre: float | None) -> NDArray[np.int32]:
+        inside = np.arange(size) - first_pixel(size, crop, centre)
         cells = np.where((inside >= 0) & (inside < crop), inside // pool, -1)
         return cells.astype(np.int32)
 
-    return along(width), along(height)
+    column, row = centre_px or (None, None)
+    return along(width, column), along(height, row)
 
 
 def _explain(state: int, columns: _Columns, width: int, height: int) -> None:

@@ -45,7 +45,7 @@ from storage.video import count_frames
 from storage.writer import DATA, FRAMES, SPOOL, TrialWriter
 
 RATE_HZ = 100
-EMULATED_HZ = 101
+EMULATED_HZ = 102
 PACKET_US = 10_000
 POLL_S = 0.01
 FREE_RUN = BaslerSettings(px_per_mm=20.0, trigger="free run", rate_hz=EMULATED_HZ)

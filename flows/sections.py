@@ -9,6 +9,7 @@ import numpy as np
 from analysis import dataset, figures
 from analysis.report import Figure, Number, Section, Table, number, percent
 from analysis.training import Fitted
+from analysis.windows import first_pixel
 from flows import clock_words, results
 from flows.campaigns import Collected
 from flows.label import STEP as LABELS
@@ -176,7 +177,8 @@ def _one_trial(
     events = recording.events()
     windows = item.settings.windows
     _, height = recording.record["geometry"]["event_px"]
-    top = (height - windows.crop_px) // 2
+    centre = dataset.crop_centre_px(recording)
+    top = first_pixel(height, windows.crop_px, None if centre is None else centre[1])
     cell = (events.y.astype(np.int64) - top) / windows.pool_px
     keep = (events.p > 0) & (cell >= 0) & (cell < windows.cells)
     to_line = recording.clock("events")

@@ -264,6 +264,8 @@ class Session:
                 "centre": 0,
             },
         }
+        if (centre := self.rig_file.calibration.centre_px) is not None:
+            record["geometry"]["event_centre_px"] = list(centre)
         if told := self.rig.describe():
             record["devices"] = told
         if run.truth is not None:

@@ -196,17 +196,19 @@ class KeyedError(ValueError):
 
 
 def _key(loc: tuple[int | str, ...]) -> str:
-    text = ""
+    text, before = "", ""
     for part in loc:
         if isinstance(part, int):
             text += f"[{part}]"
-        elif not (text.endswith("]") and part in _TAGS):
+        elif not (text.endswith("]") and part in _TAGS) and part not in _TAGS_OF.get(before, ()):
             text += f".{part}" if text else part
+        before = str(part)
     return text
 
 
 # pydantic puts the tag of a union into the location; a person does not write it there
 _TAGS: set[str] = set()
+_TAGS_OF: dict[str, tuple[str, ...]] = {}
 
 
 def register_tags(*names: str) -> None:
@@ -214,11 +216,19 @@ def register_tags(*names: str) -> None:
     _TAGS.update(names)
 
 
+def register_tags_of(key: str, *names: str) -> None:
+    """The same for a union that is no list: its tags stand behind its key."""
+    _TAGS_OF[key] = names
+
+
 def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     current: Any = model
+    before = ""
     for part in loc:
-        if isinstance(part, int) or part in _TAGS:
-            if part in _TAGS:
+        tag = part in _TAGS or part in _TAGS_OF.get(before, ())
+        before = str(part)
+        if isinstance(part, int) or tag:
+            if tag:
                 current = _tagged(current, str(part))
             continue
         field = getattr(current, "model_fields", {}).get(part)

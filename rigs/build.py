@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rigs.arms.settings import ArmSettings, PlaneSettings
 from rigs.capabilities import FrameCamera, Operator, Plate, Pose, RigError, Simulation
@@ -16,6 +16,13 @@ from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig
 from rigs.rig_file import RigFile
 from storage.streams import Sink
+
+if TYPE_CHECKING:
+    from rigs.wire.loopback import Loopback
+
+
+DRIVEN_TAIL_S = 0.3
+"""How long real drivers are read after the last pulse, s."""
 
 
 class _MockSimulation:
@@ -107,19 +114,32 @@ def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     """Real drivers; stand-ins in a process of their own show the simulated scene."""
-    from rigs.wire.live_basler import LiveBasler
     from rigs.wire.loopback import Loopback
 
     with ExitStack() as undo:
         stage = Loopback(file.scene, file.timing, devices.arm)
         undo.callback(stage.close)
-        exposure_ns = file.scene.frame_camera.exposure_us * 1000
-        camera = LiveBasler(stage, exposure_ns // 2, devices.frame_camera.sync_line or 1)
-        rig = _driven_rig(
-            file, stage.reached_by(devices), stage, stage, stage, camera, (stage.close,)
-        )
+        rig = loopback_rig(file, stage)
+        rig.ending = (stage.close,)
         undo.pop_all()
     return rig
+
+
+def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
+    """Real drivers on stand-ins that somebody else began, and ends.
+
+    Args:
+        file: of the kind `loopback`, with the arm and the scene that `stage` shows.
+
+    Raises:
+        RigError: a stand-in is not there.
+    """
+    from rigs.wire.live_basler import LiveBasler
+
+    assert file.devices is not None
+    exposure_ns = file.scene.frame_camera.exposure_us * 1000
+    camera = LiveBasler(stage, exposure_ns // 2, file.devices.frame_camera.sync_line or 1)
+    return _driven_rig(file, stage.reached_by(file.devices), stage, stage, stage, camera, ())
 
 
 def _driven_rig(
@@ -161,6 +181,7 @@ def _driven_rig(
             poll_s=float(file.poll),
             timing=file.timing,
             touch_mm=file.calibration.touch_depth,
+            tail_s=DRIVEN_TAIL_S,
             plate=plate,
             simulation=simulation,
             ending=ending,

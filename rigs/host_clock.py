@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 
 class HostClock:
     """A `rigs.capabilities.Clock`: the host's monotonic clock, by which drivers stamp arrivals."""
+
+    def __init__(self) -> None:
+        self._never = threading.Event()
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary origin."""
@@ -14,4 +18,4 @@ class HostClock:
 
     def wait(self, seconds: float) -> None:
         """Let `seconds` pass; a signal's handler runs at once."""
-        time.sleep(max(seconds, 0.0))
+        self._never.wait(max(seconds, 0.0))

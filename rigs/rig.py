@@ -34,7 +34,7 @@ from storage.streams import Json, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
-"""How long cameras are read after the last pulse: they send in blocks."""
+"""How long cameras are read after the last pulse, unless a rig says otherwise."""
 _MOVE_GRACE_S = 10.0
 
 
@@ -81,6 +81,8 @@ class Rig:
         timing: which signal reaches which device, and so what else has to be read.
         touch_mm: how deep the centre papilla is when touching off notices it.
         centre_px: where the event camera sees that papilla; by default in its picture's centre.
+        tail_s: how long cameras are read after the last pulse: they send in blocks, and a busy
+            host is late to read them.
         simulation: the world behind a simulated rig, None on a real one.
         ending: called last when the rig is closed.
     """
@@ -97,6 +99,7 @@ class Rig:
     timing: Timing = field(default_factory=Timing)
     touch_mm: float = 0.0
     centre_px: tuple[float, float] | None = None
+    tail_s: float = TAIL_S
     plate: Plate | None = None
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
@@ -318,14 +321,19 @@ class Rig:
             self.frames.start()
 
     def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
-        """Stop the pulses, and read what the cameras still hold before they stop."""
+        """Stop the pulses, and read what the cameras still hold before and after they stop.
+
+        Events that come later than `tail_s` after the motion tell nothing; a pulse or a frame does.
+        """
         if with_frames and self.timing.frames == "exposure line":
             self.frames.stop()
         self.sync.stop()
-        self.wait(TAIL_S, sink)
+        self.wait(self.tail_s, sink)
         self.events.stop()
+        sink.add_event_pulses(self.events.read_pulses())
         if with_frames:
             self.frames.stop()
+            sink.add_frames(self.frames.read())
 
     def _drain(self, sink: Sink) -> None:
         sink.add_events(self.events.read())
@@ -360,8 +368,8 @@ class Rig:
         """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
 
         A device that fails while it is stopped does not keep the others from being stopped. Then
-        what went wrong first is raised, unless it is the arm that could not be stopped or moved
-        clear and nobody would hear of it otherwise.
+        what went wrong first is raised; but an arm that could not be stopped or moved clear is
+        always told of.
         """
         try:
             yield
@@ -376,9 +384,11 @@ class Rig:
                 for device in (self.events, self.frames, self.sync):
                     with suppress(RigError):
                         device.stop()
-            if fault is not None and not (isinstance(error, RigError) and error.device == "arm"):
-                raise fault from error
-            raise
+            if fault is None or str(fault) == str(error):
+                raise
+            if isinstance(error, RigError) and error.device == "arm":
+                raise ArmFault("arm", f"{_text(error)}. It {_text(fault)}") from error
+            raise fault from error
 
     def _retract(self, clear: Position) -> None:
         """Straight out along the plate's normal, only with a healthy arm, bounded in time."""
@@ -399,8 +409,15 @@ class Rig:
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:
     """What happened, and what a person must do about it; nothing is unlocked from here."""
+    lost = state is ArmState.DISCONNECTED
+    where = "the arm may still move" if lost else "the arm stays where it is"
     return ArmFault(
         "arm",
-        f"{state.value} in the phase '{phase}'; the arm stays where it is: {state.advice}, move "
+        f"{state.value} in the phase '{phase}'; {where}: {state.advice}, move "
         "it clear of the plate, then run the same command to go on",
     )
+
+
+def _text(error: RigError) -> str:
+    """What it says, without the device's name."""
+    return str(error).removeprefix(f"{error.device}: ")

@@ -193,6 +193,9 @@ def _keep(path: Path, today: date) -> Path:
 
 def _yaml() -> YAML:
     yaml = YAML()
+    yaml.representer.add_representer(
+        type(None), lambda dumper, _: dumper.represent_scalar("tag:yaml.org,2002:null", "null")
+    )
     yaml.preserve_quotes = True
     yaml.width = _WIDEST
     yaml.indent(mapping=2, sequence=4, offset=2)

@@ -263,6 +263,17 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
         InputError: the first move that the rig may not make.
     """
     limits = rig.limits
+    most_us = 1e6 / 4 / plan.protocol.collection.recording.sync_rate
+    for name in ("event_camera", "frame_camera", "arm_controller"):
+        jitter_us = getattr(rig.timing, name).jitter_us
+        if jitter_us > most_us:
+            raise InputError(
+                file,
+                f"timing.{name}.jitter_us",
+                f"{jitter_us:g}",
+                f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
+                "pulses could not be told apart",
+            )
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")

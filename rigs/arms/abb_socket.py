@@ -140,7 +140,13 @@ class AbbSocketArm:
         return self._run.progress(self.state())
 
     def read_poses(self) -> PoseChunk:
-        """Poses since the last call: one a piece, on the host's clock."""
+        """Poses since the last call, on the host's clock: one a piece, and one now if it stands.
+
+        Takes at most `ANSWER_S`. Raises ArmFault: an arm that stands does not answer.
+        """
+        if self._run.done and self._lost is None:
+            with self._one:
+                self._watched(self._look)
         return self._stream.read()
 
     def read_pulses(self) -> PulseChunk:

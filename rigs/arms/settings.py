@@ -49,7 +49,9 @@ class Limits(StrictModel):
     def _makes_sense(self) -> Limits:
         for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
             if low >= high:
-                raise KeyedError("limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm")
+                raise KeyedError(
+                    "devices.arm.limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm"
+                )
         return self
 
 

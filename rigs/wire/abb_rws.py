@@ -31,6 +31,9 @@ ACCELERATION_MM_S2 = 500.0
 STOP_MM_S2 = 2000.0
 _ORIGIN = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 _TICK_S = 0.002
+LATE_S = 0.005
+"""A packet that would leave later than this is lost: a controller is never late, the network may
+lose."""
 _NO_AXIS = "9E+09"
 """What RAPID says of an external axis that is not there."""
 
@@ -181,7 +184,8 @@ class AbbStandIn:
             self._reach(Stage.IDLE)
         if self.running and not moving and t_s >= self._wait_until_s:
             self._next(t_s)
-        if self._streaming and not self._silent:
+        late = self.clock.now_s() - t_s > LATE_S * self.clock.rate
+        if self._streaming and not self._silent and not late:
             with contextlib.suppress(OSError):
                 self._udp.sendto(self._packet(t_s), self._egm)
 

@@ -43,7 +43,7 @@ class Scene(Protocol):
         """Frames of that size come from now on."""
 
     def stop_grabbing(self) -> None:
-        """No frame comes any more."""
+        """An empty chunk comes after the last frame."""
 
 
 class LiveBasler:
@@ -90,7 +90,7 @@ class LiveBasler:
 
     def GetNodeMap(self) -> Any:
         """The emulated camera's settings, and the chunks and lines that it does not have."""
-        return _NodeMap(self._device.GetNodeMap())
+        return _NodeMap(self._device.GetNodeMap(), self._end_frames)
 
     def IsCameraDeviceRemoved(self) -> bool:
         """Whether it was unplugged."""
@@ -111,14 +111,10 @@ class LiveBasler:
 
     def StopGrabbing(self) -> None:
         """Stop; frames that came before were given to pylon."""
-        if self._feeder is not None:
-            self._scene.stop_grabbing()
-            with self._came:
-                self._coming.append(None)
-                self._came.notify()
-            self._feeder.join(FEED_S)
-            self._feeder = None
-        self._device.StopGrabbing()
+        try:
+            self._end_frames()
+        finally:
+            self._device.StopGrabbing()
 
     def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
         """The next result of pylon's, with the scene's picture in it."""
@@ -142,6 +138,19 @@ class LiveBasler:
 
     # --------------------------------------------------------------------------------------
 
+    def _end_frames(self) -> None:
+        """No frame comes any more, and pylon has been given all that came: at most `FEED_S`."""
+        feeder, self._feeder = self._feeder, None
+        if feeder is None:
+            return
+        try:
+            self._scene.stop_grabbing()
+            feeder.join(FEED_S)
+        finally:
+            with self._came:  # a scene that is gone says nothing
+                self._coming.append(None)
+                self._came.notify()
+
     def _take(self, frames: FrameChunk) -> None:
         """In the thread that the scene's frames come by."""
         rows = zip(
@@ -152,7 +161,7 @@ class LiveBasler:
             strict=True,
         )
         with self._came:
-            self._coming.extend(rows)
+            self._coming.extend(rows if len(frames.number) else (None,))
             self._came.notify()
 
     def _feed(self) -> None:
@@ -244,12 +253,33 @@ class _Choice:
         return mode
 
 
-class _NodeMap:
-    """Settings of an emulated camera, with chunks and with lines to be triggered by."""
+class _Command:
+    """A command of the emulated camera, with something that is done first."""
 
-    def __init__(self, node_map: Any) -> None:
+    def __init__(self, node: Any, first: Callable[[], None]) -> None:
+        self._node, self._first = node, first
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._node, name)
+
+    def Execute(self) -> None:
+        """Do it."""
+        self._first()
+        self._node.Execute()
+
+
+class _NodeMap:
+    """Settings of an emulated camera, with chunks and with lines to be triggered by.
+
+    Args:
+        end_frames: called before the acquisition is stopped.
+    """
+
+    def __init__(self, node_map: Any, end_frames: Callable[[], None]) -> None:
         self._map = node_map
-        self._own = {
+        self._own: dict[str, Any] = {
+            # what was exposed by then is still to be taken by pylon
+            "AcquisitionStop": _Command(node_map.GetNode("AcquisitionStop"), end_frames),
             "ChunkModeActive": _Choice(),
             "ChunkSelector": _Choice(("Timestamp", "LineStatusAll")),
             "ChunkEnable": _Choice(),

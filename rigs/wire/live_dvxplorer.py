@@ -38,6 +38,10 @@ class LiveDvxplorer:
         """Send nothing from now on; the connections stay."""
         self._silent = True
 
+    def resume(self) -> None:
+        """Send again what comes from now on; what a stall kept back is lost."""
+        self._silent = False
+
     def close(self) -> None:
         """The cable is pulled: connections break. Any number of times."""
         self._events.close()

@@ -141,6 +141,20 @@ class Loopback:
         """Make something go wrong now; see `Theatre.happen`."""
         self._ask("happen", device, kind)
 
+    def restore(self, device: str) -> None:
+        """A person puts it right; see `Theatre.restore`. Drivers have to be built anew."""
+        self.sync_port, self.event_ports = self._ask("restore", device)
+
+    def arm_place(self) -> tuple[float, float, float]:
+        """Where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        place: tuple[float, float, float] = self._ask("arm_place")
+        return place
+
+    def at_rest(self) -> bool:
+        """Whether the arm truly stands still."""
+        rest: bool = self._ask("at_rest")
+        return rest
+
     def sent(self) -> Counter[str]:
         """What was sent since the trial began, by stream."""
         found: Counter[str] = self._ask("sent")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from rigs.arms.settings import ArmSettings, UrSettings
+from rigs.capabilities import Pose
 from rigs.wire.faults import Kind
 from rigs.wire.motion import StraightMotion
 
@@ -25,6 +26,12 @@ class StandingArm(Protocol):
 
     def restore(self) -> None:
         """A person has put everything right."""
+
+    def pose(self) -> Pose:
+        """Where its tool centre point is now."""
+
+    def moving(self) -> bool:
+        """Whether it is on its way now."""
 
     def close(self) -> None:
         """Give its ports back."""

@@ -66,6 +66,7 @@ class PtySyncBox:
 
     Attributes:
         port: name of the pty.
+        pulses: how many pulses (code bits 1) the train that runs, or the last one, has sent.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class PtySyncBox:
         self._ending = threading.Event()
         self._silent, self._corrupt, self._drop = False, 0, 0
         self._train: _Plan | None = None
-        self._sent = 0
+        self._sent = self.pulses = 0
         self._power_on()
         self._thread = threading.Thread(target=self._work, name="pty sync box", daemon=True)
         self._thread.start()
@@ -95,10 +96,11 @@ class PtySyncBox:
         self.close()
 
     def close(self) -> None:
-        """End the thread and the pty: to the host the board is unplugged."""
+        """End the thread and the pty: to the host the board is unplugged, and it ticks no more."""
         self._ending.set()
         self._thread.join(JOIN_S)
         with self._lock:
+            self._end()
             for handle in (self._master, self._slave):
                 if handle >= 0:
                     os.close(handle)
@@ -195,6 +197,7 @@ class PtySyncBox:
             bits = train.bits.upto(max(due, 0))
             for number in range(self._sent, due):
                 us = first_us + number * 1_000_000_000 // train.millihertz
+                self.pulses += int(bits[number])
                 if bits[number] or train.millihertz <= ALL_TO_HZ * 1000:
                     self._report(f"P {number} {bits[number]} {us}")
                 if self._exposure_us is not None:
@@ -244,6 +247,6 @@ class PtySyncBox:
             self._say("E code must be lfsr, irregular or regular")
         else:
             self._armed = _Plan(round(float(hz) * 1000), int(ticks), int(seed), CODES[code])
-            self._sent = self._exposed = self._dropped = self._told = 0
+            self._sent = self._exposed = self._dropped = self._told = self.pulses = 0
             self._stamps = []
             self._say("OK ARM")

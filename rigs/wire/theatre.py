@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,12 @@ PULSE_NS = 5_000_000
 """Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
 REST_S = 2.0
 """The longest that a trial's begin waits for the arm to be at rest."""
+CLEAR_MM = 5.0
+PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
+"""How far a person moves a stopped arm clear of the plate, and how fast."""
+_NONE = np.empty(0, np.int64)
+NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
+"""What is sent when no more frames come."""
 _BITS = 1 << 12
 
 
@@ -93,9 +100,6 @@ class Theatre:
         timing: which signals reach which device; frames by hardware trigger.
         arm: settings of the arm's driver: a stand-in of its kind listens where it will look.
         on_frames: is given the frames of each turn.
-
-    Attributes:
-        sent: what was sent since the trial began, by stream.
     """
 
     def __init__(
@@ -122,10 +126,11 @@ class Theatre:
         self._trains: deque[tuple[Train | None, int]] = deque()
         self._train: Train | None = None
         self._level = SyncLevel(self._box_clock)
-        self.sent: Counter[str] = Counter()
+        self._sent: Counter[str] = Counter()
         self._stamps_us: list[I64] = []
+        self._size = settings.event_camera.width, settings.event_camera.height
         self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
-        self.camera = LiveDvxplorer((settings.event_camera.width, settings.event_camera.height))
+        self.camera = LiveDvxplorer(self._size)
         self.arm: StandingArm = standing_arm(
             arm, self._path.motion, self._arm_now_s, self._arm_input
         )
@@ -166,8 +171,8 @@ class Theatre:
         chunk, pulses = self._events.read(), self._events.read_pulses()
         if len(chunk) or len(pulses.t_ns):
             self.camera.send(chunk, pulses)
-            self.sent["events"] += len(chunk)
-            self.sent["event_pulses"] += len(pulses.t_ns)
+            self._sent["events"] += len(chunk)
+            self._sent["event_pulses"] += len(pulses.t_ns)
             self._stamps_us.append(chunk.t_us)
         if self._grabbing:
             self._send_frames()
@@ -176,7 +181,7 @@ class Theatre:
         frames = self._frames.read()
         if len(frames.number):
             self._on_frames(frames)
-            self.sent["frames"] += len(frames.number)
+            self._sent["frames"] += len(frames.number)
 
     # -- the sync box ----------------------------------------------------------------------
 
@@ -211,7 +216,7 @@ class Theatre:
         self.world.begin_trial(seed)
         self._path.begin(self.world.past_ns)
         self._events.start()
-        self.sent.clear()
+        self._sent.clear()
         self._stamps_us.clear()
 
     def truth(self, reference_arm_ns: int) -> dict[str, Any]:
@@ -219,6 +224,10 @@ class Theatre:
         self.turn()
         true_ns = self._arm_clock.to_device(reference_arm_ns) - self.world.past_ns
         return truth_of(self.world, self._box.clock, true_ns)
+
+    def sent(self) -> Counter[str]:
+        """What was sent since the trial began, by stream; pulses of the box since its last ARM."""
+        return self._sent + Counter({"box_pulses": self.sync_box.pulses})
 
     def events_between(self, first_us: int, last_us: int) -> int:
         """How many events with stamps from the first to the last of these were sent, us."""
@@ -251,11 +260,23 @@ class Theatre:
         self._grabbing = True
 
     def stop_grabbing(self) -> None:
-        """The frame camera stops; what it exposed before was sent."""
+        """The frame camera stops; what it exposed before is sent, and an empty chunk."""
         if self._grabbing:
             self.turn()
             self._frames.stop()
             self._grabbing = False
+        self._on_frames(NO_FRAMES)
+
+    # -- what a person at the rig would see and do -----------------------------------------
+
+    def arm_place(self) -> tuple[float, float, float]:
+        """Where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        x, y, depth = self.world.plane.sensor(self.arm.pose())[:3]
+        return float(x), float(y), float(depth)
+
+    def at_rest(self) -> bool:
+        """Whether the arm truly stands still."""
+        return not self.arm.moving()
 
     def happen(self, device: str, kind: str) -> None:
         """Make something go wrong on the wire now.
@@ -269,7 +290,7 @@ class Theatre:
             RigError: no such fault.
         """
         known: dict[str, dict[str, Callable[[], None]]] = {
-            "arm": {found.value: lambda k=found: self.arm.happen(k) for found in Kind},  # type: ignore[misc]
+            "arm": {found.value: partial(self.arm.happen, found) for found in Kind},
             "sync_box": {
                 "reset": self.sync_box.reset,
                 "silence": self.sync_box.silence,
@@ -282,6 +303,34 @@ class Theatre:
         except KeyError:
             raise RigError(device, f"no stand-in can show '{kind}' of it") from None
         what()
+
+    def restore(self, device: str) -> tuple[str, tuple[int, int]]:
+        """A person puts right whatever is wrong with a device.
+
+        A stopped arm is unlocked and moved clear of the plate; the others are plugged in again.
+
+        Returns:
+            The sync box's port and the event camera's ports, which may be new ones.
+
+        Raises:
+            RigError: no such device.
+        """
+        if device == "arm":
+            self.arm.restore()
+            x, y, depth = self.arm_place()
+            if depth > -CLEAR_MM:
+                clear = self.world.plane.pose(x, y, -CLEAR_MM)
+                now_s = self._arm_now_s()
+                self._path.motion.move(clear, PENDANT_MM_S, PENDANT_MM_S2, now_s)
+        elif device == "sync_box":
+            self.sync_box.close()
+            self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+        elif device == "event_camera":
+            self.camera.close()
+            self.camera = LiveDvxplorer(self._size)
+        else:
+            raise RigError(device, "is no device of a stand-in")
+        return self.sync_box.port, self.camera.ports
 
 
 def _rehearse(settings: MockSettings, timing: Timing) -> None:

@@ -81,7 +81,7 @@ class UrStandIn:
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
         self._connections = Connections()
-        self._silent = False
+        self._silent = self._cut_off = False
         self._thread: LoopThread | None = None
 
     def __enter__(self) -> UrStandIn:
@@ -120,14 +120,14 @@ class UrStandIn:
         """Take connections again after the link was cut or went silent."""
         assert self._thread is not None
         self._thread.call(self._connections.cut)
-        self._silent = False
+        self._silent = self._cut_off = False
         self._thread.call(self._listen)
 
     def restore(self) -> None:
         """A person has put everything right: safety, remote control and link."""
         self.unlock()
         self.set_remote(True)
-        if self._silent:
+        if self._silent or self._cut_off:
             self.restore_link()
 
     def set_remote(self, on: bool) -> None:
@@ -158,6 +158,7 @@ class UrStandIn:
         if kind is Kind.SILENCE:
             self._silent = True
         else:
+            self._cut_off = True
             self._connections.cut()
 
     def _listen(self) -> None:

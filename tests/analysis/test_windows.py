@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from analysis.windows import bin_events, window_totals
+from analysis.windows import bin_events, first_pixel, window_totals
 from protocols.settings import Windows
 
 PAPER = Windows()
@@ -180,3 +180,22 @@ def test_bad_columns_are_named() -> None:
             bin_events(x, y, bad, t, start, PAPER)
     with pytest.raises(TypeError, match="x must"):
         bin_events(x.astype(float), y, p, t, start, PAPER)
+
+
+@pytest.mark.parametrize(
+    ("centre", "expected"),
+    [(None, 120), (319.5, 120), (329.5, 130), (0.0, 0), (639.0, 240), (319.4, 120)],
+)
+def test_a_crop_is_as_near_to_its_centre_as_the_sensor_allows(
+    centre: float | None, expected: int
+) -> None:
+    assert first_pixel(640, 400, centre) == expected
+
+
+def test_events_are_counted_about_the_centre_that_is_told() -> None:
+    columns = [np.array([v]) for v in (450, 250, 1, 0)]
+    start = np.array([0])
+    middle = bin_events(*columns, start, PAPER)
+    moved = bin_events(*columns, start, PAPER, centre_px=(339.5, 259.5))  # 20 px right and down
+    assert np.argwhere(middle[0, 0, 0]).tolist() == [[(250 - 40) // 20, (450 - 120) // 20]]
+    assert np.argwhere(moved[0, 0, 0]).tolist() == [[(250 - 60) // 20, (450 - 140) // 20]]

@@ -15,6 +15,7 @@ from rigs.build import build_rig
 from storage.recording import Recording
 from storage.store import Store
 from storage.verify import verify
+from storage.whole import write_sums
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, tiny_gravity, write
 
@@ -131,5 +132,6 @@ def test_a_trial_without_video_and_tracks_cannot_be_labelled(tmp_path: Path) -> 
 
     with h5py.File(data_file, "a") as file:
         del file["tracks"]
+    write_sums(recording.folder, ("data.h5", "record.json"))
     with pytest.raises(ValueError, match="has neither video nor tracks to label from"):
         label(Recording(recording.folder), data)

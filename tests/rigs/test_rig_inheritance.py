@@ -132,15 +132,13 @@ def test_what_cannot_be_extended_is_said(text: str, says: str, base: Path) -> No
 def test_shipped_rigs_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mock").mkdir()
-    for name in ("mock", "mock_noisy", "mock-noisy", "mock-weak", "rehearsal"):
+    for name in ("loopback", "mock", "mock_noisy", "mock-noisy", "mock-weak", "rehearsal"):
         assert rig_path(Path(name)) == shipped_rigs()[name.replace("-", "_")]
     assert rig_path(Path("mock.yaml")) == Path("mock.yaml")
     assert rig_path(Path("some/mock")) == Path("some/mock")
     (tmp_path / "mine").write_text(MOCK)
     assert load_rig_file(Path("mine"))[0].name == "mock"
-    with pytest.raises(
-        InputError, match=r"rehersal: .* ships: mock, mock_noisy, mock_weak, rehearsal"
-    ):
+    with pytest.raises(InputError, match=r"rehersal: .* ships: irb120, loopback, mock, mock_noisy"):
         rig_path(Path("rehersal"))
 
 
@@ -187,3 +185,23 @@ def test_what_was_read_keeps_every_file_apart(base: Path) -> None:
     assert found.blame("mock.seed").name == "child.yaml"
     assert found.blame("limits.depth").name == "mock.yaml"
     assert found.blame("nothing.like.it").name == "child.yaml"
+
+
+def test_a_device_with_another_driver_takes_the_place_of_the_one_below(tmp_path: Path) -> None:
+    arm = "{driver: abb, host: 10.0.0.2, limits: {low_mm: [-1, -1, -1], high_mm: [1, 1, 1]}}"
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: {shipped_rigs()['ur5']}\nname: mine\ndevices: {{arm: {arm}}}\n")
+    devices = load_rig_file(path)[0].devices
+    assert devices is not None
+    assert (devices.arm.driver, devices.arm.host) == ("abb", "10.0.0.2")
+    assert devices.frame_camera.trigger_line == "Line1"
+
+
+@pytest.mark.parametrize("name", ["ur5", "irb120"])
+def test_rig_files_to_copy_are_whole(name: str) -> None:
+    rig, _ = load_rig_file(Path(name))
+    assert not rig.simulated
+    assert not rig.has_plate
+    assert rig.frame_source == "video"
+    with pytest.raises(ValueError, match="is real"):
+        _ = rig.scene

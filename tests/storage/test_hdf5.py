@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import h5py
-import hdf5plugin  # noqa: F401  (registers the filters)
+import hdf5plugin
 import numpy as np
 import pytest
 from hypothesis import given
@@ -88,6 +88,56 @@ def test_times_near_two_to_the_62_stay_apart(tmp_path: Path) -> None:
     write(tmp_path / "t.h5", whole, 1)
     with StreamReader(tmp_path / "t.h5") as reader:
         assert np.array_equal(reader.events().t_us, whole.t_us)
+
+
+@pytest.mark.parametrize("before", [1, 70_000])
+def test_times_longer_than_32_bits_are_kept_in_64(before: int, tmp_path: Path) -> None:
+    first = events(before)
+    gap = 2**32 - int(first.t_us[-1] - first.t_us[0])
+    late = events(70_000, start_us=int(first.t_us[-1]) + gap - 500)
+    file = StreamFile(tmp_path / "t.h5")
+    for chunk in (first, late):
+        file.add_events(chunk)
+    file.finish()
+    wanted = np.concatenate([first.t_us, late.t_us])
+    assert wanted[-1] - wanted[0] > 2**32
+    with StreamReader(tmp_path / "t.h5") as reader:
+        assert np.array_equal(reader.event_times(), wanted)
+        assert np.array_equal(reader.events().t_us, wanted)
+        assert np.array_equal(reader.column("events/t"), wanted - wanted[0])
+        middle = (int(late.t_us[30_000]), int(late.t_us[60_000]))
+        window = reader.events(*middle)
+        assert np.array_equal(window.t_us, wanted[(wanted >= middle[0]) & (wanted < middle[1])])
+    with h5py.File(tmp_path / "t.h5") as opened:
+        assert opened["events/t"].dtype == np.int64
+        assert set(opened["events"]) == {"x", "y", "p", "t"}
+
+
+def test_a_file_of_format_1_reads_the_same(tmp_path: Path) -> None:
+    whole = events(70_000)
+    write(tmp_path / "2.h5", whole, 3)
+    (tmp_path / "1.h5").write_bytes((tmp_path / "2.h5").read_bytes())
+    zstd = hdf5plugin.Bitshuffle(nelems=1 << 16, cname="zstd", clevel=1)
+    with h5py.File(tmp_path / "1.h5", "r+") as old:
+        old.attrs["format"] = 1
+        for name, dtype in (("x", "uint16"), ("y", "uint16"), ("p", "uint8"), ("t", "int64")):
+            values = old[f"events/{name}"][:].astype(dtype)
+            del old[f"events/{name}"]
+            old.create_dataset(
+                f"events/{name}", data=values, chunks=(1 << 16,), maxshape=(None,), **zstd
+            )
+    start = int(whole.t_us[1000])
+    found = []
+    for name in ("1.h5", "2.h5"):
+        with StreamReader(tmp_path / name) as reader:
+            found.append((reader.events(), reader.events(start, start + 50_000)))
+    for one, two in zip(*found, strict=True):
+        assert len(one) == len(two) > 0
+        for column in ("x", "y", "p", "t_us"):
+            values = getattr(one, column), getattr(two, column)
+            assert np.array_equal(*values)
+            assert values[0].dtype == values[1].dtype
+    assert np.array_equal(found[0][0].t_us, whole.t_us)
 
 
 def test_small_columns_come_back_from_beyond_what_is_held(tmp_path: Path) -> None:

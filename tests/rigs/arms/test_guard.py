@@ -86,5 +86,5 @@ def test_numbers_that_are_none_are_refused() -> None:
 def test_limits_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValidationError):
         Limits(low_mm=(0, 0, 0), high_mm=(1, 0, 1))
-    with pytest.raises(ValidationError):
-        Limits(**BOX, depth_mm=2.0)
+    with pytest.raises(ValueError, match="need the taught plate"):
+        Guard(Limits(**BOX, depth_mm=2.0))

@@ -1,0 +1,106 @@
+"""What tests of a loopback rig share: a short trial, a rig file, sessions on its stand-ins."""
+
+from __future__ import annotations
+
+import copy
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flows.orders import Order, describe_campaign, make_order, pending_trials
+from flows.session import Session
+from rigs.build import loopback_rig
+from rigs.rig_file import RigFile
+from rigs.wire.loopback import Loopback
+from storage.store import Campaign, Store
+from tests.conftest import ROOT, SMALL
+from tests.flows.conftest import write
+from tests.rigs.loopback import own_address
+
+
+def quick(distance_mm: float = 7.0, speed_mm_s: float = 6.0, trials: int = 1) -> dict[str, Any]:
+    """Slides that are over in three or four seconds, pressing and letting go included."""
+    data = copy.deepcopy(SMALL)
+    data["name"] = "quick"
+    collection = data["collection"]
+    for factor, values in (("depth", [2.4]), ("speed", [speed_mm_s]), ("direction", [0, 180])):
+        collection["factors"][factor]["values"] = values[:trials]
+    collection["motion"] = [
+        {"phase": "approach", "clearance": "1 mm", "speed": "20 mm/s"},
+        {"phase": "press", "depth": "$depth", "speed": "6 mm/s"},
+        {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"},
+        {
+            "phase": "slide",
+            "distance": f"{distance_mm} mm",
+            "speed": "$speed",
+            "direction": "$direction",
+        },
+        {"phase": "release", "clearance": "1 mm", "speed": "10 mm/s"},
+        {"phase": "return", "speed": "20 mm/s"},
+    ]
+    collection["maintenance"] = {}
+    data["analysis"]["split"] = {"method": "ranked"}
+    return data
+
+
+def rig_yaml(folder: Path) -> Path:
+    """The shipped loopback rig with a stand-in arm at an address of its own, near the plate."""
+    data = {
+        "extends": str(ROOT / "rigs" / "loopback.yaml"),
+        "name": "loopback",
+        "devices": {"arm": {"host": own_address()}},
+        "mock": {"arm": {"start_xyz_mm": [397, 0, 300]}},
+    }
+    return write(folder / "rig.yaml", data)
+
+
+def order_in(folder: Path, data: dict[str, Any], rig: Path) -> Order:
+    """What a person orders: this protocol on that rig, into a store of the folder's own."""
+    folder.mkdir(exist_ok=True)
+    return make_order(write(folder / "p.yaml", data), rig, folder / "store")
+
+
+@contextmanager
+def stage_of(file: RigFile) -> Iterator[Loopback]:
+    """Stand-ins for a rig file, which outlive the rigs that are built on them."""
+    assert file.devices is not None
+    stage = Loopback(file.scene, file.timing, file.devices.arm)
+    try:
+        yield stage
+    finally:
+        stage.close()
+
+
+@contextmanager
+def at_work(
+    order: Order, stage: Loopback, file: RigFile | None = None
+) -> Iterator[tuple[Session, Campaign]]:
+    """One session, as the same command begins and ends it: drivers are built anew each time."""
+    campaign = describe_campaign(Store.create(order.store), order)
+    rig = loopback_rig(file or order.rig, stage)
+    try:
+        rig.connect()
+        yield Session(order.plan, file or order.rig, rig, campaign), campaign
+    finally:
+        rig.close()
+
+
+def take_all(work: Session) -> None:
+    """Take what is pending."""
+    work.take(pending_trials(work.plan, work.campaign))
+
+
+def free_udp_port() -> int:
+    """A UDP port that nobody has now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def with_values(path: Path, **values: Any) -> Path:
+    """A YAML file with other values at its top."""
+    return write(path, {**yaml.safe_load(path.read_text()), **values})

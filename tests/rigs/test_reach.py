@@ -1,0 +1,67 @@
+"""Whether devices can be reached is told by name, with what to look at."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rigs.devices import DeviceSettings
+from rigs.reach import reach
+from tests.rigs.loopback import own_address
+
+LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
+
+
+@pytest.fixture
+def listening() -> Iterator[tuple[str, int]]:
+    """An address where somebody takes connections."""
+    host = own_address()
+    with socket.create_server((host, 0)) as server:
+        yield host, server.getsockname()[1]
+
+
+def devices(**more: Any) -> DeviceSettings:
+    plain = {
+        "arm": {"driver": "abb_socket", "host": own_address(), "limits": LIMITS},
+        "frame_camera": {},
+        "sync_box": {"port": "/dev/nothing"},
+    }
+    return DeviceSettings.model_validate({**plain, **more})
+
+
+def test_what_is_not_there_is_named_with_what_to_look_at() -> None:
+    found = reach(devices())
+    assert set(found) == {"arm", "event camera", "frame camera", "sync box"}
+    assert "look at its power, its cable and the address" in (found["arm"] or "")
+    assert (
+        found["sync box"] == "there is no /dev/nothing; look at its cable, and at /dev/serial/by-id"
+    )
+    assert "was not found" in (found["event camera"] or "")
+
+
+def test_an_arm_and_a_stream_that_answer_are_reached(listening: tuple[str, int]) -> None:
+    host, port = listening
+    found = reach(
+        devices(
+            arm={"driver": "abb_socket", "host": host, "port": port, "limits": LIMITS},
+            event_camera={
+                "source": {"kind": "network", "host": host, "events_port": port, "triggers_port": 1}
+            },
+        )
+    )
+    assert found["arm"] is None
+    assert found["event camera"] is None
+
+
+def test_a_port_is_reached_and_a_rig_without_one_is_told() -> None:
+    master, slave = os.openpty()
+    try:
+        assert reach(devices(sync_box={"port": os.ttyname(slave)}))["sync box"] is None
+        assert reach(devices(sync_box=None))["sync box"] == "no port is named"
+    finally:
+        os.close(master)
+        os.close(slave)

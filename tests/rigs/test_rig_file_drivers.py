@@ -1,0 +1,132 @@
+"""Rig files of drivers and of stand-ins: each kind has its own sections, and says what lacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from protocols import InputError
+from rigs.build import _check_grade
+from rigs.cameras.stamps import Stamping
+from rigs.capabilities import RigError
+from rigs.rig_file import load_rig_file
+from rigs.rig_inheritance import read_rig
+from tests.conftest import ROOT
+from tests.rigs.test_rig_file import Change, _both, _set
+
+
+def loopback() -> dict[str, Any]:
+    """The shipped loopback rig with what it extends, as plain data."""
+    merged = read_rig(ROOT / "rigs" / "loopback.yaml").text
+    data: dict[str, Any] = yaml.safe_load(merged)
+    return data
+
+
+def _without(*path: str) -> Change:
+    def change(data: dict[str, Any]) -> None:
+        for part in path[:-1]:
+            data = data[part]
+        del data[path[-1]]
+
+    return change
+
+
+CASES: dict[str, tuple[Change, str, str]] = {
+    "devices on a mock": (_set("driver", to="mock"), "devices", "no meaning with driver: mock"),
+    "a scene on a real rig": (
+        _set("driver", to="devices"), "mock", "no meaning with driver: devices",
+    ),
+    "a loopback without a scene": (_without("mock"), "mock", "is needed by driver: loopback"),
+    "a loopback without drivers": (
+        _without("devices"), "devices", "is needed by driver: loopback",
+    ),
+    "a real rig without drivers": (
+        _both(_set("driver", to="devices"), _without("mock"), _without("devices")),
+        "devices", "is needed by driver: devices",
+    ),
+    "a real rig without a sync box": (
+        _both(_set("driver", to="devices"), _without("mock")),
+        "devices.sync_box.port", "name its serial port",
+    ),
+    "another exposure than the scene's": (
+        _set("devices", "frame_camera", "exposure_us", to=1000),
+        "devices.frame_camera.exposure_us", "must be 2000",
+    ),
+    "frames that no stand-in times so": (
+        _set("timing", "frames", to="exposure line"),
+        "timing.frames", "must be hardware trigger",
+    ),
+    "tracks in place of pictures": (
+        _set("mock", "frame_camera", "level", to="tracks"),
+        "mock.frame_camera.level", "must be video",
+    ),
+    "an arm that is none": (
+        _set("devices", "arm", "driver", to="kuka"), "devices.arm.driver", "one of ur, abb",
+    ),
+    "a setting of another make": (
+        _set("devices", "arm", "egm_port", to=6510), "devices.arm.egm_port", "known here: host",
+    ),
+    "an arm without limits": (
+        _without("devices", "arm", "limits"), "devices.arm.limits", "is missing",
+    ),
+    "limits the wrong way round": (
+        _set("devices", "arm", "limits", "low_mm", to=[-20, 30, -70]),
+        "devices.arm.limits.low_mm", "y is not below high_mm",
+    ),
+    "a line that no camera has": (
+        _set("devices", "frame_camera", "sync_line", to=9),
+        "devices.frame_camera.sync_line", "less than or equal to 8",
+    ),
+}  # fmt: skip
+
+
+def load(data: dict[str, Any], path: Path) -> Any:
+    path.write_text(yaml.safe_dump(data))
+    return load_rig_file(path)[0]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_message_names_key_and_cure(case: str, tmp_path: Path) -> None:
+    change, key, says = CASES[case]
+    data = loopback()
+    change(data)
+    with pytest.raises(InputError) as caught:
+        load(data, tmp_path / "rig.yaml")
+    assert caught.value.key.startswith(key)
+    assert says in caught.value.message
+
+
+def test_a_real_rig_is_not_simulated_and_a_loopback_is(tmp_path: Path) -> None:
+    stand_ins = load(loopback(), tmp_path / "a.yaml")
+    assert stand_ins.simulated
+    assert not stand_ins.in_virtual_time
+    data = loopback()
+    data["driver"] = "devices"
+    del data["mock"]
+    data["devices"]["sync_box"] = {"port": "/dev/serial/by-id/box"}
+    real = load(data, tmp_path / "b.yaml")
+    assert not real.simulated
+    assert not real.has_plate
+    data["devices"]["plate"] = {"mass_kg": 0.165}
+    assert load(data, tmp_path / "c.yaml").has_plate
+
+
+class _Camera:
+    """A frame camera of which only its stamps matter."""
+
+    def __init__(self, stamping: Stamping) -> None:
+        self.stamping = stamping
+
+
+def test_a_camera_whose_times_are_worse_than_promised_is_refused(tmp_path: Path) -> None:
+    file = load(loopback(), tmp_path / "rig.yaml")
+    fine: Any = _Camera(Stamping("chunk", "hardware trigger"))
+    _check_grade(file, fine)
+    poor: Any = _Camera(Stamping("host arrival", "host arrival"))
+    with pytest.raises(RigError, match=r"'host arrival'.*write timing.frames: host arrival"):
+        _check_grade(file, poor)
+    simulated: Any = object()
+    _check_grade(file, simulated)  # knows of no stamps
