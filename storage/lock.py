@@ -11,7 +11,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from storage.process import named, this_process
@@ -64,7 +64,8 @@ def exclusive(
         try:
             yield
         finally:
-            os.ftruncate(handle, 0)
+            with suppress(OSError):  # a disk may be gone; what went wrong before counts
+                os.ftruncate(handle, 0)
     finally:
         os.close(handle)  # frees the lock
 
@@ -95,7 +96,7 @@ def _acquire(handle: int, what: str) -> None:
         if holder and not holder.get("brief"):
             break
         waited.wait(_LOOK_S)
-    raise Locked(f"{what} is in use: {named(holder)}", holder)
+    raise Locked(f"{what} is in use by another program ({named(holder)})", holder)
 
 
 def _holder(handle: int) -> Json:

@@ -51,7 +51,10 @@ def order(folder: Path) -> Order:
 @pytest.mark.usefixtures("taken")
 def test_collect_is_refused(tmp_path: Path) -> None:
     with (
-        pytest.raises(Locked, match=r"the arm at .* is in use: pid .* for the store /data/other"),
+        pytest.raises(
+            Locked,
+            match=r"the arm at .* is in use .*pid .* for the store /data/other",
+        ),
         stretch(order(tmp_path)),
     ):
         pass
@@ -64,7 +67,7 @@ def test_collect_is_refused(tmp_path: Path) -> None:
 def test_check_says_so(tmp_path: Path) -> None:
     (found,) = check_devices(order(tmp_path))
     assert (found.name, found.passed) == ("rig", False)
-    assert "is in use: pid" in found.finding
+    assert "is in use by another program (pid" in found.finding
 
 
 @pytest.mark.usefixtures("taken")

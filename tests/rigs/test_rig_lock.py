@@ -70,8 +70,8 @@ def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) ->
         with pytest.raises(Locked) as refused, held(real()):
             pass
         for part in (
-            "the arm at 192.168.1.10 (rig ur5) is in use: ", f"pid {holder.pid} of ", "`sliplab",
-            "for the store /data/study, since 20",
+            "the arm at 192.168.1.10 (rig ur5) is in use by another program ",
+            f"(pid {holder.pid} of ", "`sliplab", "for the store /data/study, since 20",
         ):  # fmt: skip
             assert part in str(refused.value)
         holder.kill()

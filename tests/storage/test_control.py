@@ -80,7 +80,10 @@ def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Pat
             pass
         who = refused.value.holder
         assert who["pid"] == holder.pid
-        assert f"the rig is in use: pid {holder.pid} of {process.user_name()} on " in str(refused)
+        assert (
+            f"the rig is in use by another program (pid {holder.pid} of {process.user_name()} on "
+            in str(refused)
+        )
         assert "for the store somewhere, since 20" in str(refused.value)
         assert process.is_here(who)
         # another start with this number is another process, and gets no signal
