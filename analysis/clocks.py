@@ -158,8 +158,13 @@ def fit_clock(
     _gate_share(x, y, match)
     px, py = x[match.device], y[match.reference]
     line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
-    if np.abs(line.slopes).max() > max_drift_ppm * 1e-6:
-        line = line_within_unit(px, py - px, resolution_ns, max_drift_ppm * 1e-6) or line
+    # where a unit is all that the stamps show, it knows better than their scatter
+    steep = bool(np.abs(line.slopes).max() > max_drift_ppm * 1e-6)
+    unsure = line.uncertainty > resolution_ns and np.ptp(line.residuals) <= 2 * resolution_ns
+    if steep or unsure:
+        bounded = line_within_unit(px, py - px, resolution_ns, max_drift_ppm * 1e-6)
+        if bounded is not None and (steep or bounded.uncertainty < line.uncertainty):
+            line = bounded
     _gate_line(line, jitter_ns, max_drift_ppm)
     predicted = _extended(line, x)
     inside = line.inside

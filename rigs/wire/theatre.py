@@ -31,20 +31,18 @@ from rigs.mock.settings import MockSettings
 from rigs.mock.sync import MockSyncBox
 from rigs.mock.truth import truth_of
 from rigs.mock.world import World, start_pose
-from rigs.pulse_code import code_bits
 from rigs.wire.faults import Kind
 from rigs.wire.live_dvxplorer import LiveDvxplorer
 from rigs.wire.motion_path import MotionPath
 from rigs.wire.standing_arm import StandingArm, standing_arm
 from rigs.wire.sync_box import PtySyncBox, Train
+from rigs.wire.sync_level import SyncLevel
 from storage.clockmap import ClockMap
 from storage.streams import FrameChunk
 
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
 """How far the world is behind the host's clock: longer than a controller's cycle."""
-PULSE_NS = 5_000_000
-"""Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
 REST_S = 2.0
 """The longest that a trial's begin waits for the arm to be at rest."""
 CLEAR_MM = 5.0
@@ -53,43 +51,6 @@ PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
 _NONE = np.empty(0, np.int64)
 NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
 """What is sent when no more frames come."""
-_BITS = 1 << 12
-
-
-class SyncLevel:
-    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
-
-    Args:
-        box: true time of all trials to the box's clock, ns.
-    """
-
-    def __init__(self, box: ClockMap) -> None:
-        self._box = box
-        self._train: Train | None = None
-        self._bits = np.zeros(0, np.uint8)
-        self._ticks: int | None = None
-
-    def follow(self, train: Train | None, sent: int) -> None:
-        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
-        if train is None:
-            self._ticks = sent
-        else:
-            self._bits = np.zeros(0, np.uint8)
-            self._ticks, self._train = None, train
-
-    def high(self, total_ns: int) -> bool:
-        """Whether the line is high at a true time of all trials."""
-        train, ticks = self._train, self._ticks
-        if train is None:
-            return False
-        passed = self._box.to_reference(total_ns) - train.first_ns
-        period = 1e9 / train.rate_hz
-        tick = int(passed // period)
-        if tick < 0 or (ticks is not None and tick >= ticks):
-            return False
-        if tick >= len(self._bits):
-            self._bits = code_bits(train.seed, max(2 * tick, _BITS), train.code)
-        return bool(self._bits[tick]) and passed - tick * period < min(PULSE_NS, period / 2)
 
 
 class Theatre:

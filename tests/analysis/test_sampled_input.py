@@ -20,7 +20,7 @@ def sampled(phase_ns: int, ppm: float, seconds: float = 4.0) -> tuple[np.ndarray
 
 
 @pytest.mark.parametrize("ppm", [-150.0, -40.0, 5.0, 60.0, 190.0])
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.7, 0.95])
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98])
 def test_stamps_that_move_by_a_unit_are_no_drift(ppm: float, share: float) -> None:
     # the edge of a unit is passed at this share of the train
     phase_ns = -round(share * 4e9 * ppm * 1e-6)
@@ -31,7 +31,7 @@ def test_stamps_that_move_by_a_unit_are_no_drift(ppm: float, share: float) -> No
     )
     true = np.round(reference * (1 + ppm * 1e-6)).astype(np.int64) + phase_ns
     assert np.abs(fit.map.to_reference(true) - reference).max() <= fit.uncertainty_ns
-    assert fit.uncertainty_ns < 3e6  # the gate of a digital input
+    assert fit.uncertainty_ns < 2.5e6  # its gate is 3 ms
 
 
 def test_a_clock_that_really_drifts_too_much_is_refused() -> None:

@@ -32,7 +32,7 @@ from tests.rigs.loopback import until
 pytestmark = pytest.mark.realtime
 
 BUSY_S = 1.5
-SPEED_MM_S, LENGTH_MM, DEPTH_MM = 2.5, 8.0, 2.4
+SPEED_MM_S, LENGTH_MM, DEPTH_MM = 2.5, 7.0, 2.4
 PAST_MM = 0.5
 POLL_S = 0.1
 """Of the rig file: how often streams are read."""

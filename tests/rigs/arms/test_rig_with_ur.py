@@ -41,7 +41,9 @@ class HostClock:
 
 
 class Nothing:
-    """A camera or sync box that is only ever stopped."""
+    """A camera or sync box that is only ever connected and stopped."""
+
+    def connect(self) -> None: ...
 
     def stop(self) -> None: ...
 

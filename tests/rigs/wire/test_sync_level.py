@@ -12,7 +12,7 @@ from rigs.pulse_code import code_bits
 from rigs.sync_box import SerialSyncBox
 from rigs.sync_settings import SyncBoxSettings
 from rigs.wire.sync_box import PtySyncBox, Train
-from rigs.wire.theatre import PULSE_NS, SyncLevel
+from rigs.wire.sync_level import PULSE_NS, SyncLevel
 from storage.clockmap import ClockMap
 from tests.rigs.loopback import until
 
