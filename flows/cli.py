@@ -10,6 +10,7 @@ import typer
 
 from flows import console
 from flows.cli_calibrate import calibrate_app, teach_app
+from flows.cli_control import register as register_control
 from flows.cli_rigs import rigs
 from protocols.errors import InputError
 
@@ -23,6 +24,7 @@ app = typer.Typer(
 )
 
 app.command()(rigs)
+register_control(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
 
@@ -151,6 +153,11 @@ def collect(
     result = run(order)
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
+    if not as_json:
+        from flows.aside_view import show_aside
+
+        show_aside(result["causes"])
+        result = {key: value for key, value in result.items() if key != "causes"}
     _finish(result, f"collected into {store}", as_json)
     if result["missing"] > result["left_out"]:
         raise typer.Exit(console.FAILED)
@@ -258,12 +265,14 @@ def trials(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The catalogue of committed trials as a table."""
+    """The catalogue of committed trials as a table, and what was set aside, with causes."""
+    from flows.aside_view import all_aside, show_aside
     from storage.catalogue import catalogue, query
     from storage.store import Store
 
     unreadable: list[str] = []
     table = catalogue(Store.open(store), unreadable)
+    aside = all_aside(Store.open(store), unreadable)
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:
@@ -289,6 +298,7 @@ def trials(
             {
                 "count": len(table),
                 "trials": json.loads(table.to_json(orient="records")),
+                "set_aside": aside,
                 "unreadable": unreadable,
             }
         )
@@ -296,6 +306,7 @@ def trials(
         shown = [name for name in SHOWN if name in table.columns]
         rows = [list(row) for row in table[shown].itertuples(index=False)]
         console.print_table(f"trials of {store}", shown, rows, limit=40)
+        show_aside(aside)
         console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
 
 

@@ -9,9 +9,12 @@ import typer
 
 from flows import console
 from protocols.errors import InputError
+from rigs.capabilities import RigError
 from rigs.reach import reach
 from rigs.rig_file import RigFile, load_rig_file
 from rigs.rig_inheritance import shipped_rigs
+from rigs.rig_lock import held
+from storage.lock import Locked
 
 
 def rigs(
@@ -48,7 +51,7 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
         text = str(error)
         known = dict.fromkeys(COLUMNS, "")
         return {**known, "name": path.name, "answer": text, "wrong": True, "file": str(path)}
-    answers = reach(file.devices) if ask and file.driver == "devices" and file.devices else {}
+    answers = _ask(file) if ask and file.driver == "devices" else {}
     silent = {name: why for name, why in answers.items() if why is not None}
     return {
         "name": file.name,
@@ -61,6 +64,16 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
         "silent": silent,
         "file": str(path),
     }
+
+
+def _ask(file: RigFile) -> dict[str, str | None]:
+    """By device whether it answers; a rig that somebody uses is not disturbed."""
+    assert file.devices is not None
+    try:
+        with held(file):
+            return reach(file.devices)
+    except (Locked, RigError) as error:
+        return {"rig": str(error)}
 
 
 def _answer(file: RigFile, ask: bool, silent: dict[str, str]) -> str:

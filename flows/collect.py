@@ -12,12 +12,15 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows import console, stopping
+from flows.boundary import carry_out, refuse_paused
 from flows.orchestration import Parcel, run
 from flows.orders import Order, campaign_counts, check_disk, pending_trials
+from flows.remaining import Remaining
 from flows.session import Session
-from flows.stretch import refresh, stretch
+from flows.stretch import owned, refresh, stretch
 from flows.timing import timed
 from protocols import Trial
+from storage import control
 from storage.store import Store
 
 MOCK_BATCH = 25
@@ -37,13 +40,24 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
     with stretch(wanted) as work, timed(Store(wanted.store), f"collect {wanted.campaign}"):
         session, trials = work.session, work.trials
         simulated = "simulated " if wanted.rig.simulated else ""
-        with console.bar(f"collect {wanted.campaign} ({simulated}trials)", len(trials)) as bar:
-            session.on_trial = lambda trial, outcome: bar.advance(1, f"{trial.id} {outcome}")
+        left = Remaining(wanted.plan, trials, real_time=not wanted.rig.in_virtual_time)
+        title = f"collect {wanted.campaign} ({simulated}trials)"
+        with console.bar(title, len(trials), str(left)) as bar:
+
+            def told(trial: Trial, outcome: str) -> None:
+                left.done(trial)
+                bar.advance(1, f"{trial.id} {outcome}", str(left))
+
+            session.on_trial, work.boundary.on_pause = told, left.pause
             with stopping.signals():  # Prefect has handlers of its own inside a flow
                 session.rig.connect()
                 size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
-                for start in range(0, len(trials), size):
-                    take_trials(Parcel(session), Parcel(trials[start : start + size]))
+                while trials:
+                    for start in range(0, len(trials), size):
+                        take_trials(Parcel(session), Parcel(trials[start : start + size]))
+                    trials = work.boundary.more() if wanted.most is None else []
+                    bar.extend(len(trials))
+                    left.add(trials)
         return {
             **campaign_counts(wanted, session.campaign),
             "taken": session.taken,
@@ -53,8 +67,17 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
 
 
 def collect(order: Order) -> dict[str, Any]:
-    """Run the collection; returns at once when the store lacks nothing that can be taken."""
+    """Run the collection; returns at once when the store lacks nothing that can be taken.
+
+    Raises:
+        CampaignStopped: the store is paused, the disk has no room for the next trial, or
+            reference trials drifted apart.
+    """
     store = Store.create(order.store)
+    refuse_paused(store)
+    if control.open_requests(store):  # whoever asked was killed before it was done
+        with owned(store):
+            carry_out(store)
     if pending_trials(order.plan, store.campaign(order.campaign)):
         check_disk([order])
         return run(collect_flow, Parcel(order))

@@ -83,31 +83,44 @@ class Bar:
     def __init__(self, progress: Progress, task: Any) -> None:
         self._progress, self._task = progress, task
 
-    def advance(self, count: float = 1, note: str = "") -> None:
+    def advance(self, count: float = 1, note: str = "", left: str = "") -> None:
         """`count` more are done; a stop request is answered here.
+
+        Args:
+            left: the time that is left in words, for a bar that was told it would be.
 
         Raises:
             KeyboardInterrupt: somebody asked the program to stop.
         """
         stopping.check()
-        self._progress.update(self._task, advance=count, note=note)
+        self._progress.update(self._task, advance=count, note=note, left=left)
+
+    def extend(self, count: float) -> None:
+        """`count` more are to be done than it was thought."""
+        for task in self._progress.tasks:
+            if task.id == self._task:
+                self._progress.update(self._task, total=(task.total or 0) + count)
 
 
 @contextmanager
-def bar(title: str, total: float) -> Iterator[Bar]:
-    """A progress bar on standard error while the block runs."""
+def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
+    """A progress bar on standard error while the block runs.
+
+    Args:
+        left: the time that is left in words, where the caller knows better than a count would.
+    """
     progress = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        TimeRemainingColumn() if left is None else TextColumn("{task.fields[left]}"),
         TextColumn("{task.fields[note]}"),
         console=messages,
         transient=not messages.is_terminal,
     )
     with progress:
-        yield Bar(progress, progress.add_task(title, total=total, note=""))
+        yield Bar(progress, progress.add_task(title, total=total, note="", left=left or ""))
 
 
 def duration(seconds: float) -> str:

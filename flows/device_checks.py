@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rigs.capabilities import ArmFault, DeviceHealth, RigError
+from storage.lock import Locked
 
 if TYPE_CHECKING:
     from flows.orders import Order
@@ -28,6 +29,19 @@ class Check:
 
 def check_devices(order: Order) -> list[Check]:
     """Connect every device, hear what it says of itself, and fit the clocks; nothing moves."""
+    from rigs.rig_lock import held
+
+    try:
+        with held(order.rig, order.store):
+            return _check_held(order)
+    except Locked as error:
+        return [Check("rig", False, str(error))]
+    except RigError as error:
+        return [Check(error.device, False, _told(error))]
+
+
+def _check_held(order: Order) -> list[Check]:
+    """As `check_devices`, of a rig that nobody else uses meanwhile."""
     from rigs.build import build_rig
 
     found = _check_reach(order)

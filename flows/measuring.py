@@ -22,6 +22,7 @@ from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
 from rigs.rig_edit import writable_target, write_entries
 from rigs.rig_file import RigFile, load_rig_file
 from rigs.rig_inheritance import rig_path
+from rigs.rig_lock import held
 from rigs.teaching import APPROACH_MM_S
 
 WAY = (
@@ -110,18 +111,19 @@ class Measurement:
         if moves and not yes:
             _confirm()
         today = date.today()
-        rig = build.build_rig(self.file)
-        rig.should_stop = stopping.requested
-        try:
-            if with_arm:
-                rig.connect()
-            finding = measure(Bench(self.file, rig, today))
-        except StopRequested:
-            console.say("stopped: the arm stands still, nothing was written")
-            raise KeyboardInterrupt from None
-        finally:
-            with suppress(RigError):  # it would hide what went wrong before
-                rig.close()
+        with held(self.file):
+            rig = build.build_rig(self.file)
+            rig.should_stop = stopping.requested
+            try:
+                if with_arm:
+                    rig.connect()
+                finding = measure(Bench(self.file, rig, today))
+            except StopRequested:
+                console.say("stopped: the arm stands still, nothing was written")
+                raise KeyboardInterrupt from None
+            finally:
+                with suppress(RigError):  # it would hide what went wrong before
+                    rig.close()
         written = write_entries(
             self.path, target, finding.changes, today=today, remove=finding.remove,
             expected=self.text,

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flows.changes import told
 from flows.estimate import check_space, plan_bytes
 from protocols import InputError, Plan, Trial, load_plan
-from protocols.yaml_file import read_text
+from protocols.yaml_file import parse_yaml, read_text
 from rigs.levels import at_level, with_level
 from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from storage.store import Campaign, Store, StoreError
+from storage.decisions import skipped
+from storage.store import FORGIVEN, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -87,28 +89,83 @@ def _check_same(order: Order, campaign: Campaign) -> None:
         raise StoreError(
             f"{campaign.folder}: was begun under another `collection:` section; changing "
             "analysis, levels or repetitions is fine, anything else would mix two experiments. "
-            "Give the new one its own name with --campaign"
+            f"Give the new one its own name with --campaign.{_changed(order, campaign)}"
         )
     if info["rig_hash"] != rig_hash(order.rig_text) and not same_rig(
         read_text(campaign.folder / "rig.yaml", "rig file"), order.rig_text
     ):
         raise StoreError(
             f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
-            "give the new one its own name with --campaign"
+            f"give the new one its own name with --campaign.{_rig_changed(order, campaign)}"
         )
     if missing := campaign.committed() - {trial.id for trial in order.plan}:
         raise StoreError(
             f"{campaign.folder}: holds trials that the protocol no longer has, such as "
-            f"{min(missing)}; a protocol may only add trials to a campaign"
+            f"{min(missing)}; a protocol may only add trials to a campaign."
+            f"{_changed(order, campaign)}"
         )
+
+
+def _changed(order: Order, campaign: Campaign) -> str:
+    """What differs from the campaign's own copy of its protocol, if that can be read."""
+    try:
+        begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()))
+    except InputError:
+        return ""
+    old, new = begun.collection_data, order.plan.collection_data
+    for data, enabled in ((old, begun.enabled), (new, order.plan.enabled)):
+        for name, factor in data["factors"].items():  # however they were written
+            for key in ("values", "range", "optional"):
+                factor.pop(key)
+            factor["levels"] = [str(level) for level in enabled[name]]
+    changes = told(old, new, "collection")
+    return f" What changed:{changes}" if changes else ""
+
+
+def _rig_changed(order: Order, campaign: Campaign) -> str:
+    """What differs from the campaign's own copy of its rig file."""
+    old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
+    changes = told(old, parse_yaml(order.rig_text, "rig file"))
+    return f" What changed:{changes}" if changes else ""
 
 
 def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
     """Trials that are neither committed nor set aside, in the plan's order."""
-    done = campaign.committed()
+    done = campaign.committed() | skipped(campaign).keys()
     failed = campaign.failed_attempts()
     retakes = plan.protocol.collection.gates.retakes
     return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
+
+
+def set_aside(plan: Plan, campaign: Campaign) -> list[dict[str, Any]]:
+    """Trials of the plan that no collection takes, in its order, each with its cause.
+
+    By JSON names: ``trial``, ``cause``, ``attempts`` that failed, ``by`` (a person, or None for
+    the gates), ``when``.
+    """
+    done, by_person, failed = campaign.committed(), skipped(campaign), campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    causes: dict[str, list[str]] = {}
+    for item in campaign.quarantined():
+        if str(item["cause"]).startswith("gate") and FORGIVEN not in item:
+            causes.setdefault(item["trial"], []).append(str(item["cause"]))
+    found = []
+    for trial in plan:
+        if trial.id in done:
+            continue
+        attempts, known = failed.get(trial.id, 0), by_person.get(trial.id)
+        if known is not None:
+            cause = known.get("why") or "no reason given"
+        elif attempts > retakes:
+            cause = "; then ".join(dict.fromkeys(causes[trial.id]))
+        else:
+            continue
+        person = known or {}
+        found.append(
+            {"trial": trial.id, "cause": cause, "attempts": attempts,
+             "by": person.get("who"), "when": person.get("when")}
+        )  # fmt: skip
+    return found
 
 
 def describe_campaign(store: Store, order: Order) -> Campaign:
@@ -149,13 +206,14 @@ def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:
     """What a campaign holds now: planned = committed + missing."""
     planned = {trial.id for trial in order.plan}
     committed = campaign.committed() & planned
-    pending = {trial.id for trial in pending_trials(order.plan, campaign)}
+    aside = set_aside(order.plan, campaign)
     return {
         "campaign": campaign.name,
         "planned": len(planned),
         "committed": len(committed),
         "quarantined": len(campaign.quarantined()),
-        "set_aside": sorted(planned - committed - pending),
+        "set_aside": sorted(item["trial"] for item in aside),
+        "causes": aside,
         "missing": len(planned) - len(committed),
         "simulated": order.rig.simulated,
     }

@@ -16,6 +16,8 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 
+from flows import stopping
+from flows.boundary import Boundary
 from flows.quality import Assessment, assess
 from protocols import Plan, Task, Trial
 from protocols.hashing import hash_integer
@@ -36,7 +38,8 @@ class Session:
     """Takes the trials of one plan on one rig into one campaign.
 
     Attributes:
-        on_trial: called after each trial with it and ``committed`` or ``set aside``.
+        on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
+        boundary: asked before each attempt, and told of each trial, if there is one.
     """
 
     plan: Plan
@@ -45,6 +48,7 @@ class Session:
     campaign: Campaign
     operator: str = ""
     on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
+    boundary: Boundary | None = None
     taken: int = 0
     retaken: int = 0
     _before: Trial | None = None
@@ -57,24 +61,50 @@ class Session:
         Raises:
             RigError: a device failed, or a person did not do what was asked.
             StoreError: the store's disk is full, read-only or failing.
+            CampaignStopped: something that is watched between trials ended the campaign.
+            KeyboardInterrupt: somebody asked to stop.
         """
         for trial in trials:
-            self._prepare(trial)
             with disk_explained(self.campaign.folder, RigError):
+                if not self._may_take(trial):
+                    continue
+                self._prepare(trial)
                 self._take(trial)
             self._before = trial
 
+    def fresh_start(self) -> None:
+        """Somebody may have been at the rig: look at plate, skin and depth zero anew."""
+        self._before, self._warm, self._zero_slot = None, False, None
+
+    def _may_take(self, trial: Trial) -> bool:
+        if self.boundary is None or self.boundary.may_take(trial):
+            return True
+        self.on_trial(trial, "skipped")
+        return False
+
+    def _over(self, trial: Trial, outcome: str) -> None:
+        self.on_trial(trial, outcome)
+        if self.boundary is not None:
+            self.boundary.after(trial, outcome)
+
     def _prepare(self, trial: Trial) -> None:
         """What the protocol wants before this trial, given what this session did already."""
+        self._change_over(trial)
+        for task in self.plan.tasks_before(trial):
+            if task.kind == "clean":
+                self._ask(task)
+        self._warm_and_zero(trial)
+
+    def _change_over(self, trial: Trial) -> None:
         for task in self.plan.changeovers(self._before, trial):
             if not self._mounted(trial):
                 self._ask(task)
                 if not self._mounted(trial):
                     raise RigError("plate", f"{task.prompt}: the rig finds another mass mounted")
+
+    def _warm_and_zero(self, trial: Trial) -> None:
+        """Warm the skin up and find depth zero, as far as that was not done yet."""
         upkeep = self.plan.protocol.collection.maintenance
-        for task in self.plan.tasks_before(trial):
-            if task.kind == "clean":
-                self._ask(task)
         if upkeep.warm_up is not None and not self._warm:
             warm_up = upkeep.warm_up
             self.rig.press(
@@ -104,7 +134,8 @@ class Session:
         """Take one trial until it passes its gates or its retakes are used up."""
         collection = self.plan.protocol.collection
         frame_px = self.rig_file.frame_px(self.plan)
-        attempt = self.campaign.failed_attempts().get(trial.id, 0)
+        attempt = self.campaign.attempts().get(trial.id, 0)
+        failed = self.campaign.failed_attempts().get(trial.id, 0)
         while True:
             writer = self.campaign.begin(
                 trial.id,
@@ -141,13 +172,18 @@ class Session:
                 except (OSError, RuntimeError) as error:
                     self._abandon(writer, error)
                     raise
-                self.on_trial(trial, "committed")
+                self._over(trial, "committed")
                 return
             self._reject(trial, attempt, writer, found, provenance, run, frame_px)
             attempt += 1
-            if attempt > collection.gates.retakes:
-                self.on_trial(trial, "set aside")
+            failed += 1
+            if failed > collection.gates.retakes:
+                self._over(trial, "set aside")
                 return
+            if not self._may_take(trial):
+                return
+            self._change_over(trial)  # only after a pause is there anything to do
+            self._warm_and_zero(trial)
             self.retaken += 1
 
     def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
@@ -261,6 +297,7 @@ def _installed() -> Json:
 
 def _cause(error: BaseException) -> str:
     """Why a trial ended early, for its quarantine."""
-    if isinstance(error, (KeyboardInterrupt, StopRequested)):
+    # compiled code that a signal interrupts raises an error of its own
+    if isinstance(error, (KeyboardInterrupt, StopRequested)) or stopping.requested():
         return "stopped by a person"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -42,6 +42,28 @@ def check() -> None:
         raise KeyboardInterrupt
 
 
+def stop() -> None:
+    """Stop as on a signal: somebody asked for it in another way.
+
+    Raises:
+        KeyboardInterrupt: always.
+    """
+    _requested.set()
+    raise KeyboardInterrupt
+
+
+def wait(seconds: float) -> None:
+    """Let time pass; a stop request is answered here.
+
+    Raises:
+        KeyboardInterrupt: somebody asked the program to stop.
+    """
+    check()
+    # on an event of its own: a handler that sets the one that is waited on could wait for itself
+    threading.Event().wait(seconds)
+    check()
+
+
 @contextmanager
 def signals() -> Iterator[None]:
     """Answer SIGINT and SIGTERM while the block runs; only the main thread can, others pass."""

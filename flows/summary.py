@@ -96,11 +96,12 @@ def _sync(campaigns: list[Collected]) -> dict[str, Any]:
 
 
 def _quality(campaigns: list[Collected]) -> dict[str, Any]:
+    aside = [known for item in campaigns for known in item.campaign.quarantined()]
     return {
         "planned": sum(len(item.plan) for item in campaigns),
         "committed": sum(len(item.trials) for item in campaigns),
-        "retaken": sum(sum(item.campaign.failed_attempts().values()) for item in campaigns),
-        "quarantined": sum(len(item.campaign.quarantined()) for item in campaigns),
+        "retaken": sum(str(known["cause"]).startswith("gate") for known in aside),
+        "quarantined": len(aside),
     }
 
 

@@ -12,6 +12,7 @@ from protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
     PositiveMillimetres,
+    PositivePercent,
     PositiveSeconds,
     PositiveSpeed,
 )
@@ -72,6 +73,13 @@ class Limits(StrictModel):
     duration: PositiveSeconds
 
 
+class ReferenceGate(StrictModel):
+    """How far reference trials may drift from the campaign's first one before it stops."""
+
+    event_rate: PositivePercent
+    """Of the events a second while the arm holds still in contact."""
+
+
 class Gates(StrictModel):
     """When a trial is not good enough and is taken again."""
 
@@ -86,6 +94,8 @@ class Gates(StrictModel):
     """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """How often a trial is taken again before it is set aside."""
+    reference: ReferenceGate | None = None
+    """Left out, reference trials are taken and not compared while collecting."""
 
 
 class References(StrictModel):

@@ -70,6 +70,12 @@ class Collection(StrictModel):
 
     def _check_references(self) -> None:
         if self.references is None:
+            if self.gates.reference is not None:
+                raise KeyedError(
+                    "collection.gates.reference",
+                    None,
+                    "compares reference trials, and the protocol has none: add references",
+                )
             return
         given = self.references.condition
         for name, factor in self.factors.items():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from protocols.errors import InputError
 from protocols.factors import Level
@@ -165,13 +165,21 @@ class Plan:
 
         Levels, repetitions and reference trials only add trials; the ids say which.
         """
-        data = self.protocol.collection.model_dump(mode="json", by_alias=True)
+        data = self.collection_data
         for factor in data["factors"].values():
             for key in ("values", "range", "optional"):
                 factor.pop(key)
         for key in ("repetitions", "references"):
             data.pop(key)
         return hash_data(data)
+
+    @property
+    def collection_data(self) -> dict[str, Any]:
+        """The `collection:` section as JSON data, defaults written out."""
+        data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
+        if data["gates"]["reference"] is None:  # hashes of protocols from before it came stay
+            data["gates"].pop("reference")
+        return data
 
     @cached_property
     def analysis_hash(self) -> str:

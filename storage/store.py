@@ -6,6 +6,8 @@
     STORE/campaigns/NAME/incoming/ID/    the trial being written
     STORE/campaigns/NAME/quarantine/     what did not become a trial, each with its cause
     STORE/campaigns/NAME/bench/          who stood at the rig, one file a stretch of work
+    STORE/campaigns/NAME/skipped.json    trials that a person set aside (`storage.decisions`)
+    STORE/control/                       what people asked for meanwhile (`storage.control`)
     STORE/derived/ models/ report/       what analysis made of it; may be deleted at any time
     STORE/before/                        copies of what a migration changed
 
@@ -18,7 +20,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +48,8 @@ SYNC = "sync"
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
+AGAIN, FORGIVEN = "again", "forgiven"
+"""A committed trial that a person wants anew; a failed attempt that counts no longer."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
@@ -185,10 +189,10 @@ class Campaign:
             sweep_temporary(path)
         return len(left)
 
-    def quarantine(self, folder: Path, cause: str) -> Path:
+    def quarantine(self, folder: Path, cause: str, **more: object) -> Path:
         """Move a folder that is no trial, or no longer, out of the way, with its cause."""
         sweep_temporary(folder)
-        write_json(folder / CAUSE, {"cause": cause, "trial": folder.name})
+        write_json(folder / CAUSE, {"cause": cause, "trial": folder.name, **more})
         target = self.quarantine_path(folder.name)
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -215,10 +219,19 @@ class Campaign:
         return causes
 
     def failed_attempts(self) -> dict[str, int]:
-        """How often each trial was taken and failed a gate."""
+        """How often each trial was taken and failed a gate, since it was last asked for again."""
+        return self._count(
+            lambda item: str(item["cause"]).startswith("gate") and FORGIVEN not in item
+        )
+
+    def attempts(self) -> dict[str, int]:
+        """How often each trial was taken to its end and not kept: each take has its own seed."""
+        return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
+
+    def _count(self, wanted: Callable[[Json], bool]) -> dict[str, int]:
         counts: dict[str, int] = {}
         for item in self.quarantined():
-            if str(item["cause"]).startswith("gate"):
+            if wanted(item):
                 counts[item["trial"]] = counts.get(item["trial"], 0) + 1
         return counts
 

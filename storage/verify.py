@@ -54,7 +54,7 @@ def verify(store: Store, on_trial: Callable[[str], None] | None = None) -> list[
     """
     problems = _temporary(store.folder, "")
     derived = store.folder / "derived"
-    for folder in (derived, store.folder / "models", store.folder / "report"):
+    for folder in (derived, *(store.folder / name for name in ("models", "report", "control"))):
         problems += _temporary(folder, "")
     folder = store.folder / "campaigns"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,9 @@ from hypothesis import settings
 ROOT = Path(__file__).parents[1]
 settings.register_profile("sliplab", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("sliplab")
+
+# tests that run at the same time have stand-ins of their own, at the same addresses
+os.environ["SLIPLAB_RUNTIME"] = tempfile.mkdtemp(prefix="sliplab-rigs-")
 
 SMALL: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot.yaml").read_text())
 

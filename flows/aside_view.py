@@ -1,0 +1,44 @@
+"""Trials that no collection takes, with their causes, for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flows import console
+from flows.campaigns import Collected
+from flows.orders import set_aside
+from protocols import InputError
+from storage.store import Store, StoreError
+
+
+def all_aside(store: Store, unreadable: list[str]) -> list[dict[str, Any]]:
+    """What was set aside in every campaign, as `flows.orders.set_aside`, with its campaign.
+
+    Args:
+        unreadable: gets a line for every campaign that cannot be read.
+    """
+    found = []
+    for campaign in store.campaigns():
+        try:
+            aside = set_aside(Collected(campaign).plan, campaign)
+        except (InputError, StoreError) as error:
+            unreadable.append(f"campaign {campaign.name}: {error}")
+            continue
+        found += [{"campaign": campaign.name, **item} for item in aside]
+    return found
+
+
+def show_aside(aside: list[dict[str, Any]]) -> None:
+    """A table of trials that were set aside; nothing when there are none."""
+    if not aside:
+        return
+    rows = [
+        [item["trial"], item["by"] or f"gates, {item['attempts']} attempts", item["cause"]]
+        for item in aside
+    ]
+    console.print_table(
+        f"{len(rows)} trials set aside (`sliplab again` takes them)",
+        ["trial", "by", "cause"],
+        rows,
+        limit=40,
+    )

@@ -1,0 +1,46 @@
+"""What differs between two versions of a protocol or a rig file, for people: key, old, new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+MOST = 12
+_MISSING = object()
+
+
+def differences(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Key, old and new value of everything that differs, in the order of the keys."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*old, *(name for name in new if name not in old)]:
+            inner = f"{key}.{name}" if key else str(name)
+            yield from differences(old.get(name, _MISSING), new.get(name, _MISSING), inner)
+    elif isinstance(old, list) and isinstance(new, list) and _of_mappings(old, new):
+        for index in range(max(len(old), len(new))):
+            before, after = (part[index] if index < len(part) else _MISSING for part in (old, new))
+            yield from differences(before, after, f"{key}[{index}]")
+    elif old != new:
+        yield key, _text(old), _text(new)
+
+
+def told(old: Any, new: Any, key: str = "") -> str:
+    """The differences, one a line and indented, at most `MOST` of them; empty if there are none."""
+    found = list(differences(old, new, key))
+    lines = [f"\n  {name}: {before} -> {after}" for name, before, after in found[:MOST]]
+    if len(found) > MOST:
+        lines.append(f"\n  and {len(found) - MOST} more")
+    return "".join(lines)
+
+
+def _of_mappings(*lists: list[Any]) -> bool:
+    return any(isinstance(item, dict) for part in lists for item in part)
+
+
+def _text(value: Any) -> str:
+    if value is _MISSING or value is None:
+        return "not there"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name}: {_text(item)}" for name, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_text, value)) + "]"
+    return str(value)

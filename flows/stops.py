@@ -1,0 +1,7 @@
+"""Why a campaign ends before its time without anything being broken."""
+
+from __future__ import annotations
+
+
+class CampaignStopped(RuntimeError):
+    """A campaign ended between two trials; the message says why, and how it goes on."""

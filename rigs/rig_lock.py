@@ -1,0 +1,83 @@
+"""One program at a time at a real rig: an OS lock for its arm, and one for its sync box.
+
+The locks are the machine's, whoever runs the program and from whatever session: two programs that
+drive one arm are dangerous whoever their users are. So they stand in one folder for everybody and
+not in each user's own. They die with their holder. Two machines that reach one arm are not kept
+apart by this; the arm's own controller must.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rigs.capabilities import RigError
+from rigs.rig_file import RigFile
+from storage.lock import exclusive
+
+ENVIRONMENT = "SLIPLAB_RUNTIME"
+_FOLDER = Path("/tmp/sliplab-rigs")
+
+
+def lock_names(file: RigFile) -> dict[str, str]:
+    """What is locked, by the name of its lock file; nothing on simulated rigs.
+
+    Each simulated rig has devices, or stand-ins, of its own.
+    """
+    if file.simulated or file.devices is None:
+        return {}
+    host = file.devices.arm.host.lower()
+    found = {f"arm-{_plain(host)}.lock": f"the arm at {host} (rig {file.name})"}
+    if file.devices.sync_box is not None:
+        port = os.path.realpath(file.devices.sync_box.port)  # by-id links and plain names are one
+        found[f"sync-{_plain(port)}.lock"] = f"the sync box at {port} (rig {file.name})"
+    return found
+
+
+@contextmanager
+def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
+    """Hold a rig for this program while the block runs.
+
+    Args:
+        store: where its data go, to be told to whoever is refused.
+
+    Raises:
+        Locked: another program has it; the message says which, whose and since when.
+        RigError: the lock files cannot be made.
+    """
+    names = lock_names(file)
+    with ExitStack() as locks:
+        if names:
+            about = {} if store is None else {"store": str(store.absolute())}
+            try:
+                folder = _folder(locks)
+                for name, what in names.items():
+                    locks.enter_context(exclusive(folder / name, what, mode=0o666, about=about))
+            except OSError as error:
+                raise RigError(
+                    "rig",
+                    f"cannot be locked against other programs: {error}; name a folder that all "
+                    f"who use it may write to in {ENVIRONMENT}",
+                ) from None
+        yield
+
+
+def _folder(locks: ExitStack) -> Path:
+    folder = Path(os.environ.get(ENVIRONMENT) or _FOLDER)
+    try:
+        folder.mkdir()
+        folder.chmod(0o1777)
+    except FileExistsError:
+        pass
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    locks.callback(os.close, handle)
+    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from tidying it up
+    return folder
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9.]+", "-", name).strip("-")

@@ -1,0 +1,109 @@
+"""Which process is which: numbers are used again, so a process is its number and its start."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import signal
+import socket
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+from storage.streams import Json
+
+_COMMAND_CHARACTERS = 300
+_STARTED = 19
+"""Field of /proc/PID/stat after the name: when it started, ticks since the machine did."""
+
+
+def this_process() -> Json:
+    """Who runs here: ``pid``, ``host``, ``user``, ``command``, ``since``, ``boot``, ``ticks``."""
+    return {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "user": user_name(),
+        "command": f"sliplab {' '.join(sys.argv[1:])}"[:_COMMAND_CHARACTERS].strip(),
+        "since": now(),
+        "boot": _boot(),
+        "ticks": started_ticks(os.getpid()),
+    }
+
+
+def now() -> str:
+    """This moment in UTC, to a second, as ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def user_name() -> str:
+    """Who is logged in, or the number of a user without a name."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return f"user {os.getuid()}"
+
+
+def started_ticks(pid: int) -> int | None:
+    """When a process began, in ticks since the machine did; None if it is gone or not ours to see.
+
+    A process that ended and was not waited for yet counts as gone.
+    """
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if fields[0] in {"Z", "X"} else int(fields[_STARTED])
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def is_here(who: Json) -> bool:
+    """Whether the process that `this_process` described runs on this machine, now."""
+    pid = who.get("pid")
+    if not isinstance(pid, int) or who.get("boot") != _boot() or who.get("ticks") is None:
+        return False
+    return bool(started_ticks(pid) == who["ticks"])
+
+
+def send(who: Json, number: signal.Signals) -> bool:
+    """Send a signal to the process that `this_process` described, and to no other.
+
+    Returns:
+        False if it does not run on this machine any more, or belongs to somebody else.
+    """
+    if not isinstance(who.get("pid"), int) or not hasattr(os, "pidfd_open"):
+        return False
+    try:
+        handle = os.pidfd_open(who["pid"])  # from here on its number cannot pass to another
+    except OSError:
+        return False
+    try:
+        if not is_here(who):
+            return False
+        signal.pidfd_send_signal(handle, number)
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+
+
+def named(who: Json) -> str:
+    """``pid 12 of anna on bench, `sliplab collect ...`, since ...`` for messages."""
+    if "pid" not in who:
+        return "a program that did not say its name"
+    text = f"pid {who['pid']}"
+    for word, key in (("of", "user"), ("on", "host")):
+        if who.get(key):
+            text += f" {word} {who[key]}"
+    if who.get("command"):
+        text += f", `{who['command']}`"
+    if who.get("store"):
+        text += f", for the store {who['store']}"
+    return text + (f", since {who['since']}" if who.get("since") else "")
+
+
+def _boot() -> str:
+    """What tells one run of this machine from the next."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""

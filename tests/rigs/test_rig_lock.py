@@ -1,0 +1,118 @@
+"""One program at a time at a real rig, and none kept from a simulated one."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rigs.capabilities import RigError
+from rigs.rig_file import RigFile, load_rig_file
+from rigs.rig_lock import ENVIRONMENT, held, lock_names
+from storage.lock import Locked
+from tests.conftest import ROOT
+
+HOLDER = """
+import sys
+from pathlib import Path
+from rigs.rig_file import load_rig_file
+from rigs.rig_lock import held
+with held(load_rig_file(Path("ur5"))[0], Path("/data/study")):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where locks are while the test runs."""
+    monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "locks"))
+    return tmp_path / "locks"
+
+
+def real() -> RigFile:
+    return load_rig_file(Path("ur5"))[0]
+
+
+def with_port(file: RigFile, host: str, port: str) -> RigFile:
+    """The same rig with another arm and sync box."""
+    assert file.devices is not None
+    assert file.devices.sync_box is not None
+    box = file.devices.sync_box.model_copy(update={"port": port})
+    arm = file.devices.arm.model_copy(update={"host": host})
+    devices = file.devices.model_copy(update={"arm": arm, "sync_box": box})
+    return file.model_copy(update={"devices": devices})
+
+
+def test_simulated_rigs_need_none(folder: Path) -> None:
+    for name in ("mock", "rehearsal", "loopback"):
+        file = load_rig_file(Path(name))[0]
+        assert lock_names(file) == {}
+        with held(file), held(file):
+            pass
+    assert not folder.exists()
+
+
+def test_who_is_refused_is_told_who_holds_the_rig_until_it_dies(folder: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDER], cwd=ROOT, text=True, env=environment,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert holder.stdout is not None
+    assert holder.stdin is not None
+    try:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(Locked) as refused, held(real()):
+            pass
+        for part in (
+            "the arm at 192.168.1.10 (rig ur5) is in use by another program ",
+            f"(pid {holder.pid} of ", "`sliplab", "for the store /data/study, since 20",
+        ):  # fmt: skip
+            assert part in str(refused.value)
+        holder.kill()
+        holder.wait(timeout=60)
+    finally:
+        holder.kill()
+        holder.wait(timeout=60)
+        holder.stdin.close()
+        holder.stdout.close()
+    with held(real()):
+        pass
+
+
+def test_an_arm_or_a_box_that_two_rig_files_share_is_one(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "ttyBOX").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyBOX")
+    file = with_port(real(), "UR.lab", str(tmp_path / "ttyBOX"))
+    with held(file):
+        with pytest.raises(Locked, match=r"the arm at ur\.lab"):
+            held(with_port(file, "ur.LAB", "/dev/other")).__enter__()
+        with pytest.raises(Locked, match=r"the sync box at .*ttyBOX"):
+            held(with_port(file, "other", str(tmp_path / "by-id"))).__enter__()
+        with held(with_port(file, "other", "/dev/other")):
+            pass
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o1777  # every user may lock, none may unlink
+    assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o666}
+
+
+def test_a_folder_that_is_none_is_said(folder: Path) -> None:
+    folder.write_text("")
+    with pytest.raises(RigError, match=f"cannot be locked .* {ENVIRONMENT}"):
+        held(real()).__enter__()
+
+
+def test_a_link_in_place_of_a_lock_is_not_followed(folder: Path, tmp_path: Path) -> None:
+    with held(real()):
+        pass
+    for path in folder.iterdir():
+        path.unlink()
+        path.symlink_to(tmp_path / "precious")
+    (tmp_path / "precious").write_text("thesis")
+    with pytest.raises(RigError, match="cannot be locked"):
+        held(real()).__enter__()
+    assert (tmp_path / "precious").read_text() == "thesis"
