@@ -153,20 +153,15 @@ class ClockMap:
     def then(self, after: ClockMap) -> ClockMap:
         """This map followed by `after`, as one map: within 3 ns of the two steps."""
         knots = sorted({*self.device_ns[1:], *(self.to_device(t) for t in after.device_ns[1:])})
-        first, last = (knots[0] - 1, knots[-1]) if knots else (self.device_ns[0],) * 2
+        first = knots[0] - 1 if knots else self.device_ns[0]
         images = [after.to_reference(self.to_reference(knot)) for knot in knots or [first]]
-        outer = [self._drift_with(after, knot) for knot in (first, last)]
+        # before every knot both are on their first pieces, behind every knot on their last
+        outer = [_both(self.drift[k], after.drift[k]) for k in (0, -1)]
         if not knots:
             return ClockMap((first,), tuple(images), (outer[0],))
         inner = ClockMap.through(tuple(knots), tuple(images)).drift if len(knots) > 1 else ()
         before = images[0] - 1 - _round(outer[0], DRIFT_UNITS)
         return ClockMap((first, *knots), (before, *images), (outer[0], *inner, outer[1]))
-
-    def _drift_with(self, after: ClockMap, device: int) -> int:
-        """The drift of this map followed by another, at a time."""
-        one = self.drift[self._piece(device)]
-        two = after.drift[after._piece(self.to_reference(device))]
-        return one + two + _round(one * two, DRIFT_UNITS)
 
     def to_json(self) -> dict[str, list[int]]:
         """The three fields as lists of Python ints (a JSON reader must not use floats)."""
@@ -227,6 +222,11 @@ class ClockMap:
         offset += gained
         offset += image
         return offset
+
+
+def _both(one: int, two: int) -> int:
+    """The drift of two maps in a row, parts in 10**18."""
+    return one + two + _round(one * two, DRIFT_UNITS)
 
 
 def _round(value: int, unit: int) -> int:
