@@ -55,7 +55,7 @@ def markdown(results: list[Result], day: str) -> str:
         f"Written by `python -m benchmarks` on {day}; do not edit. Figures are medians of {RUNS} "
         "rounds, in each of",
         "which all rivals ran in turn, with the lowest and the highest beside them; those of "
-        "`clocks` are over 40 trains.",
+        "`clocks` are over 1,000 trains.",
         "What each figure means stands at the top of `benchmarks/NAME.py`. All data are simulated.",
         "",
         f"**Machine**: {where['cpu']}, {where['cores']} cores, {where['memory_gb']} GB, "
