@@ -1,0 +1,90 @@
+"""`sliplab study` and `demo`: the whole chain from a rig to the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows import console
+from flows.cli_common import JsonOption, RigOption, prepare_store
+
+FULL = ("kinematic", "gravity", "disturbance")
+PILOT = ("pilot", "pilot_gravity")
+
+
+def package_file(package: str, name: str) -> Path:
+    """A file that ships with a package."""
+    module = __import__(package)
+    return Path(module.__path__[0]) / name
+
+
+def study(
+    folder: Annotated[Path, typer.Argument(help="The study's store; made if missing.")],
+    rig: RigOption,
+    pilot: Annotated[bool, typer.Option("--pilot", help="The small protocols.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole chain: collect, sync, label, train, evaluate, report."""
+    names = PILOT if pilot else FULL
+    protocols = [package_file("protocols", f"{name}.yaml") for name in names]
+    _chain(folder, protocols, rig, as_json)
+
+
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
+    rig: RigOption = Path("rehearsal"),
+    as_json: JsonOption = False,
+) -> None:
+    """Run the pilot study on the simulated rig and say where the report is."""
+    protocols = [package_file("protocols", f"{name}.yaml") for name in PILOT]
+    if rig == Path("rehearsal"):
+        console.say(
+            "The demo's outside camera hands over simulated tracks of the markers, no video; "
+            "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
+        )
+    _chain(folder, protocols, rig, as_json)
+
+
+def _chain(folder: Path, protocols: list[Path], rig: Path, as_json: bool) -> None:
+    """Run the whole chain and print what came out."""
+    from flows.orders import check_disk, make_order
+
+    orders = [make_order(protocol, rig, folder) for protocol in protocols]
+    check_disk(orders)
+    prepare_store(folder)
+    from flows.report import read_summary
+    from flows.study import study as run
+    from storage.store import Store
+
+    outcome = run(orders)
+    summary = read_summary(Store.open(folder))
+    page = folder / "report" / "index.html"
+    if as_json:
+        console.print_json(
+            {
+                "report": str(page),
+                "collected": outcome.collected,
+                "steps": outcome.steps,
+                "summary": summary,
+            }
+        )
+        return
+    from flows.sections import headline
+
+    simulated = " (simulated)" if summary["simulated"] else ""
+    rows = [[item.name, item.value, item.note] for item in headline(summary)]
+    for name, value in summary["kinematic"]["baselines"].items():
+        shown = "-" if value is None else f"{100 * value:.1f} %"
+        rows.append([f"baseline: {name.replace('_', ' ')}", shown, "argmax, same windows"])
+    argmax = summary["kinematic"]["accuracy"]["argmax"]
+    rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
+    console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
+    console.results.print(f"Report{simulated}: {page.resolve()}", soft_wrap=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Make them commands of `app`."""
+    for command in (study, demo):
+        app.command()(command)

@@ -1,0 +1,68 @@
+"""What the commands share: their options, and how they run a step and print what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows import console
+
+ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
+StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+RigOption = Annotated[
+    Path, typer.Option("--rig", help="A rig file (YAML), or the name of one that ships: mock.")
+]
+StoreOption = Annotated[Path, typer.Option("--store", help="The store's folder; made if missing.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
+]
+EnableOption = Annotated[
+    list[str] | None, typer.Option("--enable", help="Switch an optional level on: factor=level.")
+]
+CampaignOption = Annotated[
+    list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
+]
+
+
+def prepare_store(folder: Path) -> None:
+    """Make the store and point Prefect at it; everything that imports Prefect comes after."""
+    from flows import orchestration
+    from storage.store import Store
+
+    orchestration.prepare(Store.create(folder).folder)
+
+
+def step(folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
+    """Run one analysis step on a store and print what it did."""
+    finish(run_step(folder, names, step, **options), f"{step} {folder}", as_json)
+
+
+def run_step(folder: Path, names: list[str] | None, step: str, **options: Any) -> dict[str, Any]:
+    """Run one analysis step on a store."""
+    from importlib import import_module
+
+    from storage.store import Store
+
+    store = Store.open(folder)
+    prepare_store(folder)
+    from flows.campaigns import collected
+
+    result: dict[str, Any] = getattr(import_module(f"flows.{step}"), step)(
+        store, collected(store, names), **options
+    )
+    if not result["done"]:
+        console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
+    return result
+
+
+def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+    if as_json:
+        console.print_json(result)
+        return
+    shown = {
+        key: ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
+        for key, value in result.items()
+    }
+    console.print_pairs(title, shown)

@@ -1,0 +1,102 @@
+"""`sliplab sync`, `label`, `train`, `evaluate`, `report`, `tradeoff`: one step on what is stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows import console
+from flows.cli_common import CampaignOption, JsonOption, RigOption, StoreArgument, run_step, step
+
+
+def sync(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Fit the clocks of every trial again and write report/sync.html about them."""
+    result = run_step(store, campaign, "sync")
+    if as_json:
+        console.print_json(result)
+        return
+    from flows.sync import COLUMNS, tables
+
+    for title, rows in tables(result):
+        console.print_table(title, COLUMNS, rows)
+    console.results.print(
+        "Median and worst: uncertainty of events against the device, both clocks together; "
+        "of events that of their own clock."
+    )
+    simulated = " (simulated)" if result["simulated"] else ""
+    console.results.print(f"Page{simulated}: {Path(result['page']).resolve()}", soft_wrap=True)
+
+
+def label(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Find the true onsets of every trial from its video, or from the tracks in its place."""
+    step(store, campaign, as_json, "label")
+
+
+def train(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Train the spiking network on the labelled kinematic trials."""
+    step(store, campaign, as_json, "train")
+
+
+def evaluate(
+    store: StoreArgument,
+    campaign: CampaignOption = None,
+    margin: Annotated[
+        float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
+    ] = None,
+    smoothing: Annotated[
+        int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Score the network on trials it has never seen."""
+    step(store, campaign, as_json, "evaluate", margin=margin, smoothing=smoothing)
+
+
+def report(
+    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+) -> None:
+    """Write report/index.html and report/summary.json."""
+    step(store, campaign, as_json, "report")
+    console.say(f"report: {store / 'report' / 'index.html'}")
+
+
+def tradeoff(
+    scene: Annotated[
+        Path, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
+    ],
+    rig: RigOption = Path("mock"),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for page and numbers; made if missing.")
+    ] = Path("sliplab-tradeoff"),
+    trials: Annotated[int, typer.Option("--trials", min=1, help="Trials to simulate.")] = 4,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Also what each guessed number changes.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure what simulating a protocol's scene costs, and how far off cheaper ways are."""
+    from flows import tradeoff as steps
+    from flows.tradeoff_page import choice_pairs, short_table
+
+    result = steps.tradeoff(scene, rig, out, trials, sensitivity)
+    if as_json:
+        console.print_json(result)
+        return
+    title = f"Cost and error of the scene of {result['protocol']} (simulated)"
+    console.print_table(title, *short_table(result))
+    console.print_pairs("The level that the protocol needs", choice_pairs(result))
+    console.results.print(f"Page (simulated): {(out / steps.PAGE).resolve()}", soft_wrap=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Make them commands of `app`."""
+    for command in (sync, label, train, evaluate, report, tradeoff):
+        app.command()(command)
