@@ -1,4 +1,4 @@
-"""`sliplab sync`, `label`, `train`, `evaluate`, `report`, `tradeoff`: one step on what is stored."""
+"""`sliplab sync`, `label`, `train`, `evaluate`, `report`, `tradeoff`: a step on what is stored."""
 
 from __future__ import annotations
 
