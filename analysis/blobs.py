@@ -19,8 +19,6 @@ from scipy.spatial import cKDTree
 Frame = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
-MIN_CONTRAST = 40.0
-
 
 @dataclass(frozen=True)
 class Blobs:

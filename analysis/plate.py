@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.blobs import Floats, Frame, checked_frame
-from analysis.markers import MarkerTracker, MarkerTracks, stack_tracks
+from analysis.markers import MarkerTracker, MarkerTracks, Measured, stack_tracks
 
 MAX_BRIDGED = 5
 """Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm
@@ -148,7 +148,7 @@ def track_video(
     """
     markers = MarkerTracker(layout_px, threshold=threshold)
     plate = PlateTracker(marker_id) if with_plate else None
-    rows: list[tuple[Floats, NDArray[np.bool_]]] = []
+    rows: list[Measured] = []
     poses: list[tuple[bool, Floats, Floats]] = []
     for frame in frames:
         rows.append(markers.update(frame))
