@@ -20,7 +20,7 @@ FLANK = 0.06
 LEAST_CONTRAST = 40.0
 GRID_PX = 0.0035
 """What the pixel grid does to a centroid, px RMS, measured on drawn discs of 20 px radius."""
-FREE_SHARE = 0.004
+FREE_SHARE = 0.002
 """A change of area up to this share is the pixel grid's; what is beyond it may be a hidden part."""
 AREA, SIGMA, QUALITY, DARK, BRIGHT = 0, 1, 2, 3, 4
 """Columns of `found`."""
@@ -214,7 +214,7 @@ def _one(
         found[k, DARK], found[k, BRIGHT] = dark, bright
         light = max(uneven - 3.0 * noise, 0.0) / contrast
         rim = noise / contrast * np.sqrt(0.6 / (np.pi * radius))
-        part = 0.8 * radius * max(hidden - (FREE_SHARE if free else 0.015), 0.0)
+        part = radius * max(hidden - (FREE_SHARE if free else 0.015), 0.0)
         grid = GRID_PX * np.sqrt(20.0 / radius)
         found[k, SIGMA] = np.sqrt(grid**2 + rim**2 + part**2 + (0.5 * light) ** 2)
         found[k, QUALITY] = (
