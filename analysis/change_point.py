@@ -3,16 +3,16 @@
 The paper's rule dates a slip by the frame in which a marker has gone 2 pixels, which at 0.6 mm/s is
 a sixth of a second after it let go. Here the whole track about that moment is used. Before the slip
 the marker rests (a slow drift is allowed for); from then on it moves at a velocity that nobody
-knows and that wanders: stick-slip, friction that varies along the path. A stuck papilla holds
-more than a sliding one, so that it starts with a jerk, which dies away. So the way after the slip
-is a straight line, an exponential that saturates, and an integrated Wiener process: the frames
+knows and that wanders: stick-slip, friction that varies along the path. A stuck papilla holds more
+than a sliding one, so that it starts with a jerk, which dies away. So the way after the slip is a
+straight line, an exponential that saturates, and an integrated Wiener process: the frames
 nearest to the slip count most, and what a later frame says is discounted by how much the velocity
 may have changed until then.
 
 Time of the slip, strength of the wandering, length of the jerk and everything linear are inferred
-together: the linear part is integrated out in closed form with flat priors, the rest on a grid. The estimate is the
-median of the slip time's posterior and the interval its central 95 %. A place is the mean over the
-exposure, so that a frame in which the slip begins lies on a parabola.
+together: the linear part is integrated out in closed form with flat priors, the rest on a grid. The
+estimate is the median of the slip time's posterior, the interval its central 95 %. A place is the
+mean over the exposure, so that a frame in which the slip begins lies on a parabola.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ DEPARTED_SIGMAS = 6.0
 """A marker has left its place when three frames in a row are this far from where it was."""
 _REST = (24, 4)
 """Where it was: the median over frames this long, and this shortly, before."""
-_WANDER = 2.0 ** np.arange(-7.0, 0.0)
+_WANDER = 2.0 ** np.arange(-6.0, 0.0)
 """Strength of the wandering as shares of the speed, a frame to the power -1/2."""
-_RELIEF = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+_RELIEF = np.array([0.12, 0.25, 0.5, 1.0, 2.0, 4.0])
 """How long it takes to relieve the excess of static friction, frames."""
 _DRIFT_PX = 0.002
 """Prior of the drift before the slip, px a frame, standard deviation."""

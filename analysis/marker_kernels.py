@@ -30,15 +30,16 @@ _KEEPS_UP = 0.02
 
 
 @numba.njit(cache=True, nogil=True)
-def _line(frame: Any, y: int, left: int, right: int) -> Any:
+def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
     """Sum, pixels, and sum of squared steps of a piece of a row; none of it outside the picture."""
     left, right = max(left, 0), min(right, frame.shape[1])
     if not 0 <= y < frame.shape[0] or left >= right:
         return 0.0, 0, 0.0
-    total, squares, before = 0, 0, np.int64(frame[y, left])
+    total, squares = 0, 0
+    before: Any = np.int64(frame[y, left])
     for j in range(left, right):
-        grey = np.int64(frame[y, j])
-        step = grey - before
+        grey: Any = np.int64(frame[y, j])
+        step: Any = grey - before
         total += grey
         squares += min(step * step, 400)
         before = grey
@@ -80,7 +81,7 @@ def _levels(frame: Any, left: int, top: int, side: int, radius: float) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _box_sums(frame: Any, left: int, top: int, side: int, low: Any, high: Any, c: Any, y: Any) -> Any:
+def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyped-def]
     """Weight and weighted sums of x and y in a square box; four rows at a time.
 
     `c` and `y` are scratch, int32: column sums, and their running sums, which hold y.
@@ -109,7 +110,7 @@ def _box_sums(frame: Any, left: int, top: int, side: int, low: Any, high: Any, c
 
 
 @numba.njit(cache=True, nogil=True)
-def _disc_sums(frame: Any, cx: int, cy: int, reach: float, cuts: Any, low: Any, high: Any) -> Any:
+def _disc_sums(frame, cx, cy, reach, cuts, low, high):  # type: ignore[no-untyped-def]
     """The same in a disc, less what lies beyond a cut (x0, y0) in its direction (dx, dy)."""
     height, width = frame.shape
     far = int(np.ceil(reach))
@@ -126,7 +127,7 @@ def _disc_sums(frame: Any, cx: int, cy: int, reach: float, cuts: Any, low: Any, 
             else:
                 left = max(left, int(np.ceil(x0 - beyond / dx)))
         for j in range(left, right):
-            w = np.int64(min(max(frame[i, j], low), high) - low)
+            w: Any = np.int64(min(max(frame[i, j], low), high) - low)
             total += w
             sum_x += w * j
             sum_y += w * i
@@ -147,7 +148,7 @@ def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cu
 
 
 @numba.njit(cache=True, nogil=True)
-def _stands_free(xy: Any, k: int, left: int, top: int, side: int, radius: float, shape: Any) -> bool:
+def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-untyped-def]
     """Whether a box lies in the picture and no other marker may show in it."""
     if left < 0 or top < 0 or left + side > shape[1] or top + side > shape[0]:
         return False
@@ -187,7 +188,7 @@ def _one(
             dark, bright, contrast = before_dark, before_bright, usual
         flank = max(FLANK * contrast, 3.5 * noise + 1.0)
         low_level, high_level = np.round(dark + flank), np.round(bright - flank)
-        if not (0 <= low_level and low_level + 8 < high_level and high_level <= 255):
+        if not (low_level >= 0 and low_level + 8 < high_level and high_level <= 255):
             break
         low, high = np.uint8(low_level), np.uint8(high_level)
         if side <= c.size and _stands_free(xy, k, left, top, side, radius, frame.shape):

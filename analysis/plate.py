@@ -240,15 +240,13 @@ def bridge(poses: list[PlatePose], max_bridged: int = MAX_BRIDGED) -> PlateTrack
     """
     if not poses:
         nothing = np.empty(0)
-        return PlateTrack(
-            np.empty((0, 2)), np.empty((0, 4, 2)), np.empty(0, np.bool_), nothing
-        )
+        return PlateTrack(np.empty((0, 2)), np.empty((0, 4, 2)), np.empty(0, np.bool_), nothing)
     ok = np.array([pose.seen for pose in poses], np.bool_)
     # the centre is the corners' mean, bridged or not
     columns = np.stack([pose.corners for pose in poses]).reshape(len(poses), 8)
     sigma = np.array([pose.sigma for pose in poses])
     seen = np.flatnonzero(ok)
-    for before, after in pairwise(seen):
+    for before, after in pairwise(seen.tolist()):
         if 1 < after - before <= max_bridged + 1:
             gap = np.arange(before + 1, after)
             share = ((gap - before) / (after - before))[:, None]

@@ -36,7 +36,7 @@ def _grey(frame: Any, x: float, y: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _side(frame: Any, ax: float, ay: float, bx: float, by: float, reach: float) -> Any:
-    """How far outwards the side from a to b lies at a and at b, px, and its scatter; NaN where lost.
+    """How far outwards the side from a to b lies at a and at b, and its scatter, px; NaN if lost.
 
     Corners go clockwise in the picture, so that outwards is to the left of the way.
     """

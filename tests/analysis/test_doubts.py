@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.onsets import MAX_UNSEEN_NS, doubts, paper_onsets
+from analysis.doubts import MAX_UNSEEN_NS, doubts
+from analysis.onsets import paper_onsets
 from protocols.settings import Labelling
 
 FRAME_NS = 10_000_000
