@@ -186,7 +186,10 @@ def _one(
         if not trusted:
             # far off, or hidden: what it looked like before may lead to it
             dark, bright, contrast = before_dark, before_bright, usual
-        flank = max(FLANK * contrast, 3.5 * noise + 1.0)
+        if not _stands_free(xy, k, left, top, side, radius, frame.shape):
+            uneven = 0.0
+        # light on one side of the ground must not count as white
+        flank = max(FLANK * contrast, 3.5 * noise + 1.0, uneven + 1.0)
         low_level, high_level = np.round(dark + flank), np.round(bright - flank)
         if not (low_level >= 0 and low_level + 8 < high_level and high_level <= 255):
             break
@@ -197,7 +200,7 @@ def _one(
         else:
             near = _near_cuts(xy, k, x, y, known, reach, cuts)
             total, sum_x, sum_y = _disc_sums(frame, cx, cy, reach, near, low, high)
-            uneven, free = 0.0, near.shape[0] == 0
+            free = near.shape[0] == 0
         covered = total / (high_level - low_level)
         if covered < 0.3 * area:
             break

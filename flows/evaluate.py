@@ -18,6 +18,7 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
+from flows.label_errors import label_errors, rules_compared
 from flows.orchestration import Parcel, run
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
@@ -30,7 +31,7 @@ from storage.store import Store, StoreError
 
 STEP = "evaluation"
 COUNTS = "counts"
-VERSION = 1
+VERSION = 2
 COUNTS_VERSION = 1
 NAME = "evaluation"
 
@@ -133,7 +134,8 @@ def score(wanted: Parcel[Job]) -> None:
         "windows": _score_windows(job),
         "trials": rows,
         "experiments": _summaries(rows),
-        "label_error_ms": _label_errors(job),
+        "label_error_ms": label_errors(job.store, job.campaigns),
+        "label_rules_ms": rules_compared(job.store, job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
@@ -211,32 +213,6 @@ def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "lead_ms": summarise_lead(scored),
         }
     return result
-
-
-def _label_errors(job: Job) -> dict[str, Any]:
-    """Labels against the simulation's truth, over every labelled simulated trial; ms."""
-    errors: dict[str, list[float]] = {"incipient": [], "gross": []}
-    for item in job.campaigns:
-        labels = Derived.of(job.store, LABELS, item.name)
-        for trial, recording in item.trials:
-            truth = recording.simulation_truth()
-            if truth is None:
-                continue
-            label = labels.read(trial.id)
-            for kind, values in errors.items():
-                found, true = label[f"{kind}_ns"], truth[f"{kind}_ns"]
-                if found is not None and true is not None:
-                    values.append((found - true) / 1e6)
-    summary: dict[str, Any] = {}
-    for kind, values in errors.items():
-        there = np.asarray(values)
-        summary[kind] = {
-            "n": len(values),
-            "median": float(np.median(there)) if len(there) else None,
-            "median_abs": float(np.median(np.abs(there))) if len(there) else None,
-            "max_abs": float(np.max(np.abs(there))) if len(there) else None,
-        }
-    return summary
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)

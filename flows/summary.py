@@ -45,7 +45,11 @@ def make_summary(
         "kinematic": kinematic,
         "gravity": experiments["gravity"],
         "disturbance": experiments["disturbance"],
-        "labels": {"error_ms": evaluation["label_error_ms"], "source": _sources(campaigns)},
+        "labels": {
+            "error_ms": evaluation["label_error_ms"],
+            "rules_ms": evaluation["label_rules_ms"],
+            "source": _sources(campaigns),
+        },
         "detection": evaluation["detection"],
         "sync": _sync(campaigns),
         "quality": _quality(campaigns),
