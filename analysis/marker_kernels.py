@@ -103,7 +103,7 @@ def _box_sums(frame, left, top, side, low, high, c, y):  # type: ignore[no-untyp
     total, sum_x, sum_y = 0, 0, 0
     for j in range(side):
         total += c[j]
-        sum_x += j * np.int64(c[j])
+        sum_x += int(j * np.int64(c[j]))
         sum_y += y[j]
     # a row's weight was added once for itself and once for each row below it
     return total, sum_x + left * total, (top + side) * total - sum_y
