@@ -26,6 +26,7 @@ together by chance."""
 _APART_PX = 0.3
 _GONE_FRAMES = 3
 _KEEP = 0.8
+_UNANCHORED_PX = 0.15
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class CameraShift:
 
     px: Floats
     unsure: NDArray[np.bool_]
+    sigma: Floats
+    """(n,) what taking it out adds to a coordinate's standard deviation, px."""
 
     @property
     def largest_px(self) -> float:
@@ -53,7 +56,7 @@ def camera_shift(away: Floats) -> CameraShift:
         away: (n, m, 2) offsets from where they stood at rest, px, NaN where unknown.
     """
     n, m, _ = away.shape
-    shift, unsure = np.zeros((n, 2)), np.zeros(n, np.bool_)
+    shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
     stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
     velocity, before = np.zeros((m, 2)), np.full((m, 2), np.nan)
     now, drifted = np.zeros(2), False
@@ -67,6 +70,7 @@ def camera_shift(away: Floats) -> CameraShift:
             anchored = near.sum() >= max(ANCHORS, 0.5 * hold.sum())
             if anchored:
                 now = np.median(away[f, hold][near], axis=0)
+                sigma[f] = np.sqrt(np.mean((away[f, hold][near] - now) ** 2))
                 drifted |= bool(near.sum() >= MANY and np.hypot(*now) > LEAST_PX)
         if not anchored and seen.any():
             # innovations: of what stood still its place, of what slides its step
@@ -85,5 +89,10 @@ def camera_shift(away: Floats) -> CameraShift:
         before = np.where(seen[:, None], place, before)
     knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
     if not (drifted or knocked):
-        return CameraShift(np.zeros((n, 2)), np.zeros(n, np.bool_))
-    return CameraShift(shift, unsure)
+        return no_shift(n)
+    return CameraShift(shift, unsure, sigma)
+
+
+def no_shift(n: int) -> CameraShift:
+    """Of a camera that stood still for n frames."""
+    return CameraShift(np.zeros((n, 2)), np.zeros(n, np.bool_), np.zeros(n))

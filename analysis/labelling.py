@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from analysis.camera_shift import CameraShift, camera_shift
+from analysis.camera_shift import CameraShift, camera_shift, no_shift
 from analysis.doubts import Doubts, uncertain, unseen
 from analysis.onsets import Onsets, offsets, paper_onsets
 from analysis.places import SURE_PX, Places, places_of
@@ -188,10 +188,11 @@ def label_places(
     xy = np.where(sure[..., None], places.flat_xy, np.nan)
     away = offsets(xy, reference, places.flat_plate)
     sigma = np.where(sure, places.sigma, np.nan)
-    camera = CameraShift(np.zeros((len(frame_ns), 2)), np.zeros(len(frame_ns), np.bool_))
+    camera = no_shift(len(frame_ns))
     if places.plate is None:
         camera = camera_shift(away)
         away = away - camera.px[:, None, :]
+        sigma = np.hypot(sigma, camera.sigma[:, None])
     else:
         sigma = np.hypot(sigma, places.plate.sigma[:, None])
     moved = np.hypot(away[..., 0], away[..., 1])

@@ -14,6 +14,8 @@ from analysis.onsets import NO_ONSET, Onsets
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_MEAN, _CREPT_PX = 5, 0.02
+"""Means over so many frames that leave rest by this, px, show a slip too small for a departure."""
 WIDEST_NS = 40_000_000
 """A slip's interval may be this wide without making an onset unknown: two frames either way."""
 
@@ -59,6 +61,29 @@ class SlipTimes:
         return f"{(self.high_ns[marker] - self.low_ns[marker]) / 1e6:.0f} ms"
 
 
+def crept_from(away: Floats, sigma: Floats) -> int:
+    """The frame from which a marker was no longer quite where it rested, up to the last one.
+
+    A papilla may slip by less than a departure and stick again; where it is not known which of its
+    slips was the first, the interval has to say so.
+
+    Args:
+        away: (k, 2) offsets from rest up to the departure, px. sigma: (k,) px.
+    """
+    known = np.flatnonzero(np.isfinite(away).all(axis=1) & np.isfinite(sigma))
+    if len(known) < _MEAN:
+        return len(away)
+    box = np.ones(_MEAN) / _MEAN
+    x, y = (np.convolve(column, box, "valid") for column in away[known].T)
+    limit = np.maximum(_CREPT_PX, 5 * np.convolve(sigma[known], box, "valid") / np.sqrt(_MEAN))
+    home = np.flatnonzero(np.hypot(x, y) <= limit)
+    if not len(home):
+        return 0
+    # the mean at k is over k to k + 4
+    last = int(home[-1]) + _MEAN - 1
+    return int(known[last]) if last < len(known) - 1 else len(away)
+
+
 def slip_times(
     frame_ns: Ints,
     away: Floats,
@@ -96,5 +121,7 @@ def slip_times(
         if found is None:
             at[marker], low[marker], high[marker] = frame_ns[left], rested, frame_ns[left]
         else:
-            at[marker], low[marker], high[marker] = found.at_ns, found.low_ns, found.high_ns
+            at[marker], high[marker] = found.at_ns, found.high_ns
+            began = crept_from(away[:left, marker], sigma[:left, marker])
+            low[marker] = min(found.low_ns, int(frame_ns[max(began, first)]))
     return SlipTimes(at, low, high, centre)
