@@ -65,7 +65,7 @@ def find_blobs(
     frame = checked_frame(frame)
     level = otsu_threshold(frame) if threshold is None else threshold
     binary = cv2.threshold(frame, level, 1, cv2.THRESH_BINARY)[1]
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4, ltype=cv2.CV_16U)
     found: list[tuple[float, float, float, float]] = []
     for label in range(1, len(stats)):
         left, top, width, height, area = (int(v) for v in stats[label])

@@ -232,7 +232,7 @@ def _one(
 def follow(
     frame: Any, xy: Any, wanted: Any, radius: float, margin: float, area: Any, tolerance: float,
     state: Any, found: Any,
-) -> int:  # fmt: skip
+) -> Any:  # fmt: skip
     """Move the markers `wanted` of `xy` from their predictions to their centroids.
 
     Args:
@@ -245,7 +245,7 @@ def follow(
         found: (m, 5), changed; the last two columns are read, as they were a frame before.
 
     Returns:
-        how many of those wanted are lost.
+        how many of those wanted are lost, and how many of all are whole.
     """
     predicted = xy.copy()
     known = state != LOST
@@ -275,9 +275,11 @@ def follow(
                     way_a = np.hypot(xy[a, 0] - predicted[a, 0], xy[a, 1] - predicted[a, 1])
                     way_b = np.hypot(xy[b, 0] - predicted[b, 0], xy[b, 1] - predicted[b, 1])
                     state[a if way_a > way_b else b] = LOST
+    whole = 0
     for k in range(xy.shape[0]):
+        whole += state[k] == WHOLE
         if wanted[k]:
             lost += state[k] == LOST
             if state[k] == WHOLE:
                 area[k] += _KEEPS_UP * (found[k, AREA] - area[k])
-    return lost
+    return lost, whole

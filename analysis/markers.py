@@ -14,11 +14,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from analysis.blobs import Floats, Frame, checked_frame, find_blobs, match_layout
+from analysis.blobs import Blobs, Floats, Frame, checked_frame, find_blobs, match_layout
 from analysis.marker_kernels import (
     AREA,
     BRIGHT,
@@ -33,6 +34,8 @@ from analysis.marker_kernels import (
 
 AREA_TOLERANCE = 0.06
 """A marker whose area differs by more than this share from what it was is lost."""
+_COARSE_PX = 50.0
+"""With markers so far apart the first search looks at every other pixel."""
 _EAGER_FRAMES = 20
 _PATIENT_EVERY = 4
 """A marker lost for more than 20 frames is looked for in every fourth."""
@@ -98,6 +101,9 @@ class MarkerTracker:
         self._layout, self._threshold, self._tolerance = layout, threshold, area_tolerance
         m = len(layout)
         self._everywhere = np.ones(m, np.bool_)
+        self._everywhere.flags.writeable = False
+        self._whole = 0
+        self._all_followed = False
         self._xy = np.full((m, 2), np.nan)
         self._velocity = np.zeros((m, 2))
         self._area = np.zeros(m)
@@ -122,6 +128,9 @@ class MarkerTracker:
             self._find(frame)
         else:
             self._follow(frame)
+        if self._whole == len(self._xy):
+            found = self._measured.copy()
+            return Measured(self._xy.copy(), self._everywhere, found[:, SIGMA], found[:, QUALITY])
         ok = self._state == WHOLE
         return Measured(
             np.where(ok[:, None], self._xy, np.nan),
@@ -132,10 +141,10 @@ class MarkerTracker:
 
     def _find(self, frame: Frame) -> None:
         """Search the whole frame; the layout names the blobs."""
-        # the papillae's radius is 2.0 mm at a spacing of 5.6 mm: 0.36 of it
-        limits = (np.pi * (0.15 * self._spacing) ** 2, np.pi * (0.5 * self._spacing) ** 2)
-        blobs = find_blobs(frame, self._threshold, *limits)
-        shift, index = match_layout(blobs.xy, self._layout, 0.35 * self._spacing)
+        coarse = self._spacing >= _COARSE_PX and min(frame.shape) > 64
+        blobs, shift, index = self._search(frame, 2 if coarse else 1)
+        if coarse and (index < 0).any():
+            blobs, shift, index = self._search(frame, 1)
         seen = index >= 0
         if seen.sum() * 2 < len(index):
             return
@@ -158,18 +167,38 @@ class MarkerTracker:
         self._area = np.where(whole, self._measured[:, AREA], usual)
         self._look(frame, seen, self._tolerance)
 
+    def _search(self, frame: Frame, shrink: int) -> tuple[Blobs, Floats, NDArray[np.int64]]:
+        """Blobs of the frame, the layout's shift, and which blob each marker is.
+
+        Places to half a pixel do: they are measured afterwards.
+        """
+        part = frame
+        if shrink > 1:
+            size = frame.shape[1] // shrink, frame.shape[0] // shrink
+            cut = frame[: size[1] * shrink, : size[0] * shrink]
+            part = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+        # the papillae's radius is 2.0 mm at a spacing of 5.6 mm: 0.36 of it
+        apart = self._spacing / shrink
+        limits = (np.pi * (0.15 * apart) ** 2, np.pi * (0.5 * apart) ** 2)
+        small = find_blobs(part, self._threshold, *limits)
+        places = small.xy * shrink + (shrink - 1) / 2
+        blobs = Blobs(places, small.area * shrink**2, small.roundness)
+        shift, index = match_layout(blobs.xy, self._layout, 0.35 * self._spacing)
+        return blobs, shift, index
+
     def _follow(self, frame: Frame) -> None:
         before = self._xy.copy()
-        known = self._state != LOST
+        known = None if self._all_followed else self._state != LOST
         self._xy += self._velocity
-        lost = self._look(frame, self._everywhere, self._tolerance)
-        if not lost:
-            if known.all():
+        self._all_followed = not self._look(frame, self._everywhere, self._tolerance)
+        if self._all_followed:
+            if known is None:
                 np.subtract(self._xy, before, out=self._velocity)
             else:
                 self._velocity[:] = self._common(before, known)
-            self._missed[:] = 0
+                self._missed[:] = 0
             return
+        known = self._everywhere if known is None else known
         if (self._state == WHOLE).sum() * 2 < len(known) and self._find_again(frame):
             return
         seen = self._state != LOST
@@ -190,12 +219,11 @@ class MarkerTracker:
         return result
 
     def _look(self, frame: Frame, wanted: NDArray[np.bool_], tolerance: float) -> int:
-        return int(
-            follow(
-                frame, self._xy, wanted, self._radius, self._margin, self._area, tolerance,
-                self._state, self._measured,
-            )
+        lost, self._whole = follow(
+            frame, self._xy, wanted, self._radius, self._margin, self._area, tolerance,
+            self._state, self._measured,
         )  # fmt: skip
+        return int(lost)
 
     def _recover(self, frame: Frame, i: int) -> None:
         """Look for a lost marker around where the others' motion has carried it."""
