@@ -35,14 +35,13 @@ def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
     left, right = max(left, 0), min(right, frame.shape[1])
     if not 0 <= y < frame.shape[0] or left >= right:
         return 0.0, 0, 0.0
+    row = frame[y, left:right]
     total, squares = 0, 0
-    before: Any = np.int64(frame[y, left])
-    for j in range(left, right):
-        grey: Any = np.int64(frame[y, j])
-        step: Any = grey - before
-        total += grey
+    for j in range(row.size):
+        total += row[j]
+    for j in range(row.size - 1):
+        step = np.int32(row[j + 1]) - np.int32(row[j])
         squares += min(step * step, 400)
-        before = grey
     return float(total), right - left, float(squares)
 
 
@@ -70,12 +69,9 @@ def _levels(frame: Any, left: int, top: int, side: int, radius: float) -> Any:
     dark = lowest if known == 1 else (lowest + second) / 2
     reach = max(int(0.5 * radius), 1)
     cx, cy = left + side // 2, top + side // 2
-    white, count = 0.0, 0
-    for line in range(-1, 2):
-        total, n, more = _line(frame, cy + line * reach, cx - reach, cx + reach + 1)
-        white, count = white + total, count + n
-        squares, steps = squares + more, steps + max(n - 1, 0)
-    bright = white / count if count > 0 else 0.0
+    total, n, more = _line(frame, cy, cx - reach, cx + reach + 1)
+    squares, steps = squares + more, steps + max(n - 1, 0)
+    bright = total / n if n > 0 else 0.0
     noise = np.sqrt(squares / (2 * steps)) if steps > 0 else 0.0
     return dark, bright, noise, highest - lowest
 
@@ -152,11 +148,12 @@ def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-unty
     """Whether a box lies in the picture and no other marker may show in it."""
     if left < 0 or top < 0 or left + side > shape[1] or top + side > shape[0]:
         return False
-    reach = side / 2 + radius + 2
+    half = side / 2
     for other in range(xy.shape[0]):
         if other != k:
-            dx, dy = xy[other, 0] - left - side / 2, xy[other, 1] - top - side / 2
-            if abs(dx) < reach and abs(dy) < reach:
+            dx = max(abs(xy[other, 0] - left - half) - half, 0.0)
+            dy = max(abs(xy[other, 1] - top - half) - half, 0.0)
+            if dx * dx + dy * dy < (radius + 2) ** 2:
                 return False
     return True
 
