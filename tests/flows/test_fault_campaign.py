@@ -1,4 +1,4 @@
-"""Every fault by name, once each in one campaign of 30 trials: what docs/faults.md says comes of it.
+"""Every fault by name, once each in a campaign of 30 trials: docs/faults.md says what comes of it.
 
 The table there is held to what happens: what the arm did, what became of the trial, and what the
 person at the rig reads. A row that is not true any more fails here and shows the true one.
@@ -10,8 +10,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from analysis.labelling import label_recording
 from flows.orders import campaign_counts, make_order, pending_trials
@@ -55,7 +53,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "device_gone", "device": "frame_camera"},
     {"kind": "device_gone", "device": "sync_box"},
 ]
-"""Each happens once, in the middle of a trial of its own; a plate can only stick where one falls."""
+"""Each happens once, in the middle of a trial of its own; a plate sticks only where one falls."""
 
 
 @dataclass(frozen=True)
