@@ -54,7 +54,8 @@ def _sound(path: Path) -> bool:
             if file.execute("pragma quick_check").fetchone() != ("ok",):
                 return False
             tables = {
-                name for (name,) in file.execute("select name from sqlite_master where type='table'")
+                name
+                for (name,) in file.execute("select name from sqlite_master where type='table'")
             }
             return (
                 {_MADE, "flow_run", "task_run"} <= tables

@@ -85,6 +85,11 @@ class EmbeddedServer:
         atexit.register(self.stop)
 
     @property
+    def pid(self) -> int:
+        """The server's process."""
+        return self._process.pid
+
+    @property
     def url(self) -> str:
         """What PREFECT_API_URL must be; waits until the server answers there.
 

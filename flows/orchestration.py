@@ -52,6 +52,11 @@ def begin() -> None:
         _servers[home] = EmbeddedServer(Path(home))
 
 
+def embedded() -> EmbeddedServer:
+    """The embedded server that this program started (`begin`)."""
+    return _servers[os.environ["PREFECT_HOME"]]
+
+
 def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
@@ -69,7 +74,7 @@ def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     if PREFECT_API_URL.value() is None:
         begin()
-        updates[PREFECT_API_URL] = _servers[os.environ["PREFECT_HOME"]].url
+        updates[PREFECT_API_URL] = embedded().url
     with temporary_settings(updates=updates):
         run_events.install()
         return flow(parcel)

@@ -73,7 +73,9 @@ class BatchingWorker(EventsWorker):
                 await super()._handle(self._held.pop(next(iter(self._held))))
 
 
-_tell = prefect.task_engine.emit_task_run_state_change_event
+_engine: Any = prefect.task_engine
+_emitter: Any = prefect.events.utilities
+_tell = _engine.emit_task_run_state_change_event
 
 
 def _tell_but_pending(
@@ -81,10 +83,11 @@ def _tell_but_pending(
 ) -> Event | None:
     if initial_state is None:
         return None
-    return _tell(task_run, initial_state, validated_state, follows)
+    told: Event | None = _tell(task_run, initial_state, validated_state, follows)
+    return told
 
 
 def install() -> None:
     """Have the events of this process go that way."""
-    prefect.events.utilities.EventsWorker = BatchingWorker
-    prefect.task_engine.emit_task_run_state_change_event = _tell_but_pending
+    _emitter.EventsWorker = BatchingWorker
+    _engine.emit_task_run_state_change_event = _tell_but_pending

@@ -66,9 +66,7 @@ class _Part:
         self.sync: dict[str, str] = {}
         if not same_clocks:
             old = known.sync()
-            self.sync = {
-                name: catalogue_index.sync_key(campaign, name) for name in listing.names
-            }
+            self.sync = {name: catalogue_index.sync_key(campaign, name) for name in listing.names}
             self.kept = {n: at for n, at in self.kept.items() if self.sync[n] == old[at]}
         self.fresh: dict[str, dict[str, Any]] = {}
         self.changed = len(self.kept) != high - low or not same_clocks

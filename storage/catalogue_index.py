@@ -165,9 +165,17 @@ def write(
     pq.write_table(made, buffer, compression="zstd")
     data = buffer.getvalue()
     back = _parse(data)
-    if back is None or not back.table.equals(table) or list(back.table.dtypes) != list(table.dtypes):
+    if (
+        back is None
+        or not back.table.equals(table)
+        or list(back.table.dtypes) != list(table.dtypes)
+    ):
         return  # something that Parquet cannot keep as it is: it will be read again each time
     with suppress(OSError):  # a store that is only read from
         path = _path(store)
         make_folder(path.parent)
         write_bytes(path, hashlib.sha256(data).digest() + data)
+
+
+def _same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
+    return bool(one.equals(other)) and list(one.dtypes) == list(other.dtypes)
