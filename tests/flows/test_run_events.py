@@ -1,4 +1,4 @@
-"""What the embedded server is told of quick tasks: every run, whole, and where its tables come from."""
+"""What the embedded server is told of quick tasks, and where its tables come from."""
 
 from __future__ import annotations
 
