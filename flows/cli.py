@@ -105,7 +105,9 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
+    from flows import orchestration
     from flows.orders import Bench, check_disk, make_order
+    from storage.store import Store
 
     order = make_order(
         protocol,
@@ -120,6 +122,8 @@ def collect(
         console.say(f"note: {warning}")
     check_disk([order])
     prepare_store(store)
+    if order.wanted(Store(store).campaign(order.campaign)):
+        orchestration.begin()  # starts beside all that is imported below
     from flows.collect import collect as run
 
     result = run(order)

@@ -35,7 +35,10 @@ def trials(
 
     unreadable: list[str] = []
     table = catalogue(Store.open(store), unreadable)
-    aside = all_aside(Store.open(store), unreadable)
+    whole = None
+    if not unreadable and len(table):  # else what is whole may be more than what can be read
+        whole = {name: set(part) for name, part in table.groupby("campaign")["trial"]}
+    aside = all_aside(Store.open(store), unreadable, whole)
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:

@@ -43,6 +43,20 @@ def prepare(store: Path) -> None:
         os.environ.setdefault(name, value)
 
 
+def begin() -> None:
+    """Start the embedded server, if a flow will need it, and go on without waiting for it."""
+    if "PREFECT_API_URL" in os.environ:
+        return
+    home = os.environ["PREFECT_HOME"]
+    if home not in _servers:
+        _servers[home] = EmbeddedServer(Path(home))
+
+
+def embedded() -> EmbeddedServer:
+    """The embedded server that this program started (`begin`)."""
+    return _servers[os.environ["PREFECT_HOME"]]
+
+
 def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
@@ -55,11 +69,12 @@ def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
         temporary_settings,
     )
 
+    from flows import run_events
+
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     if PREFECT_API_URL.value() is None:
-        home = os.environ["PREFECT_HOME"]
-        if home not in _servers:
-            _servers[home] = EmbeddedServer(Path(home))
-        updates[PREFECT_API_URL] = _servers[home].url
+        begin()
+        updates[PREFECT_API_URL] = embedded().url
     with temporary_settings(updates=updates):
+        run_events.install()
         return flow(parcel)

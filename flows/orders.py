@@ -137,13 +137,16 @@ def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
     return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
 
 
-def set_aside(plan: Plan, campaign: Campaign) -> list[dict[str, Any]]:
+def set_aside(
+    plan: Plan, campaign: Campaign, committed: set[str] | None = None
+) -> list[dict[str, Any]]:
     """Trials of the plan that no collection takes, in its order, each with its cause.
 
     By JSON names: ``trial``, ``cause``, ``attempts`` that failed, ``by`` (a person, or None for
-    the gates), ``when``.
+    the gates), ``when``. Whoever knows which trials are whole spares looking with `committed`.
     """
-    done, by_person, failed = campaign.committed(), skipped(campaign), campaign.failed_attempts()
+    done = campaign.committed() if committed is None else committed
+    by_person, failed = skipped(campaign), campaign.failed_attempts()
     retakes = plan.protocol.collection.gates.retakes
     causes: dict[str, list[str]] = {}
     for item in campaign.quarantined():
