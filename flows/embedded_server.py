@@ -23,6 +23,7 @@ from pathlib import Path
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
+_HEADLESS = {"PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
 _PR_SET_PDEATHSIG = 1
 
 
@@ -31,13 +32,26 @@ class ServerError(RuntimeError):
 
 
 class EmbeddedServer:
-    """One server on a free port of the loopback, its log in Prefect's home."""
+    """One server on a port of the loopback, its log in Prefect's home.
 
-    def __init__(self, home: Path) -> None:
+    Args:
+        port: where; 0 for a free one.
+        page: whether it has Prefect's page, and all of its services with it.
+
+    Raises:
+        ServerError: the port is taken, or it did not start.
+    """
+
+    def __init__(self, home: Path, port: int = 0, *, page: bool = False) -> None:
         self._log = home / "server.log"
         with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise ServerError(f"port {port} of the loopback: {error.strerror}") from None
             self.port = int(probe.getsockname()[1])
+        kind = {"PREFECT_UI_ENABLED": "1"} if page else _HEADLESS
         with self._log.open("w") as log:
             self._process = subprocess.Popen(
                 [
@@ -52,7 +66,7 @@ class EmbeddedServer:
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
-                env={**os.environ, "PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"},
+                env={**os.environ, **kind},
             )
         atexit.register(self.stop)
         self._wait_until_healthy()
@@ -92,10 +106,19 @@ class EmbeddedServer:
             self._process.wait(timeout=STOP_LIMIT_S)
 
 
+def die_with(parent: int) -> bool:
+    """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
+
+    Returns:
+        False if that one has ended already.
+    """
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    return os.getppid() == parent
+
+
 def _serve(port: int, parent: int) -> None:
     """Be the server until told to end, or until the parent dies."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != parent:
+    if not die_with(parent):
         return  # it died before it could be watched
     import uvicorn
     from prefect.server.api.server import create_app
