@@ -1,8 +1,8 @@
 """`sliplab serve`: one program registers the deployments of one rig and runs what is asked for.
 
-Two of Prefect's runners in one process: one takes a single run at a time, because a rig is one
-thing; the other carries pause, resume and stop past whatever runs. Each run is a process of its
-own, which stops its arm and ends when this program ends, however that happens.
+Prefect's runner takes a single run at a time, because a rig is one thing. Each is a process of its
+own, which stops its arm and ends when this program ends, however that happens. Pause, resume and
+stop are carried past it (`flows.serve_control`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 from flows import console, run_records
 from flows.embedded_server import EmbeddedServer
+from flows.serve_control import answer_page
 from flows.serve_file import Scheduled
 from flows.service import Service
 from protocols import InputError
@@ -26,6 +27,8 @@ from storage.store import Store
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
+CONTROL_POLL_S = 1.0
+"""How often the page is asked for pause, resume and stop."""
 
 
 @contextmanager
@@ -96,36 +99,37 @@ async def _serve(
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
 
-    def stop(*_: Any) -> None:
-        loop.call_soon_threadsafe(stopped.set)
+    class Ours(Runner):
+        """Prefect's, with SIGTERM for the whole program."""
 
-    runners = []
-    for title, flows, limit in (("rig", ON_RIG, 1), ("control", CONTROL, None)):
-        runner = Runner(
-            f"{name} {title}", query_seconds=poll_s, limit=limit, pause_on_shutdown=False
-        )
-        runner.handle_sigterm = stop  # its own ends one runner of two
-        for flow in flows:
-            await _refuse_another(flow.name, name, store)
-            await runner.aadd_flow(
-                flow, name, tags=_tags(store, rig), description=flow.description,
-                schedules=_prefects([item for item in schedules if item.flow == flow.name]),
-            )  # fmt: skip
-        runners.append(runner)
+        def handle_sigterm(self, *args: Any, **kwargs: Any) -> None:
+            loop.call_soon_threadsafe(stopped.set)
+
+    rig_runner = Ours(f"{name} rig", query_seconds=poll_s, limit=1, pause_on_shutdown=False)
+    control: dict[Any, Any] = {}
+    for flow in (*ON_RIG, *CONTROL):
+        await _refuse_another(flow.name, name, store)
+        about = {"tags": _tags(store, rig), "description": flow.description}
+        if flow in ON_RIG:
+            when = _prefects([item for item in schedules if item.flow == flow.name])
+            await rig_runner.aadd_flow(flow, name, schedules=when, **about)
+        else:
+            made = await flow.ato_deployment(name, **about)
+            control[await made.aapply()] = flow
     await _close_stranded(name, [flow.name for flow in (*ON_RIG, *CONTROL)], store)
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop)
-    running = [asyncio.create_task(runner.start()) for runner in runners]
+        loop.add_signal_handler(number, stopped.set)
+    running = asyncio.create_task(rig_runner.start())
+    answering = asyncio.create_task(answer_page(control, min(poll_s, CONTROL_POLL_S), stopped))
     ending = asyncio.create_task(stopped.wait())
     console.say(f"serving {store.folder} on the rig {rig}: deployments */{name}")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
-    await asyncio.wait([ending, *running], return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait([ending, running, answering], return_when=asyncio.FIRST_COMPLETED)
     console.say("ending: what runs stops, arm first")
-    ending.cancel()
-    for runner in runners:
-        if runner.started:
-            await runner.astop()
-    for outcome in await asyncio.gather(*running, return_exceptions=True):
+    stopped.set()
+    if rig_runner.started:
+        await rig_runner.astop()
+    for outcome in await asyncio.gather(running, answering, ending, return_exceptions=True):
         if isinstance(outcome, Exception):
             raise outcome
 

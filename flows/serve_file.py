@@ -1,10 +1,10 @@
 """The file of schedules that `sliplab serve` reads: nights and weekends, checked like a protocol.
 
-    timezone: Europe/Rome
-    schedules:
-      - {name: nights, flow: collect, protocol: kinematic.yaml,
-         days: [mon, tue, wed, thu], from: "22:00", until: "06:00"}
-      - {name: morning report, flow: report, cron: "30 7 * * mon-fri"}
+timezone: Europe/Rome
+schedules:
+  - {name: nights, flow: collect, protocol: kinematic.yaml,
+     days: [mon, tue, wed, thu], from: "22:00", until: "06:00"}
+  - {name: morning report, flow: report, cron: "30 7 * * mon-fri"}
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Timing(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
     name: str
-    days: list[Day] | None = Field(None, min_length=1)
-    from_: From | None = Field(None, alias="from")
+    days: list[Day] | None = Field(default=None, min_length=1)
+    from_: From | None = Field(default=None, alias="from")
     cron: str | None = None
     active: bool = True
 

@@ -20,6 +20,7 @@ from flows.service import Service
 from storage import control
 from storage.store import Store
 
+STEP, EVALUATE, STUDY, ASK = Step(), Evaluate(), Study(), Ask()
 served: Callable[..., Any] = partial(flow, persist_result=False, **HOOKS)
 
 
@@ -30,32 +31,32 @@ def collect(wanted: Collect) -> Any:
 
 
 @served(name="label")
-def label(wanted: Step = Step()) -> Any:
+def label(wanted: Step = STEP) -> Any:
     """Find the true onsets of every trial."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "label"))
 
 
 @served(name="train")
-def train(wanted: Step = Step()) -> Any:
+def train(wanted: Step = STEP) -> Any:
     """Train the spiking network on the labelled kinematic trials."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "train"))
 
 
 @served(name="evaluate")
-def evaluate(wanted: Evaluate = Evaluate()) -> Any:
+def evaluate(wanted: Evaluate = EVALUATE) -> Any:
     """Score the network on trials it has never seen."""
     options = {"margin": wanted.margin, "smoothing": wanted.smoothing}
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "evaluate", **options))
 
 
 @served(name="report")
-def report(wanted: Step = Step()) -> Any:
+def report(wanted: Step = STEP) -> Any:
     """Write report/index.html and report/summary.json."""
     return run_of(lambda here, run: _steps(here, wanted.campaigns, "report"))
 
 
 @served(name="study")
-def study(wanted: Study = Study()) -> Any:
+def study(wanted: Study = STUDY) -> Any:
     """The whole chain: collect, sync, label, train, evaluate, report."""
     return run_of(partial(_study, wanted))
 
@@ -67,19 +68,19 @@ def chain(wanted: Chain) -> Any:
 
 
 @served(name="pause")
-def pause(wanted: Ask = Ask()) -> Any:
+def pause(wanted: Ask = ASK) -> Any:
     """Let the trial that runs come to its end, then stand still."""
     return run_of(partial(_ask, "pause", wanted))
 
 
 @served(name="resume")
-def resume(wanted: Ask = Ask()) -> Any:
+def resume(wanted: Ask = ASK) -> Any:
     """Go on after a pause."""
     return run_of(partial(_ask, "resume", wanted))
 
 
 @served(name="stop")
-def stop(wanted: Ask = Ask()) -> Any:
+def stop(wanted: Ask = ASK) -> Any:
     """Stop the collection that runs now, the arm first."""
     return run_of(partial(_ask, "stop", wanted))
 
@@ -162,9 +163,7 @@ def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:
     if kind == "stop":
         outcome = controlling.stop(store, who=who, why=wanted.why, limit_s=wanted.wait_s)
     else:
-        outcome = controlling.request(
-            store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s
-        )
+        outcome = controlling.request(store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s)
     if outcome.answer is None:
         return f"{kind}: not yet; request {outcome.request.number} stands"
     return f"{kind}: done, request {outcome.request.number}: {outcome.answer['did']}"

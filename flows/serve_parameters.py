@@ -23,18 +23,20 @@ class Parameters(BaseModel):
 class OnRig(Parameters):
     """What everything that moves the arm may be told."""
 
-    operator: str = Field("", description="Who stands at the rig.")
-    temperature_c: float | None = Field(None, description="Of the room, degrees Celsius.")
-    humidity_percent: float | None = Field(None, ge=0, le=100, description="Relative, percent.")
-    note: str = Field("", description="Anything worth keeping.")
+    operator: str = Field(default="", description="Who stands at the rig.")
+    temperature_c: float | None = Field(default=None, description="Room, degrees Celsius.")
+    humidity_percent: float | None = Field(
+        default=None, ge=0, le=100, description="Relative, percent."
+    )
+    note: str = Field(default="", description="Anything worth keeping.")
     until: Until | None = Field(
-        None,
+        default=None,
         description='When the rig must be free again: "06:00" or "mon 06:00". No trial is begun '
         "that would not be over by then.",
     )
-    timezone: Zone = Field("UTC", description="Of `until`, such as Europe/Rome.")
+    timezone: Zone = Field(default="UTC", description="Of `until`, such as Europe/Rome.")
     patience_min: float = Field(
-        10.0,
+        default=10.0,
         ge=0,
         le=1440,
         description="How long to wait for a rig or a store that another program uses, minutes; "
@@ -46,45 +48,48 @@ class Collect(OnRig):
     """Takes the trials that the store lacks."""
 
     protocol: Path = Field(description="A protocol file (YAML), from the service's own folder.")
-    trials: int | None = Field(None, ge=1, description="Take so many of the missing, no more.")
-    enable: list[str] = Field([], description="Optional levels to switch on: factor=level.")
-    campaign: str | None = Field(None, description="Its name; the protocol's by default.")
+    trials: int | None = Field(
+        default=None, ge=1, description="Take so many of the missing, no more."
+    )
+    enable: list[str] = Field(default=[], description="Optional levels to switch on: factor=level.")
+    campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
 
 
 class Chain(Collect):
     """Collection, then labels and evaluation of what there is."""
 
     train: bool = Field(
-        True, description="Train again where trials came in; else evaluate a fresh model only."
+        default=True,
+        description="Train again where trials came in; else evaluate a fresh model only.",
     )
 
 
 class Study(OnRig):
     """The whole chain over the shipped protocols, to the report."""
 
-    pilot: bool = Field(False, description="The small protocols.")
+    pilot: bool = Field(default=False, description="The small protocols.")
 
 
 class Step(Parameters):
     """One step on what is stored."""
 
-    campaigns: list[str] = Field([], description="Only these campaigns; all by default.")
+    campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
 
 
 class Evaluate(Step):
     """Scores the network on trials it has never seen."""
 
-    margin: float | None = Field(None, ge=0, description="Spikes a winner must lead by.")
-    smoothing: int | None = Field(None, ge=1, description="Windows to average over.")
+    margin: float | None = Field(default=None, ge=0, description="Spikes a winner must lead by.")
+    smoothing: int | None = Field(default=None, ge=1, description="Windows to average over.")
 
 
 class Ask(Parameters):
     """A word to the collection that runs."""
 
-    who: str = Field("", description="Who asks; kept with the request.")
-    why: str = Field("", description="The reason; kept with the request.")
+    who: str = Field(default="", description="Who asks; kept with the request.")
+    why: str = Field(default="", description="The reason; kept with the request.")
     wait_s: float = Field(
-        600.0, ge=0, le=86400, description="How long to wait until it is carried out, s."
+        default=600.0, ge=0, le=86400, description="How long to wait until it is carried out, s."
     )
 
 

@@ -23,7 +23,6 @@ from protocols import InputError
 from rigs.capabilities import RigError
 from storage.errors import disk_error
 from storage.lock import Locked
-from storage.process import is_here, this_process
 from storage.store import StoreError
 
 LOOK_S = 2.0
@@ -80,9 +79,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
 def ended(flow: Any, flow_run: Any, state: Any) -> None:
     """Prefect's hook for every end, also of runs whose process could not say anything any more."""
     here = service()
-    run_records.end(
-        here.folder, str(flow_run.id), state.type.value, state.message or "", "hook"
-    )
+    run_records.end(here.folder, str(flow_run.id), state.type.value, state.message or "", "hook")
 
 
 HOOKS: dict[str, list[Any]] = {

@@ -130,9 +130,7 @@ class _Page:
         if self._progress is None:
             self._progress = self._make(client, "progress", percent, words).id
         else:
-            client.update_artifact(
-                self._progress, ArtifactUpdate(data=percent, description=words)
-            )
+            client.update_artifact(self._progress, ArtifactUpdate(data=percent, description=words))
 
     def _tell_table(self, client: Any) -> None:
         import json
@@ -173,8 +171,11 @@ class _Page:
         return client.create_artifact(
             ArtifactCreate(
                 key=artifact_key(self._order.campaign, kind),
-                type=kind, data=data, description=words, flow_run_id=self._run,
-            )  # fmt: skip
+                type=kind,
+                data=data,
+                description=words,
+                flow_run_id=self._run,
+            )
         )
 
 
