@@ -53,6 +53,14 @@ def private() -> bool:
     return PREFECT_API_URL.value() in {None, *(server.url for server in _servers.values())}
 
 
+def embedded_url() -> str:
+    """The address of the embedded server, which the first call starts."""
+    home = os.environ["PREFECT_HOME"]
+    if home not in _servers:
+        _servers[home] = EmbeddedServer(Path(home))
+    return _servers[home].url
+
+
 def run(flow: Any, parcel: Parcel[Any]) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
@@ -72,10 +80,7 @@ def run(flow: Any, parcel: Parcel[Any]) -> Any:
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     server = run_records.server_name(PREFECT_API_URL.value())
     if server == run_records.EMBEDDED:
-        home = os.environ["PREFECT_HOME"]
-        if home not in _servers:
-            _servers[home] = EmbeddedServer(Path(home))
-        updates[PREFECT_API_URL] = _servers[home].url
+        updates[PREFECT_API_URL] = embedded_url()
     with temporary_settings(updates=updates):
         if _store is not None:
             run_records.close_dead(_store, server)

@@ -41,8 +41,9 @@ _TIMING = {*Timing.model_fields, "flow", "timezone"}
 
 def _schedule(flow: FlowName, parameters: type[Parameters]) -> type[BaseModel]:
     """Timing and the parameters of one flow in one mapping, as a person writes it."""
+    kind: Any = Literal[flow]
     made: type[BaseModel] = create_model(
-        f"{flow} schedule", __base__=(Timing, parameters), flow=(Literal[flow], ...)
+        f"{flow} schedule", __base__=(Timing, parameters), flow=(kind, ...)
     )
     return made
 

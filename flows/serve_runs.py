@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 from flows import console, run_records, stopping
@@ -43,10 +44,11 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     from prefect.states import Cancelled, Completed, Failed
 
     context = FlowRunContext.get()
-    if context is None or context.flow_run is None:
+    if context is None or context.flow_run is None or context.flow is None:
         raise RuntimeError("is no flow run")
-    run, here = context.flow_run, service()
-    run_records.begin(here.folder, str(run.id), context.flow.name, here.server, here.name)
+    run, here, name = context.flow_run, service(), context.flow.name
+    run_records.begin(here.folder, str(run.id), name, here.server, here.name)
+    state: Any
     try:
         with stopping.signals():
             if os.getpid() != here.pid and not die_with(here.pid):
@@ -70,7 +72,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
         raise
     with suppress(OSError):
         run_records.end(here.folder, str(run.id), state.type.value, state.message or "", "flow")
-    console.say(f"{context.flow.name} {run.name}: {state.type.value}: {state.message}")
+    console.say(f"{name} {run.name}: {state.type.value}: {state.message}")
     if os.getpid() != here.pid and os.getppid() != here.pid and here.server == run_records.EMBEDDED:
         os._exit(console.FAILED)  # the server went with the service: nobody is left to be told
     return state
@@ -133,14 +135,12 @@ def _tell_waiting(run: Any, why: str) -> None:
 
     console.say(f"waiting: {why}")
     with suppress(Exception), get_client(sync_client=True) as client:
-        state = Running(name="WaitingForRig", message=why)
+        state: Any = Running(name="WaitingForRig", message=why)
         client.set_flow_run_state(run.id, state, force=True)
 
 
 def _words(error: Exception) -> str:
     name = getattr(error, "filename", None)
     if isinstance(error, OSError) and name:
-        from pathlib import Path
-
-        return disk_error(Path(os.fsdecode(name)), error) or str(error)
+        return str(disk_error(Path(os.fsdecode(name)), error) or error)
     return str(error) or type(error).__name__

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
+from uuid import UUID
 
 from flows import orchestration
 from flows.orders import Order, campaign_counts
@@ -71,7 +72,7 @@ def shown(order: Order) -> Iterator[Show]:
     if context is None or context.flow_run is None:
         yield Show()
         return
-    page = _Page(order, str(context.flow_run.id))
+    page = _Page(order, context.flow_run.id)
     try:
         yield page.show
     finally:
@@ -81,7 +82,7 @@ def shown(order: Order) -> Iterator[Show]:
 class _Page:
     """The thread that tells the server, and what it tells."""
 
-    def __init__(self, order: Order, run: str) -> None:
+    def __init__(self, order: Order, run: UUID) -> None:
         self._order, self._run = order, run
         self._over = threading.Event()
         self._progress: Any = None

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from typing import Any
 import pytest
 import yaml
 
-from flows import run_records, serve, showing
-from flows.embedded_server import EmbeddedServer
+from flows import orchestration, run_records, serve, serve_runs, showing
+from flows.orders import make_order
 from flows.serve_file import Scheduled
 from flows.serve_parameters import Ask, Chain, Collect, OnRig
 from flows.serve_runs import until_of
@@ -25,7 +26,7 @@ from flows.stops import WindowOver
 from protocols import InputError
 from storage.derived import Derived
 from storage.files import read_json, write_json
-from storage.lock import exclusive
+from storage.lock import Locked, exclusive
 from storage.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
@@ -35,22 +36,20 @@ RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Prefect's embedded server, as `sliplab serve` has it; the settings point at it."""
+def server() -> Iterator[str]:
+    """The embedded server of the tests; the settings point at it."""
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
-    running = EmbeddedServer(tmp_path_factory.mktemp("server"))
-    try:
-        with temporary_settings(updates={PREFECT_API_URL: running.url}):
-            yield running.url
-    finally:
-        running.stop()
+    url = orchestration.embedded_url()
+    with temporary_settings(updates={PREFECT_API_URL: url}):
+        yield url
 
 
 @pytest.fixture
 def service(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
     """This process as the one that serves a store that is not there yet."""
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
+    monkeypatch.setattr(orchestration, "private", lambda: False)  # as if somebody could look
     store = Store.create(tmp_path / "store")
     found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid())
     found.tell()
@@ -122,6 +121,28 @@ def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protoc
         stack.enter_context(exclusive(service.folder / ".lock", "the store"))
         state = collect(Collect(protocol=protocol, patience_min=0), return_state=True)
     assert (state.type.value, "is in use by another program" in state.message) == ("FAILED", True)
+
+
+def test_a_rig_that_is_free_again_is_taken(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serve_runs, "LOOK_S", 0.01)
+    order = make_order(protocol, RIG, service.folder)
+    answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
+    told: list[str] = []
+    monkeypatch.setattr(serve_runs, "_tell_waiting", lambda run, why: told.append(why))
+
+    def work() -> dict[str, Any]:
+        answer = answers.pop(0)
+        if isinstance(answer, Locked):
+            raise answer
+        return answer
+
+    assert serve_runs.when_free(order, 10.0, work, None) == {"taken": 1}
+    assert told == ["the rig is in use by anna"]
+    answers[:] = [Locked("the rig is in use by anna")]
+    with pytest.raises(WindowOver, match="nothing was taken: the rig is in use by anna"):
+        serve_runs.when_free(replace(order, until=0.0), 10.0, work, None)
 
 
 def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:

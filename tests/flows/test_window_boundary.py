@@ -27,11 +27,15 @@ def after(calls: int, before: float = 0.0, then: float = 1000.0) -> Callable[[],
 
 def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> None:
     wanted = campaign.order(tmp_path, 4)
-    with pytest.raises(WindowOver, match="the next collection goes on"):  # noqa: SIM117
+
+    def night() -> None:
         with stretch(replace(wanted, until=500.0)) as work:
             work.boundary.clock = after(3)
             work.session.rig.connect()
             work.session.take(work.trials)
+
+    with pytest.raises(WindowOver, match="the next collection goes on"):
+        night()
     store = Store.open(wanted.store).campaign(campaign.NAME)
     assert 1 <= len(store.committed()) <= 3  # retakes ask as well
     assert not list((store.folder / "incoming").iterdir())
