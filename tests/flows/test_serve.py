@@ -244,3 +244,25 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     page.call("/deployments/get_scheduled_flow_runs", {"deployment_ids": [there["id"]]})
     with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
         asyncio.run(serve._refuse_another("collect", "here", Store.create(tmp_path / "other")))
+
+
+def test_what_a_killed_service_had_taken_is_closed(service: Service, server: str) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.states import Pending
+
+    from flows.serve_flows import label
+
+    async def register() -> None:
+        await (await label.ato_deployment("stranded")).aapply()
+
+    asyncio.run(register())
+    page, store = Page(server, "stranded"), Store.open(service.folder)
+    taken, ours, waiting = (page.run("label")["id"] for _ in range(3))
+    with get_client(sync_client=True) as client:
+        for run in (taken, ours):
+            client.set_flow_run_state(run, Pending(), force=True)
+    run_records.begin(service.folder, ours, "label", "embedded")  # by a process that is alive
+    asyncio.run(serve._close_stranded("stranded", ["label"], store))
+    assert page.state(taken)["type"] == "CRASHED"
+    assert "was killed" in page.state(taken)["message"]
+    assert [page.state(run)["type"] for run in (ours, waiting)] == ["PENDING", "SCHEDULED"]
