@@ -58,6 +58,7 @@ def run_step(folder: Path, names: list[str] | None, step: str, **options: Any) -
 
 
 def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+    """Print what a command did, as one JSON object or for a person."""
     if as_json:
         console.print_json(result)
         return
