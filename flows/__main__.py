@@ -58,7 +58,7 @@ def _explain(error: Exception) -> int:
     ):
         console.say(f"error: {said}")
         return console.FAILED
-    expected = {"StoreError", "RigError", "ArmFault", "Locked", "CampaignStopped"}
+    expected = {"StoreError", "RigError", "ArmFault", "Locked", "CampaignStopped", "ServerError"}
     if type(error).__name__ not in expected:
         console.messages.print_exception(max_frames=8)
     console.say(f"error: {error or type(error).__name__}")

@@ -20,6 +20,7 @@ from flows.cli_common import (
 )
 from flows.cli_control import register as register_control
 from flows.cli_rigs import rigs
+from flows.cli_serve import register as register_serve
 
 app = typer.Typer(
     name="sliplab",
@@ -144,5 +145,6 @@ cli_chain.register(app)
 cli_store.register(app)
 app.command()(rigs)
 register_control(app)
+register_serve(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

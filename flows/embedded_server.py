@@ -53,7 +53,7 @@ class EmbeddedServer:
         page: whether it has Prefect's page, and all of its services with it.
 
     Raises:
-        ServerError: the port is taken.
+        ServerError: the port is taken, or it did not start.
     """
 
     def __init__(self, home: Path, port: int = 0, *, page: bool = False) -> None:

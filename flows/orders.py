@@ -42,6 +42,8 @@ class Order:
     bench: Bench = Bench()
     most: int | None = None
     """Trials that were asked for at most."""
+    until: float | None = None
+    """When the rig has to be free again, seconds since 1970; None for no such time."""
 
     def wanted(self, campaign: Campaign) -> list[Trial]:
         """Trials to take now, in the plan's order."""
@@ -57,6 +59,7 @@ def make_order(
     campaign: str | None = None,
     bench: Bench = Bench(),
     most: int | None = None,
+    until: float | None = None,
 ) -> Order:
     """Read and check everything that can be known before anything moves.
 
@@ -77,7 +80,7 @@ def make_order(
     # one campaign, one physics: a level of a factor that is added later must not change it
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
-    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most, until)
     if begun:
         _check_same(order, begun)
     return order
