@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,21 +13,25 @@ from prefect.cache_policies import NO_CACHE
 
 from analysis import dataset, metrics, model_file, training
 from analysis.baselines import evaluate_baselines
+from analysis.dataset import SampleSet
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
-from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.label import STEP as LABELS
 from flows.label import label_key
 from flows.orchestration import Parcel, run
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
+from flows.trial_work import TrialWork, keep_trials, stale_trials
 from protocols import Trial
-from protocols.settings import Detection
+from protocols.settings import Detection, Windows
 from storage.derived import Derived, make_key
 from storage.files import read_json
 from storage.recording import Recording
 from storage.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 STEP = "evaluation"
 COUNTS = "counts"
@@ -46,6 +51,7 @@ class Job:
     trials: list[tuple[Collected, Trial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
     key: str
+    cluster: Cluster | None = None
 
 
 def choose_model(models: list[Model]) -> Model:
@@ -65,11 +71,13 @@ def make_job(
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
+    cluster: Cluster | None = None,
 ) -> Job:
     """Find what is to be evaluated, and by what detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own.
+        cluster: what counts spikes and makes samples, instead of this machine.
     """
     models = wanted_models(store, campaigns)
     model = choose_model(models)
@@ -99,38 +107,64 @@ def make_job(
         detection,
         trials,
         make_key(STEP, VERSION, [model.key, inputs], used),
+        cluster,
     )
 
 
-@task(name="spike counts", cache_policy=NO_CACHE, persist_result=False)
-def count_spikes(wanted: Parcel[Job]) -> int:
-    """Run the network over all consecutive windows of every trial that needs it."""
-    job = wanted.content
+@dataclass(frozen=True)
+class _Counting:
+    """What spike counts depend on besides the trial.
+
+    Attributes:
+        threads: of the network; None for as many as there are cores.
+    """
+
+    model: bytes
+    windows: Windows
+    threads: int | None
+
+
+def count_spikes(job: Job) -> int:
+    """Run the network over all consecutive windows of every trial that needs it.
+
+    In this process, where the network uses all cores; or on a cluster.
+    """
     windows = training_settings(job.campaigns).windows
-    work = [
-        (item, trial, recording, key)
-        for item, trial, recording, key in job.trials
-        if not Derived.of(job.store, COUNTS, item.name).fresh(trial.id, key)
+    model = job.model.path.read_bytes()
+    counting = _Counting(model, windows, None if job.cluster is None else 1)
+    wanted = [
+        TrialWork(recording, item.name, key, counting) for item, _, recording, key in job.trials
     ]
+    work = stale_trials(job.store, COUNTS, wanted)
     if work:
-        fitted = model_file.load(job.model.path)
-        with console.bar("evaluate (trials)", len(work)) as bar:
-            for item, trial, recording, key in work:
-                x, end_ns = dataset.trial_windows(recording, windows)
-                arrays = {"counts": training.predict_counts(fitted, x), "end_ns": end_ns}
-                Derived.of(job.store, COUNTS, item.name).write(trial.id, key, {}, arrays)
-                bar.advance(1, trial.id)
+        keep_trials(job.store, COUNTS, "evaluate", work, _count, job.cluster, processes=False)
     return len(work)
 
 
+def _count(
+    recording: Recording, counting: _Counting
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Spike counts of all windows of a trial."""
+    if counting.threads is not None:
+        training.limit_threads(counting.threads)
+    x, end_ns = dataset.trial_windows(recording, counting.windows)
+    counts = training.predict_counts(_fitted(counting.model), x)
+    return {}, {"counts": counts, "end_ns": end_ns}
+
+
+@lru_cache(maxsize=2)
+def _fitted(model: bytes) -> training.Fitted:
+    return model_file.parse(model, "the model")
+
+
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(wanted: Parcel[Job]) -> None:
+def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
-    job = wanted.content
+    job, train, test = wanted.content
     rows = _score_trials(job)
     result = {
         "seed": job.model.seed,
-        "windows": _score_windows(job),
+        "windows": _score_windows(job, train, test),
         "trials": rows,
         "experiments": _summaries(rows),
         "label_error_ms": _label_errors(job),
@@ -139,11 +173,9 @@ def score(wanted: Parcel[Job]) -> None:
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 
 
-def _score_windows(job: Job) -> dict[str, Any]:
+def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
     """The chosen samples of the test trials: the network and the baselines beside it."""
     settings = training_settings(job.campaigns)
-    train = load_samples(job.store, job.campaigns, "train")
-    test = load_samples(job.store, job.campaigns, "test")
     counts = training.predict_counts(model_file.load(job.model.path), test.x)
     margin = settings.detection.margin
     by_trial = {
@@ -244,8 +276,12 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
     """Count spikes where needed, then score."""
     job = wanted.content
     with timed(job.store, "evaluate"):
-        count_spikes(Parcel(job))
-        score(Parcel(job))
+        count_spikes(job)
+        train, test = (
+            load_samples(job.store, job.campaigns, split, job.cluster)
+            for split in ("train", "test")
+        )
+        score(Parcel((job, train, test)))
 
 
 def evaluate(
@@ -253,11 +289,12 @@ def evaluate(
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
+    cluster: Cluster | None = None,
 ) -> dict[str, Any]:
     """Evaluate if any input or setting changed."""
     training_campaigns(campaigns)
-    job = make_job(store, campaigns, margin, smoothing)
+    job = make_job(store, campaigns, margin, smoothing, cluster)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
-        run(evaluate_flow, Parcel(job))
+        run(evaluate_flow, Parcel(job), cluster)
     return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}

@@ -7,11 +7,13 @@ that the user names with PREFECT_API_URL is used instead of the embedded one.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from flows.embedded_server import EmbeddedServer
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 T = TypeVar("T")
 
@@ -27,10 +29,26 @@ _servers: dict[str, EmbeddedServer] = {}
 
 
 class Parcel(Generic[T]):
-    """Carries any object into a flow or task without Prefect validating, walking or storing it."""
+    """Carries any object into a flow or task without Prefect validating, walking or storing it.
+
+    It stays in its process: with a task that runs elsewhere Prefect also sends what its flow was
+    called with, which that task has no use for.
+    """
 
     def __init__(self, content: T) -> None:
         self.content = content
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without its content."""
+        return type(self), (None,)
+
+
+class Freight(Parcel[T]):
+    """A parcel that goes to other processes with its content."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With its content."""
+        return type(self), (self.content,)
 
 
 def prepare(store: Path) -> None:
@@ -43,11 +61,14 @@ def prepare(store: Path) -> None:
         os.environ.setdefault(name, value)
 
 
-def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
+def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Without heartbeats, because each would cost a flow a second of waiting for their thread; a
     killed run is known by what the store lacks.
+
+    Args:
+        cluster: where its tasks go that are submitted, instead of threads.
     """
     from prefect.settings import (
         PREFECT_API_URL,
@@ -62,4 +83,6 @@ def run(flow: Callable[..., Any], parcel: Parcel[Any]) -> Any:
             _servers[home] = EmbeddedServer(Path(home))
         updates[PREFECT_API_URL] = _servers[home].url
     with temporary_settings(updates=updates):
+        if cluster is not None:
+            flow = flow.with_options(task_runner=cluster.runner())
         return flow(parcel)

@@ -89,9 +89,7 @@ def fetch(path: Path, said: Json) -> None:
         raise StoreError(f"{path}: is missing, and {store / ORIGIN} does not say where it is")
     try:
         with disk_explained(store):
-            _remote(url).get_file(
-                f"{objects_folder(campaign)}/{said['sha256']}", path, said["sha256"]
-            )
+            _remote(url).get_file(f"{objects_folder(campaign)}/{said['sha256']}", path, said)
     except RemoteError as error:
         raise RemoteError(f"{path}: {error}") from None
 

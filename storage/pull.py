@@ -300,7 +300,7 @@ def get(remote: Remote, there: Manifest, name: str, path: Path) -> int:
     """Fetch one file of a manifest; its bytes."""
     said = there.files[name]
     try:
-        remote.get_file(there.object_key(name), path, said["sha256"])
+        remote.get_file(there.object_key(name), path, said)
     except RemoteError as error:
         raise RemoteError(f"{remote.where(there.key)}: {name}: {error}") from None
     return int(said["bytes"])

@@ -127,8 +127,7 @@ class _Push:
             return
         self._there = self._remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
-        self._manifests("about")
-        self._send(about, self._campaign.folder)
+        self._send(about, self._campaign.folder, self._manifests("about").get(""))
         ours = set()
         for recording in self._campaign.recordings():
             trial = recording.folder.name
@@ -152,7 +151,7 @@ class _Push:
             self._problem(f"{self._campaign.name}: {trial}: {error}")
             return
         if there is not None and there.files == made.files:
-            self._done.there += not self._wishes.check or self._send(made, folder)
+            self._done.there += not self._wishes.check or self._send(made, folder, there)
             return
         foreign = there is not None and there.take not in {made.take, *self._takes(trial, "")}
         if foreign and not self._wishes.replace:
@@ -161,7 +160,7 @@ class _Push:
                 "this store; push to another place, or replace it with --replace"
             )
             return
-        if self._send(made, folder):
+        if self._send(made, folder, there):
             if there is None:
                 self._done.pushed += 1
             else:
@@ -178,26 +177,19 @@ class _Push:
                 continue
             if name in there and there[name].files == made.files and not self._wishes.check:
                 continue
-            if self._send(made, self._campaign.folder / "quarantine" / name):
+            if self._send(made, self._campaign.folder / "quarantine" / name, there.get(name)):
                 self._done.set_aside += 1
 
-    def _send(self, made: Manifest, folder: Path) -> bool:
+    def _send(self, made: Manifest, folder: Path, there: Manifest | None) -> bool:
         """Objects, then the manifest. False where the files are not what they should be."""
         for name, said in made.files.items():
             problem = self._object(made.object_key(name), folder / name, said)
             if problem is not None:
                 self._problem(f"{self._campaign.name}: {folder / name}: {problem}")
                 return False
-        data = made.dump()
-        if self._visible(made.key) != data:
-            self._remote.put_bytes(made.key, data)
+        if made != there:
+            self._remote.put_bytes(made.key, made.dump())
         return True
-
-    def _visible(self, key: str) -> bytes | None:
-        try:
-            return self._remote.read(key)
-        except RemoteMissing:
-            return None
 
     def _object(self, key: str, path: Path, said: Json) -> str | None:
         """Have a file's bytes under its checksum; what is wrong with the file, if it is."""
@@ -231,7 +223,7 @@ class _Push:
     def _right(self, key: str, said: Json) -> bool:
         try:
             if self._wishes.read_back:
-                return bool(self._remote.digest(key, self._on_bytes) == said["sha256"])
+                return self._remote.matches(key, said, self._on_bytes)
             return bool(self._remote.size(key) == said["bytes"])
         except RemoteMissing:
             return False

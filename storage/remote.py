@@ -8,6 +8,7 @@ or in fsspec's own configuration (docs/scale.md), never in a URL and never in a 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,6 +20,7 @@ from urllib.parse import urlsplit
 from protocols.errors import InputError
 from storage.errors import StoreError
 from storage.files import json_text, make_folder, read_blocks, write_blocks
+from storage.streams import Json
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
 SMALL_BYTES = 8_000_000
@@ -121,8 +123,6 @@ class Remote:
             RemoteMissing: nothing was ever pushed there.
             RemoteError: it is of a newer version, or damaged.
         """
-        import json
-
         try:
             data = self.read(LAYOUT_FILE)
         except RemoteMissing:
@@ -189,14 +189,19 @@ class Remote:
                 read[key] = error
         return read
 
-    def digest(self, key: str, on_bytes: OnBytes | None = None) -> str:
-        """SHA-256 of an object, all of it read."""
-        digest = hashlib.sha256()
-        for block in self._blocks(key, None):
+    def matches(self, key: str, said: Json, on_bytes: OnBytes | None = None) -> bool:
+        """Whether an object has the ``bytes`` and the ``sha256`` of `said`; all of it is read.
+
+        Raises:
+            RemoteMissing: it is not there.
+        """
+        digest, size = hashlib.sha256(), 0
+        for block in self._blocks(key, said["bytes"] and said["bytes"] + 1):
             digest.update(block)
+            size += len(block)
             if on_bytes is not None:
                 on_bytes(len(block))
-        return digest.hexdigest()
+        return bool(size == said["bytes"] and digest.hexdigest() == said["sha256"])
 
     def size(self, key: str) -> int:
         """Bytes of an object.
@@ -217,23 +222,25 @@ class Remote:
             key, lambda: read_blocks(path), lambda: self._fs.put_file(str(path), self._path(key))
         )
 
-    def get_file(self, key: str, path: Path, sha256: str, on_bytes: OnBytes | None = None) -> None:
+    def get_file(self, key: str, path: Path, said: Json) -> None:
         """Fetch an object into `path`, which appears once all of it is there and as it should be.
+
+        Args:
+            said: its ``bytes`` and ``sha256``.
 
         Raises:
             RemoteMissing: it is not there.
             RemoteError: it cannot be read, or does not match its checksum.
             OSError: `path` cannot be written.
         """
-        digest = hashlib.sha256()
 
         def checked() -> Iterator[bytes]:
-            for block in self._blocks(key, None):
+            digest, size = hashlib.sha256(), 0
+            for block in self._blocks(key, said["bytes"] and said["bytes"] + 1):
                 digest.update(block)
-                if on_bytes is not None:
-                    on_bytes(len(block))
+                size += len(block)
                 yield block
-            if digest.hexdigest() != sha256:
+            if size != said["bytes"] or digest.hexdigest() != said["sha256"]:
                 raise RemoteError(f"{self.where(key)}: does not match its checksum")
 
         write_blocks(path, checked())
@@ -255,16 +262,18 @@ class Remote:
             else:
                 put()
 
-    def _blocks(self, key: str, most: int | None) -> Iterator[bytes]:
-        """An object's bytes, the first `most` of them."""
+    def _blocks(self, key: str, most: int | None = None) -> Iterator[bytes]:
+        """An object's bytes, the first `most` of them; who knows how many saves asking for it."""
         path = self._path(key)
-        with self._told(key, "read"):
-            size = int(self._fs.info(path)["size"])
-        end = size if most is None else min(size, most)
-        for start in range(0, end, _BLOCK):
+        if not most:
+            most = self.size(key)
+        for start in range(0, most, _BLOCK):
+            end = min(most, start + _BLOCK)
             with self._told(key, "read"):
-                block = self._fs.cat_file(path, start=start, end=min(end, start + _BLOCK))
+                block = self._fs.cat_file(path, start=start, end=end)
             yield block
+            if len(block) < end - start:
+                return
 
     def _list(self, folder: str) -> list[dict[str, Any]]:
         path = self._path(folder) if folder else self._root
