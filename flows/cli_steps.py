@@ -101,13 +101,14 @@ def tradeoff(
     sensitivity: Annotated[
         bool, typer.Option("--sensitivity", help="Also what each guessed number changes.")
     ] = False,
+    dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure what simulating a protocol's scene costs, and how far off cheaper ways are."""
     from flows import tradeoff as steps
     from flows.tradeoff_page import choice_pairs, short_table
 
-    result = steps.tradeoff(scene, rig, out, trials, sensitivity)
+    result = steps.tradeoff(scene, rig, out, trials, sensitivity, dask=dask)
     if as_json:
         console.print_json(result)
         return
