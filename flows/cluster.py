@@ -7,6 +7,7 @@ made again. Nothing here is loaded without `--dask`.
 
 from __future__ import annotations
 
+import asyncio
 import platform
 import queue
 import re
@@ -30,6 +31,10 @@ CONNECT_S = 15.0
 ALONE_S = 60.0
 """How long a cluster may be without any worker before the step gives up."""
 LOOK_S = 0.5
+ANSWER_S = 60.0
+"""How long all workers may take to answer a question."""
+REPORT_S = 5.0
+"""How long workers may take to send their last reports to Prefect's server."""
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/:\s]+:\d{1,5}")
 _PACKAGES = ("protocols", "storage", "analysis", "rigs", "flows")
 _LIBRARIES = ("numpy", "numba", "scipy", "torch", "h5py", "av", "opencv-contrib-python-headless")
@@ -79,6 +84,11 @@ class Cluster:
             "workers need the store at the same path (share its folder), or give the URL of a "
             "pushed one",
         )  # fmt: skip
+
+    def report(self) -> None:
+        """Have the workers tell Prefect's server what they did, while it is there."""
+        with suppress(Exception):  # nothing but Prefect's own view depends on it
+            _run(self.client, report_all, REPORT_S)
 
     def gather(self, futures: list[Any], done: Callable[[int, Any], None]) -> None:
         """Hand over the result of each of Prefect's futures as it comes.
@@ -182,10 +192,26 @@ def _look_at_all(client: Any, address: str) -> int:
 
 def _ask_all(client: Any, question: Callable[[Any], None], about: Any, todo: str) -> None:
     """Ask every worker; the first that objects is named."""
-    answers = client.run(question, about, on_error="return")
-    for worker, answer in sorted(answers.items()):
+    for worker, answer in sorted(_run(client, question, about).items()):
         if answer is not None:
             raise ClusterError(f"worker {worker}: {_short(answer)}; {todo}")
+
+
+def _run(client: Any, question: Callable[[Any], None], about: Any) -> dict[str, Any]:
+    """What each worker answers, or the exception that it had instead."""
+    try:
+        # as `client.run`, which knows no limit
+        answers: dict[str, Any] = client.sync(
+            client._run, in_thread, question, about, on_error="return", callback_timeout=ANSWER_S
+        )
+    except (OSError, TimeoutError) as error:
+        raise ClusterError(f"the Dask workers do not answer ({_short(error)})") from None
+    return answers
+
+
+async def in_thread(question: Callable[[Any], None], about: Any) -> None:
+    """Asked of a worker: `question`, while the worker goes on talking to its scheduler."""
+    await asyncio.to_thread(question, about)
 
 
 def this_program() -> dict[str, str]:
@@ -231,6 +257,7 @@ def reach_server(url: str) -> None:
     """
     import urllib.request
 
+    report_all(0.0)  # whatever is left is for the server of a command that was killed
     try:
         with urllib.request.urlopen(f"{url}/health", timeout=10) as answer:
             if answer.status == 200:
@@ -239,6 +266,16 @@ def reach_server(url: str) -> None:
     except OSError as error:
         problem = str(error)
     raise ClusterError(f"({socket.gethostname()}) cannot reach the Prefect server {url}: {problem}")
+
+
+def report_all(limit_s: float = REPORT_S) -> None:
+    """Asked of a worker: send what Prefect has not reported yet, and then report anew.
+
+    The next command may have another server, of which a worker that reports already would not know.
+    """
+    from prefect.events.worker import EventsWorker
+
+    EventsWorker.drain_all(timeout=limit_s, at_exit=False)
 
 
 def _result(future: Any) -> Any:

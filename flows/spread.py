@@ -93,7 +93,10 @@ def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluste
         for k, result in enumerate(results):
             done(starts[number] + k, result)
 
-    cluster.gather(futures, handed_over)
+    try:
+        cluster.gather(futures, handed_over)
+    finally:
+        cluster.report()
 
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
