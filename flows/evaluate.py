@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,20 +10,21 @@ import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis import dataset, metrics, model_file, training
+from analysis import metrics, model_file, training
 from analysis.baselines import evaluate_baselines
 from analysis.dataset import SampleSet
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from flows import counting
 from flows.campaigns import Collected, training_campaigns
+from flows.counting import COUNTS, count_spikes
 from flows.label import STEP as LABELS
 from flows.label import label_key
 from flows.orchestration import Parcel, run
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
-from flows.trial_work import TrialWork, keep_trials, stale_trials
 from protocols import Trial
-from protocols.settings import Detection, Windows
+from protocols.settings import Detection
 from storage.derived import Derived, make_key
 from storage.files import read_json
 from storage.recording import Recording
@@ -34,9 +34,7 @@ if TYPE_CHECKING:
     from flows.cluster import Cluster
 
 STEP = "evaluation"
-COUNTS = "counts"
 VERSION = 1
-COUNTS_VERSION = 1
 NAME = "evaluation"
 
 
@@ -96,7 +94,7 @@ def make_job(
             label = label_key(recording, item.settings.labelling)
             if not labels.fresh(trial.id, label):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
-            counts = make_key(COUNTS, COUNTS_VERSION, [model.key, recording.checksum], windows)
+            counts = make_key(COUNTS, counting.VERSION, [model.key, recording.checksum], windows)
             trials.append((item, trial, recording, counts))
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
@@ -109,52 +107,6 @@ def make_job(
         make_key(STEP, VERSION, [model.key, inputs], used),
         cluster,
     )
-
-
-@dataclass(frozen=True)
-class _Counting:
-    """What spike counts depend on besides the trial.
-
-    Attributes:
-        threads: of the network; None for as many as there are cores.
-    """
-
-    model: bytes
-    windows: Windows
-    threads: int | None
-
-
-def count_spikes(job: Job) -> int:
-    """Run the network over all consecutive windows of every trial that needs it.
-
-    In this process, where the network uses all cores; or on a cluster.
-    """
-    windows = training_settings(job.campaigns).windows
-    model = job.model.path.read_bytes()
-    counting = _Counting(model, windows, None if job.cluster is None else 1)
-    wanted = [
-        TrialWork(recording, item.name, key, counting) for item, _, recording, key in job.trials
-    ]
-    work = stale_trials(job.store, COUNTS, wanted)
-    if work:
-        keep_trials(job.store, COUNTS, "evaluate", work, _count, job.cluster, processes=False)
-    return len(work)
-
-
-def _count(
-    recording: Recording, counting: _Counting
-) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """Spike counts of all windows of a trial."""
-    if counting.threads is not None:
-        training.limit_threads(counting.threads)
-    x, end_ns = dataset.trial_windows(recording, counting.windows)
-    counts = training.predict_counts(_fitted(counting.model), x)
-    return {}, {"counts": counts, "end_ns": end_ns}
-
-
-@lru_cache(maxsize=2)
-def _fitted(model: bytes) -> training.Fitted:
-    return model_file.parse(model, "the model")
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
@@ -276,7 +228,13 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
     """Count spikes where needed, then score."""
     job = wanted.content
     with timed(job.store, "evaluate"):
-        count_spikes(job)
+        count_spikes(
+            job.store,
+            job.model.path,
+            training_settings(job.campaigns).windows,
+            [(item.name, recording, key) for item, _, recording, key in job.trials],
+            job.cluster,
+        )
         train, test = (
             load_samples(job.store, job.campaigns, split, job.cluster)
             for split in ("train", "test")
