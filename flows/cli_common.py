@@ -48,7 +48,7 @@ def located(place: str) -> Path:
         StoreError: there is none.
     """
     from storage.mirror import open_mirror
-    from storage.remote import is_url
+    from storage.urls import is_url
 
     if not is_url(place):
         return Path(place)

@@ -83,8 +83,8 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Check every checksum, count and clock of a store; changes nothing unless told to."""
-    from storage.remote import is_url
     from storage.store import Store
+    from storage.urls import is_url
     from storage.verify import set_aside, trial_folders
     from storage.verify import verify as look
 

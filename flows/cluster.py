@@ -58,7 +58,7 @@ class Cluster:
 
     def runner(self) -> Any:
         """Prefect's task runner for this cluster."""
-        from prefect_dask import DaskTaskRunner
+        from prefect_dask.task_runners import DaskTaskRunner
 
         return DaskTaskRunner(address=self.address)
 

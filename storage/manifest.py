@@ -22,7 +22,7 @@ from typing import Any, Literal
 from protocols.hashing import hash_data
 from storage.decisions import SKIPPED
 from storage.files import json_text, read_json, sha256
-from storage.remote import RemoteError
+from storage.remote import SMALL_BYTES, Remote, RemoteError, RemoteMissing
 from storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError, safe_name
 from storage.streams import Json
 from storage.whole import read_sums
@@ -134,6 +134,43 @@ def _plain(known: Any) -> bool:
         and type(known.get("bytes")) is int
         and known["bytes"] >= 0
     )
+
+
+def read_manifests(
+    remote: Remote, campaign: str, kind: Kind, only: str = ""
+) -> dict[str, Manifest | RemoteError]:
+    """Every manifest of a kind by its name; what is wrong with it in place of one that is.
+
+    Args:
+        only: the one of this name.
+    """
+    if kind == "about" or only:
+        names = [only]
+    else:
+        folder = manifest_key(kind, campaign).removesuffix(".json")
+        names = [
+            name.removesuffix(".json")
+            for name, size in sorted(remote.sizes(folder).items())
+            if name.endswith(".json") and not name.startswith(".") and size <= SMALL_BYTES
+        ]
+    found: dict[str, Manifest | RemoteError] = {}
+    keys: dict[str, str] = {}
+    for name in names:
+        try:
+            keys[manifest_key(kind, campaign, name)] = name
+        except StoreError as error:
+            found[name] = RemoteError(f"{remote.url}: campaign {campaign}: {error}")
+    for key, data in remote.read_many(list(keys)).items():
+        name = keys[key]
+        if isinstance(data, RemoteMissing):
+            continue
+        try:
+            if isinstance(data, RemoteError):
+                raise data
+            found[name] = parse(data, kind, campaign, name, remote.where(key))
+        except RemoteError as error:
+            found[name] = error
+    return found
 
 
 def of_campaign(campaign: Campaign) -> Manifest:

@@ -15,14 +15,15 @@ from functools import lru_cache
 from pathlib import Path
 
 from protocols.hashing import hash_text
+from storage.bring import bring
 from storage.errors import StoreError, disk_explained
 from storage.files import make_folder, write_json
-from storage.manifest import Manifest, objects_folder
-from storage.pull import ORIGIN, Pulled, bring, origin_of, pull
-from storage.push import read_manifests
-from storage.remote import Remote, RemoteError, RemoteMissing, check_url, is_url
+from storage.manifest import Manifest, objects_folder, read_manifests
+from storage.pull import ORIGIN, Pulled, origin_of, pull
+from storage.remote import Remote, RemoteError, RemoteMissing
 from storage.store import FORMAT, STORE, Store
 from storage.streams import Json
+from storage.urls import check_url, is_url
 from storage.whole import partial
 
 CACHE = "SLIPLAB_CACHE"

@@ -6,27 +6,22 @@ What comes from elsewhere writes nothing but files of known names inside the sto
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from storage.bring import BIG, bring, get, holds
 from storage.errors import StoreError, disk_explained
 from storage.files import make_folder, read_json, sync_folder, write_bytes, write_json
 from storage.lock import STORE_LOCK, exclusive
-from storage.manifest import Manifest, check_against_sums, take_of
-from storage.push import read_manifests
+from storage.manifest import Manifest, read_manifests, take_of
 from storage.remote import OnBytes, Remote, RemoteError
 from storage.store import Campaign, Store, safe_name
-from storage.streams import Json
-from storage.whole import ELSEWHERE, byte_problem, partial, read_sums, to_fetch
-from storage.writer import CHECKSUMS, DATA, FRAMES
+from storage.whole import ELSEWHERE, partial, to_fetch
+from storage.writer import CHECKSUMS
 
 ORIGIN = "origin.json"
 """In a store that was pulled: from where."""
-BIG = frozenset({DATA, FRAMES})
-"""Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
 
 
@@ -162,7 +157,7 @@ class _Pull:
         folder = self._campaign.folder
         for name in _FOLDERS:
             make_folder(self._campaign._inside(folder / name))
-        lacks = [name for name, said in about.files.items() if not _holds(folder / name, said)]
+        lacks = [name for name, said in about.files.items() if not holds(folder / name, said)]
         if not lacks:
             return
         if not self._follows:
@@ -249,62 +244,3 @@ class _Pull:
 
 class _Differs(StoreError):
     """This store has something else under that name."""
-
-
-def bring(
-    remote: Remote,
-    there: Manifest,
-    aside: Path,
-    target: Path,
-    *,
-    small: bool = False,
-    on_file: Callable[[int], None] | None = None,
-) -> None:
-    """Make the folder `target` of a manifest: all files aside, each checked, then one rename.
-
-    What an interrupted one left in `aside` is used. If somebody else made `target` meanwhile,
-    theirs stays.
-
-    Raises:
-        RemoteError: a file is not what its manifest says, or cannot be fetched.
-    """
-    make_folder(aside)
-    marker = aside / ELSEWHERE
-    write_json(marker, {"take": there.take})
-    for name, said in sorted(there.files.items()):
-        if small and name in BIG:
-            continue
-        if not _holds(aside / name, said):
-            size = get(remote, there, name, aside / name)
-            if on_file is not None:
-                on_file(size)
-    if there.kind == "trials":
-        try:
-            check_against_sums(there, read_sums(aside), remote.where(there.key))
-        except ValueError as error:
-            raise RemoteError(f"{remote.where(there.key)}: {error}") from None
-    if not small:
-        marker.unlink()
-    sync_folder(aside)
-    try:
-        os.rename(aside, target)
-    except OSError:
-        if not target.is_dir():
-            raise
-        shutil.rmtree(aside)  # another process was first
-        return
-    sync_folder(target.parent)
-
-
-def get(remote: Remote, there: Manifest, name: str, path: Path) -> int:
-    """Fetch one file of a manifest; its bytes."""
-    said = there.files[name]
-    try:
-        remote.get_file(there.object_key(name), path, said)
-    except RemoteError as error:
-        raise RemoteError(f"{remote.where(there.key)}: {name}: {error}") from None
-    return int(said["bytes"])
-
-
-def _holds(path: Path, said: Json) -> bool:
-    return byte_problem(path, said) is None

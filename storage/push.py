@@ -13,8 +13,8 @@ from pathlib import Path
 
 from storage import manifest as manifests
 from storage.errors import StoreError
-from storage.manifest import Kind, Manifest, manifest_key, objects_folder
-from storage.remote import SMALL_BYTES, OnBytes, Remote, RemoteError, RemoteMissing
+from storage.manifest import Kind, Manifest, objects_folder, read_manifests
+from storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
 from storage.store import AGAIN, INFO, Campaign, Store
 from storage.streams import Json
 from storage.whole import byte_problem
@@ -276,40 +276,3 @@ class _Push:
 
 class _Conflict(RemoteError):
     """Two stores have campaigns of one name."""
-
-
-def read_manifests(
-    remote: Remote, campaign: str, kind: Kind, only: str = ""
-) -> dict[str, Manifest | RemoteError]:
-    """Every manifest of a kind by its name; what is wrong with it in place of one that is.
-
-    Args:
-        only: the one of this name.
-    """
-    if kind == "about" or only:
-        names = [only]
-    else:
-        folder = manifest_key(kind, campaign).removesuffix(".json")
-        names = [
-            name.removesuffix(".json")
-            for name, size in sorted(remote.sizes(folder).items())
-            if name.endswith(".json") and not name.startswith(".") and size <= SMALL_BYTES
-        ]
-    found: dict[str, Manifest | RemoteError] = {}
-    keys: dict[str, str] = {}
-    for name in names:
-        try:
-            keys[manifest_key(kind, campaign, name)] = name
-        except StoreError as error:
-            found[name] = RemoteError(f"{remote.url}: campaign {campaign}: {error}")
-    for key, data in remote.read_many(list(keys)).items():
-        name = keys[key]
-        if isinstance(data, RemoteMissing):
-            continue
-        try:
-            if isinstance(data, RemoteError):
-                raise data
-            found[name] = manifests.parse(data, kind, campaign, name, remote.where(key))
-        except RemoteError as error:
-            found[name] = error
-    return found

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,12 +20,12 @@ from protocols.errors import InputError
 from storage.errors import StoreError
 from storage.files import json_text, make_folder, read_blocks, write_blocks
 from storage.streams import Json
+from storage.urls import check_url
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
 SMALL_BYTES = 8_000_000
 """Objects up to this are fetched in one request."""
 _BLOCK = 8_000_000
-_URL = re.compile(r"([a-z][a-z0-9+.-]*)://.+")
 _SECRETS = ("secret", "token", "password", "passwd", "key", "credential")
 _SECRET_VARIABLES = ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_ACCESS_KEY_ID")
 _ANSWERS = 200
@@ -41,31 +40,6 @@ class RemoteError(StoreError):
 
 class RemoteMissing(RemoteError):
     """An object is not there."""
-
-
-def is_url(place: str | os.PathLike[str]) -> bool:
-    """Whether `place` is a URL rather than a folder."""
-    return _URL.fullmatch(os.fspath(place)) is not None
-
-
-def check_url(url: str) -> str:
-    """`url` without a slash at its end.
-
-    Raises:
-        InputError: it is none, is of a kind that chains others, or carries a secret.
-    """
-    if not is_url(url):
-        raise InputError("URL", "", url, "must be a URL such as s3://bucket/folder")
-    parts = urlsplit(url)
-    if parts.username or parts.password or parts.query or parts.fragment:
-        shown = f"{parts.scheme}://.../{parts.path.lstrip('/')}"
-        raise InputError(
-            "URL", "", shown, "must not carry keys, passwords or options: put them into the "
-            "environment or fsspec's configuration",
-        )  # fmt: skip
-    if "::" in url or ".." in parts.path.split("/"):
-        raise InputError("URL", "", url, "must name one place, without '::' and '..'")
-    return url.rstrip("/")
 
 
 class Remote:

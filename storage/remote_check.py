@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from storage.manifest import Kind, Manifest, check_against_sums, objects_folder
-from storage.push import read_manifests
+from storage.manifest import Kind, Manifest, check_against_sums, objects_folder, read_manifests
 from storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
 from storage.store import StoreError, safe_name
 from storage.verify import Problem
