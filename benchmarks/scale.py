@@ -32,7 +32,7 @@ from storage.store import Store
 ROOT = Path(__file__).parent.parent
 
 
-def measure(trials: int = 3, runs: int = RUNS, s3: bool = True) -> Figures:
+def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
     """Bytes and milliseconds a trial, and megabytes a second pushed."""
     settings = load_plan(ROOT / "protocols" / "kinematic.yaml").protocol.analysis
     net = build(settings.network, settings.windows, 0)

@@ -126,7 +126,7 @@ def everywhere(
         done()
 
     @flow(name="trade-off", validate_parameters=False, persist_result=False)
-    def runs_flow(_: Parcel[None]) -> None:
+    def runs_flow(nothing: Parcel[None]) -> None:
         spread("trade-off", piece, jobs, keep, cluster)
 
     orchestrate(runs_flow, Parcel(None), cluster)
