@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import active_children, get_context
 from typing import TYPE_CHECKING, Any
 
-from prefect import task
+from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.settings import PREFECT_API_URL
 
@@ -61,6 +61,15 @@ def spread(
             for worker in active_children():
                 worker.terminate()  # what a worker had not handed over is simply made again
             raise
+
+
+@flow(name="pieces", validate_parameters=False, persist_result=False)
+def spread_flow(
+    wanted: Parcel[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
+) -> int:
+    """`spread` for who has no flow. In a module: Prefect sends a flow along with its tasks."""
+    spread(*wanted.content)
+    return len(wanted.content[2])
 
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)

@@ -113,11 +113,9 @@ def everywhere(
     Args:
         done: called in this thread after each.
     """
-    from prefect import flow
-
     from flows.orchestration import Parcel
     from flows.orchestration import run as orchestrate
-    from flows.spread import spread
+    from flows.spread import spread_flow
 
     found: dict[int, Any] = {}
 
@@ -125,11 +123,7 @@ def everywhere(
         found[number] = result
         done()
 
-    @flow(name="trade-off", validate_parameters=False, persist_result=False)
-    def runs_flow(nothing: Parcel[None]) -> None:
-        spread("trade-off", piece, jobs, keep, cluster)
-
-    orchestrate(runs_flow, Parcel(None), cluster)
+    orchestrate(spread_flow, Parcel(("trade-off", piece, jobs, keep, cluster)), cluster)
     return [found[number] for number in range(len(jobs))]
 
 
