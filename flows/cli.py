@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flows import cli_chain, cli_steps, cli_store, console
+from flows import cli_chain, cli_remote, cli_steps, cli_store, console
 from flows.cli_calibrate import calibrate_app, teach_app
 from flows.cli_common import (
     EnableOption,
@@ -143,6 +143,7 @@ def collect(
 cli_steps.register(app)
 cli_chain.register(app)
 cli_store.register(app)
+cli_remote.register(app)
 app.command()(rigs)
 register_control(app)
 register_serve(app)

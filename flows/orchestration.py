@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from flows import run_records
 from flows.embedded_server import EmbeddedServer
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 T = TypeVar("T")
 
@@ -28,10 +31,26 @@ _store: Path | None = None
 
 
 class Parcel(Generic[T]):
-    """Carries any object into a flow or task without Prefect validating, walking or storing it."""
+    """Carries any object into a flow or task without Prefect validating, walking or storing it.
+
+    It stays in its process: with a task that runs elsewhere Prefect also sends what its flow was
+    called with, which that task has no use for.
+    """
 
     def __init__(self, content: T) -> None:
         self.content = content
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without its content."""
+        return type(self), (None,)
+
+
+class Freight(Parcel[T]):
+    """A parcel that goes to other processes with its content."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With its content."""
+        return type(self), (self.content,)
 
 
 def prepare(store: Path) -> None:
@@ -67,12 +86,15 @@ def private() -> bool:
     return PREFECT_API_URL.value() in {None, *(server.url for server in _servers.values())}
 
 
-def run(flow: Any, parcel: Parcel[Any]) -> Any:
+def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Inside a flow that is served it is part of that flow's run, which has an end of its own.
     Without heartbeats, because each would cost a flow a second of waiting for their thread; a
     killed run is known by what the store lacks, and closed by the next one.
+
+    Args:
+        cluster: where its tasks go that are submitted, instead of threads.
     """
     from prefect.context import FlowRunContext
     from prefect.settings import (
@@ -94,4 +116,6 @@ def run(flow: Any, parcel: Parcel[Any]) -> Any:
         if _store is not None:
             run_records.close_dead(_store, server)
             flow = flow.with_options(**run_records.hooks(_store, server))
+        if cluster is not None:
+            flow = flow.with_options(task_runner=cluster.runner())
         return flow(parcel)

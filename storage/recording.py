@@ -16,7 +16,7 @@ from storage.files import read_json
 from storage.hdf5 import StreamReader
 from storage.streams import F64, I64, U8, EventChunk, Json
 from storage.video import read_frame, read_frames
-from storage.whole import byte_problem, read_sums
+from storage.whole import byte_problem, read_sums, to_fetch
 from storage.writer import DATA, FRAMES, RECORD
 
 RECORD_FORMAT = 1
@@ -99,6 +99,10 @@ class Recording:
         if name not in self._checked:
             if name not in self._sums:
                 raise self._damaged(f"{path}: is not among the checksums")
+            if to_fetch(path):
+                from storage.mirror import fetch  # which stands on this module
+
+                fetch(path, self._sums[name])
             if (problem := byte_problem(path, self._sums[name])) is not None:
                 raise self._damaged(f"{path}: {problem}")
             self._checked.add(name)
@@ -138,6 +142,16 @@ class Recording:
         same = found.get("raw") == self.raw_checksum
         return found if same and found.get("clocks") is not None else None
 
+    @property
+    def clocks_elsewhere(self) -> Json | None:
+        """What another process needs to use the same clocks (`use_clocks`): None, the record's."""
+        return self._refitted
+
+    def use_clocks(self, refitted: Json | None) -> None:
+        """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
+        self.__dict__.pop("clocks", None)
+        self.__dict__["_refitted"] = refitted
+
     def forget_clocks(self) -> None:
         """Look for refitted clocks anew: they have just been written."""
         for name in ("_refitted", "clocks"):
@@ -146,7 +160,7 @@ class Recording:
     @property
     def has_video(self) -> bool:
         """Whether the frames themselves were recorded."""
-        return (self.folder / FRAMES).exists()
+        return FRAMES in self._sums
 
     @cached_property
     def has_tracks(self) -> bool:
@@ -157,7 +171,10 @@ class Recording:
     @property
     def frame_source(self) -> str:
         """``video``, ``tracks`` or ``none``: what is there of the outside camera."""
-        return "video" if self.has_video else "tracks" if self.has_tracks else "none"
+        if self.has_video:
+            return "video"
+        # frames that are in no video are tracks, and the record is a small file
+        return "tracks" if self.record["counts"]["frames"] else "none"
 
     def open(self) -> StreamReader:
         """The HDF5 file, as a context manager."""

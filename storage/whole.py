@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from pathlib import Path
 
 from storage.files import read_json, sha256, write_json
 from storage.streams import Json
 from storage.writer import CHECKSUMS, DATA, RECORD
+
+ELSEWHERE = "elsewhere.json"
+"""Of a trial in a mirror (`storage.mirror`): files that it lacks are fetched when they are read."""
 
 
 def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
@@ -66,9 +70,15 @@ def partial(folder: Path) -> str | None:
     except ValueError as error:
         return str(error)
     for name, said in sums.items():
-        if (problem := size_problem(folder / name, said)) is not None:
+        problem = size_problem(folder / name, said)
+        if problem is not None and not to_fetch(folder / name):
             return f"{folder / name}: {problem}"
     return None
+
+
+def to_fetch(path: Path) -> bool:
+    """Whether a file of a trial is not here, but where this store is a mirror of."""
+    return not os.path.lexists(path) and (path.parent / ELSEWHERE).is_file()
 
 
 def write_sums(folder: Path, names: tuple[str, ...]) -> None:
