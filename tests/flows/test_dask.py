@@ -72,7 +72,9 @@ def address(workers_cache: Path) -> Iterator[str]:
 
 @pytest.fixture
 def cluster(address: str) -> Iterator[Cluster]:
-    """The two workers, looked at."""
+    """The two workers, looked at, once one that a test ended has been replaced."""
+    with distributed.Client(address, timeout="30s") as client:
+        client.wait_for_workers(2, timeout=60)
     with connected(address) as found:
         assert found is not None
         assert found.cores == 2
