@@ -11,6 +11,7 @@ import numpy as np
 
 from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
+from storage.secrets import masked
 from storage.spool import Spool
 from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
 from storage.video import VideoWriter
@@ -152,7 +153,9 @@ class TrialWriter:
     def set_aside(self, quarantine: Path, record: Json, provenance: Json, cause: Json) -> None:
         """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
         self.seal()
-        write_json_aside(self.folder / "cause.json", cause)
+        write_json_aside(
+            self.folder / "cause.json", {**cause, "cause": masked(str(cause["cause"]))}
+        )
         self._finish_folder(record, provenance)
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)
