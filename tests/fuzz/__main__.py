@@ -52,6 +52,7 @@ class Tally:
         self.outcomes.setdefault(target, Counter())[known] += 1
         if known == "wrong" and len(self.wrong) < MOST_WRONG:
             self.wrong.append(f"{number} ({target}): {outcome}")
+            print(self.wrong[-1], file=sys.stderr, flush=True)
 
 
 def fuzz(folder: Path, numbers: list[int], seed: int, jobs: int) -> dict[str, Any]:
