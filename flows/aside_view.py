@@ -8,7 +8,7 @@ from flows import console
 from flows.campaigns import Collected
 from flows.orders import set_aside
 from protocols import InputError
-from storage.store import Store, StoreError
+from storage.store import IMPORTED, Store, StoreError
 
 
 def all_aside(store: Store, unreadable: list[str]) -> list[dict[str, Any]]:
@@ -20,6 +20,8 @@ def all_aside(store: Store, unreadable: list[str]) -> list[dict[str, Any]]:
     found = []
     for campaign in store.campaigns():
         try:
+            if IMPORTED in campaign.info:  # nobody plans them
+                continue
             aside = set_aside(Collected(campaign).plan, campaign)
         except (InputError, StoreError) as error:
             unreadable.append(f"campaign {campaign.name}: {error}")

@@ -49,6 +49,8 @@ SYNC = "sync"
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
+IMPORTED = "imported"
+"""In a campaign's description: where its trials come from, if nobody collected them here."""
 AGAIN, FORGIVEN = "again", "forgiven"
 """A committed trial that a person wants anew; a failed attempt that counts no longer."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")

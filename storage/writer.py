@@ -13,7 +13,16 @@ from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
 from storage.secrets import masked
 from storage.spool import Spool
-from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.streams import (
+    I64,
+    U8,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    Json,
+    PoseChunk,
+    PulseChunk,
+)
 from storage.video import VideoWriter
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
@@ -83,6 +92,10 @@ class TrialWriter:
     def add_frame_camera_reads(self, chunk: ClockReads) -> None:
         """Append reads of the frame camera's clock."""
         self._streams.add_clock_reads("frame_camera_reads", chunk)
+
+    def add_triggers(self, t_ns: I64, kind: U8) -> None:
+        """Append what else an event camera noted, of an imported trial."""
+        self._streams.add_triggers(t_ns, kind)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""
