@@ -237,7 +237,7 @@ class Recording:
             KeyError: the motion has no such phase.
         """
         clock = self.clock("arm")
-        for step in reversed(self.record["steps"]):
+        for step in reversed(self.record.get("steps", [])):
             if step["phase"] == phase:
                 return (
                     int(clock.to_reference(int(step["start_ns"]))),
@@ -248,7 +248,7 @@ class Recording:
     @property
     def motion_phase(self) -> str:
         """``slide`` or ``retract``: the phase in which slip is looked for."""
-        phases = {step["phase"] for step in self.record["steps"]}
+        phases = {step["phase"] for step in self.record.get("steps", [])}
         return "slide" if "slide" in phases else "retract"
 
     @property

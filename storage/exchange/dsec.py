@@ -22,7 +22,7 @@ PIECE = 1 << 20
 _MOST_PACKED = 2000
 """Rows a byte of the file: what columns of equal values are packed to."""
 _MOST_UNSORTED = 1 << 28
-_FAULTS = (OSError, RuntimeError, KeyError, TypeError, MemoryError, AttributeError)
+_FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError, AttributeError)
 
 
 def read_dsec(path: Path, name: str) -> ForeignTrial:

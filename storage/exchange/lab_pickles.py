@@ -22,7 +22,8 @@ _FILE = re.compile(r"(?P<stem>.+)_events_(?P<polarity>on|off)\.(?:pickle|pkl)")
 _PART = re.compile(
     r"d(?P<depth>[0-9.]+)_s(?P<speed>[0-9.]+)_dir_(?P<direction>[A-Za-z0-9-]+)_r(?P<repetition>\d{1,6})"
 )
-_LANDSCAPE = (480, 640)
+LANDSCAPE = (480, 640)
+"""Rows and columns of the lab's camera."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
     told = _PART.fullmatch(pair.stem)
     condition = {k: v for k, v in told.groupdict().items() if k != "repetition"} if told else {}
     return ForeignTrial(
-        name, names, all_events, "unknown; ms as the files have them, rounded to us", (640, 480),
+        name, names, all_events, "unknown; ms as the files have them, rounded to us",
+        LANDSCAPE[::-1],
         condition=condition, repetition=int(told["repetition"]) if told else 0,
         about={"resolution": "ms as stored; order within one time is lost"},
         unknown=("epoch", "units of the condition", "sync grade", "poses", "motion", "frames",
@@ -71,9 +73,9 @@ def _events(path: Path, polarity: int) -> tuple[Any, Any, Any, Any]:
     found = read_pickle(path)
     if not isinstance(found, np.ndarray):
         found = _as_array(found, path)
-    if found.dtype != object or found.ndim != 2 or sorted(found.shape) != sorted(_LANDSCAPE):
-        raise Wrong(f"{path.name}: an array {found.shape} where 640 x 480 lists belong")
-    if found.shape != _LANDSCAPE:  # columns first
+    if found.dtype != object or found.ndim != 2 or sorted(found.shape) != sorted(LANDSCAPE):
+        raise Wrong(f"{path.name}: an array {found.shape} where {_size()} lists belong")
+    if found.shape != LANDSCAPE:  # columns first
         found = found.T
     cells = found.ravel().tolist()
     counts = np.zeros(len(cells), np.int64)
@@ -96,7 +98,7 @@ def _events(path: Path, polarity: int) -> tuple[Any, Any, Any, Any]:
     if len(t_us) and int(t_us.min()) < 0:
         raise Wrong(f"{path.name}: an event before its own clock began")
     place = np.repeat(np.arange(len(cells)), counts)
-    return place % 640, place // 640, np.full(len(t_us), polarity), t_us
+    return place % LANDSCAPE[1], place // LANDSCAPE[1], np.full(len(t_us), polarity), t_us
 
 
 def _as_array(found: Any, path: Path) -> Any:
@@ -104,11 +106,15 @@ def _as_array(found: Any, path: Path) -> Any:
     rows = found if type(found) in {list, tuple} else []
     width = len(rows[0]) if rows and type(rows[0]) in {list, tuple} else -1
     if any(type(row) not in {list, tuple} or len(row) != width for row in rows) or width < 0:
-        raise Wrong(f"{path.name}: a {type(found).__name__} where 640 x 480 lists belong")
-    if len(rows) * width != 640 * 480:
-        raise Wrong(f"{path.name}: {len(rows)} x {width} lists where 640 x 480 belong")
+        raise Wrong(f"{path.name}: a {type(found).__name__} where {_size()} lists belong")
+    if len(rows) * width != LANDSCAPE[0] * LANDSCAPE[1]:
+        raise Wrong(f"{path.name}: {len(rows)} x {width} lists where {_size()} belong")
     made = np.empty((len(rows), width), object)
     for row, cells in enumerate(rows):
         for column, cell in enumerate(cells):
             made[row, column] = cell
     return made
+
+
+def _size() -> str:
+    return f"{LANDSCAPE[1]} x {LANDSCAPE[0]}"

@@ -57,14 +57,16 @@ class Tally:
 
 def fuzz(folder: Path, numbers: list[int], seed: int, jobs: int) -> dict[str, Any]:
     """Read all cases; what became of them, and what was wrong."""
-    from tests.fuzz.targets import make_small_store
+    from tests.fuzz.targets import make_foreign, make_small_store
 
     make_small_store(folder / "small-store")
+    foreign = make_foreign(folder)
+    made = {path.name for path in folder.iterdir()}
     context = multiprocessing.get_context("spawn")
     tally = Tally()
     running = [Job(numbers[job::jobs], folder / f"box-{job}") for job in range(jobs)]
     for job in running:
-        _start(context, job, folder / "small-store", seed)
+        _start(context, job, foreign, seed)
     done = 0
     while running:
         for pipe in wait([job.pipe for job in running if job.pipe is not None], timeout=60):
@@ -81,7 +83,7 @@ def fuzz(folder: Path, numbers: list[int], seed: int, jobs: int) -> dict[str, An
                 job.left = [number for number in job.left if number > job.last]
                 job.box = job.box.with_name(f"{job.box.name}+")
                 job.last = -1
-                _start(context, job, folder / "small-store", seed)
+                _start(context, job, foreign, seed)
                 continue
             if kind == "begin":
                 job.last = what
@@ -97,7 +99,7 @@ def fuzz(folder: Path, numbers: list[int], seed: int, jobs: int) -> dict[str, An
     litter = [
         path.name
         for path in folder.iterdir()
-        if path.name != "small-store" and not path.name.startswith("box-")
+        if path.name not in made and not path.name.startswith("box-")
     ]
     tally.wrong += [f"{name} was made outside of the box" for name in litter]
     return {
@@ -108,12 +110,12 @@ def fuzz(folder: Path, numbers: list[int], seed: int, jobs: int) -> dict[str, An
     }
 
 
-def _start(context: Any, job: Job, small_store: Path, seed: int) -> None:
+def _start(context: Any, job: Job, foreign: dict[str, bytes], seed: int) -> None:
     from tests.fuzz.worker import work
 
     here, there = context.Pipe(duplex=False)
     job.process = context.Process(
-        target=work, args=(there, job.box, small_store, seed, job.left, LIMIT_S), daemon=True
+        target=work, args=(there, job.box, foreign, seed, job.left, LIMIT_S), daemon=True
     )
     job.process.start()
     there.close()

@@ -169,6 +169,48 @@ def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
     parse_pickle(data, name)
 
 
+def read_foreign(box: Path, name: str, data: bytes) -> None:
+    """A file of another program, found by its name and read to its end."""
+    from protocols.errors import InputError
+    from storage.exchange.find import kind_of, trials_in
+    from storage.exchange.foreign import Wrong
+
+    folder = box / "foreign"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    if name.endswith(".json"):
+        (folder / "t.aedat4").write_bytes((box.parent / "t.aedat4").read_bytes())
+    path = _written(folder, name, data)
+    where = folder if name.endswith(".json") else path
+    try:
+        for trial in trials_in(where, kind_of(where)):
+            sum(len(chunk) for chunk in trial.events())
+            sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
+            json.dumps([trial.about, trial.condition], allow_nan=False)
+    except Wrong as error:
+        raise InputError(path, "", None, str(error)) from None
+
+
+def make_foreign(folder: Path) -> dict[str, bytes]:
+    """One small file of each kind, by name."""
+    from storage.exchange.hand_out import hand_out
+    from storage.store import Store
+    from tests.storage.exchange.files import lab_hdf5
+
+    recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
+    lab_hdf5(folder / "lab.h5")
+    found = {"lab.h5": (folder / "lab.h5").read_bytes()}
+    for kind in ("dsec", "aedat4"):  # whose manifest stays
+        out = folder / f"box-made-{kind}"
+        hand_out([recording], out, kind, "c")
+        for path in out.iterdir():
+            plain = {".json": "sliplab-export.json"}.get(path.suffix, f"t{path.suffix}")
+            data = path.read_bytes()
+            found[plain] = data.replace(b"a,r=1.aedat4", b"t.aedat4")
+    (folder / "t.aedat4").write_bytes(found["t.aedat4"])
+    return found
+
+
 def pickle_seeds() -> dict[str, bytes]:
     """Small ones in all protocols."""
     lists = np.empty((4, 3), object)
@@ -209,8 +251,9 @@ def make_small_store(folder: Path) -> None:
     control.ask(opened, "again", who="a", campaign="c", trials=("a,r=1",))
 
 
-def targets(small_store: Path) -> list[Target]:
-    """All of them; `small_store` was made by `make_small_store`."""
+def targets(small_store: Path, foreign: dict[str, bytes]) -> list[Target]:
+    """All of them; `small_store` and `foreign` were made by the functions above."""
+    manifest = {name: data for name, data in foreign.items() if name.endswith(".json")}
     files = {
         path.relative_to(small_store).as_posix(): path.read_bytes()
         for path in sorted(small_store.rglob("*"))
@@ -235,6 +278,14 @@ def targets(small_store: Path) -> list[Target]:
             {name: data for name, data in files.items() if name.endswith(".yaml")},
             read_store,
             1,
+        ),
+        Target("manifest", "json", manifest, read_foreign, 1),
+        Target(
+            "foreign",
+            "bytes",
+            {name: data for name, data in foreign.items() if name not in manifest},
+            read_foreign,
+            6,
         ),
         Target("pickle", "bytes", pickle_seeds(), read_foreign_pickle, 8),
     ]

@@ -67,12 +67,17 @@ class Watch:
 
 
 def work(
-    pipe: Connection, box: Path, small_store: Path, seed: int, numbers: list[int], limit_s: float
+    pipe: Connection,
+    box: Path,
+    foreign: dict[str, bytes],
+    seed: int,
+    numbers: list[int],
+    limit_s: float,
 ) -> None:
     """Read the cases with these numbers; tells each number before it begins, then what came."""
     box.mkdir(parents=True, exist_ok=True)
     os.chdir(box)
-    found = targets(small_store)
+    found = targets(box.parent / "small-store", foreign)
     for target in found:  # whole files first: what is loaded late is loaded now
         for name, data in target.seeds.items():
             target.read(box, name, data)
