@@ -12,6 +12,8 @@ from typing import Any
 from storage.clockmap import ClockMap
 from storage.streams import Json
 
+DEVICES = ("events", "frames", "arm")
+"""Those whose clocks have maps; what else stands among the clocks is for people."""
 _INT64 = range(-(2**63), 2**63)
 _TEXT = ("trial", "experiment", "role")
 _WHOLE = ("repetition", "block", "attempt")
@@ -54,11 +56,11 @@ def check_clocks(clocks: Any) -> None:
 
 def _clocks(clocks: Json) -> None:
     _is("events" in clocks, "clocks.events", "is missing")
-    for device, found in clocks.items():
-        if device == "reference":
+    for device in DEVICES:
+        if device not in clocks:
             continue
         key = f"clocks.{device}"
-        known = _mapping(found, key)
+        known = _mapping(clocks[device], key)
         if (error := known.get("uncertainty_ns")) is not None:
             _number(error, f"{key}.uncertainty_ns")
         try:

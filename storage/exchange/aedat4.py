@@ -36,6 +36,7 @@ EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"
 _CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 _MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
 _PACKET_EVENTS = 1 << 16
+_PIECE = 1 << 20
 _ZSTD = 3
 _COLOUR = {16: 3, 24: 4}
 """OpenCV's numbers of 8-bit pictures with three and four channels."""
@@ -179,11 +180,15 @@ def _prefixed(data: bytes) -> bytes:
 def _unpacked(data: bytes, codec: Any) -> bytes:
     if codec is None:
         return data
+    parts: list[bytes] = []  # as much is made room for as is asked for, whatever comes
+    left = _MOST_PACKET
     with pa.CompressedInputStream(pa.BufferReader(data), codec) as stream:
-        found: bytes = stream.read(_MOST_PACKET + 1)
-    if len(found) > _MOST_PACKET:
-        raise Wrong("a packet that unpacks to too much")
-    return found
+        while part := stream.read(_PIECE):
+            parts.append(part)
+            left -= len(part)
+            if left < 0:
+                raise Wrong("a packet that unpacks to too much")
+    return b"".join(parts)
 
 
 def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:

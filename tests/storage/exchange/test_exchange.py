@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 
 from protocols.errors import InputError
@@ -308,6 +310,7 @@ def _damaged_aedat4(change: Callable[[bytes], bytes]) -> Callable[[Path], Path]:
     return make
 
 
+BOMB = pa.compress(bytes(300 << 20), codec="zstd", asbytes=True)
 BAD: dict[str, Callable[[Path], Path]] = {
     "no aedat4": _written("bad.aedat4", lambda: b"hello"),
     "aedat4 cut short": _damaged_aedat4(lambda data: data[:-100]),
@@ -316,6 +319,9 @@ BAD: dict[str, Callable[[Path], Path]] = {
     ),
     "aedat4 with rubbish in a packet": _damaged_aedat4(lambda data: data + b"\0\0\0\0\4\0\0\0abcd"),
     "aedat4 that defines words": _damaged_aedat4(lambda data: data.replace(b"<dv", b"<!E", 1)),
+    "aedat4 with a packet that unpacks to 300 MB": _damaged_aedat4(
+        lambda data: data + struct.pack("<ii", 0, len(BOMB)) + BOMB
+    ),
     "no hdf5": _written("bad.h5", lambda: b"hello"),
     "hdf5 that leads out": _h5(_external),
     "hdf5 of 4 TB": _h5(_huge),
