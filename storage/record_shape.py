@@ -41,8 +41,6 @@ def check_record(record: Json) -> None:
         _level(level, f"condition.{name}")
     _clocks(_mapping(record.get("clocks"), "clocks"))
     _steps(record.get("steps", []))
-    truth = record.get("simulation_truth")
-    _is(truth is None or isinstance(truth, dict), "simulation_truth", "must be a mapping")
 
 
 def check_clocks(clocks: Any) -> None:

@@ -259,7 +259,7 @@ class Recording:
     def simulation_truth(self) -> dict[str, Any] | None:
         """What really happened, on the time line; only for tests and error reports."""
         truth = self.record.get("simulation_truth")
-        return dict(truth) if truth is not None else None
+        return dict(truth) if isinstance(truth, dict) else None
 
 
 def _named(path: Path, error: ValueError) -> str:

@@ -28,7 +28,7 @@ from storage.exchange.dv_buffers import (
     triggers_buffer,
 )
 from storage.exchange.flatbuffer import Table
-from storage.exchange.foreign import Triggers, Wrong, event_chunk
+from storage.exchange.foreign import LATEST_US, Triggers, Wrong, event_chunk
 from storage.streams import U8, EventChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
@@ -124,7 +124,7 @@ class Aedat4File:
             for table in Table.root(data, b"TRIG").tables(0)
         ]
         times = np.array([t for t, _ in found], np.int64)
-        if np.any(times < 0) or np.any(times >= 1 << 56) or np.any(times[1:] < times[:-1]):
+        if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
             raise Wrong("triggers whose times run backwards or are none")
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
 
@@ -139,7 +139,7 @@ class Aedat4File:
             count, pixels = table.vector(10, 1)
             if not channels or width <= 0 or height <= 0 or count != width * height * channels:
                 raise Wrong(f"a frame of {width} x {height} with {count} bytes of kind {form}")
-            if not last <= t_us < 1 << 56:
+            if not last <= t_us < LATEST_US:
                 raise Wrong("frames whose times run backwards or are none")
             last = t_us
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_us)

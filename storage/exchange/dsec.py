@@ -14,7 +14,14 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from storage.exchange.foreign import ForeignTrial, Triggers, Wrong, event_chunk, rounded_us
+from storage.exchange.foreign import (
+    LATEST_US,
+    ForeignTrial,
+    Triggers,
+    Wrong,
+    event_chunk,
+    rounded_us,
+)
 from storage.rows import RowFile, Rows
 from storage.streams import I64, EventChunk
 
@@ -34,7 +41,7 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
     with _opened(path) as (file, rows):
         columns = [rows(f"events/{key}") for key in "xypt"]
         offset = int(_whole(file.rows("t_offset").read())) if file.has("t_offset") else 0
-        if not 0 <= offset < 1 << 56:
+        if not 0 <= offset < LATEST_US:
             raise Wrong(f"{path.name}: t_offset = {offset}: is no time")
         triggers = None
         if file.has("triggers/t"):
@@ -167,7 +174,8 @@ def _whole(values: Any) -> I64:
 
 def _rising(found: Triggers) -> None:
     t = found.t_us
-    if len(t) != len(found.kind) or np.any(t < 0) or np.any(t[1:] < t[:-1]):
+    wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
+    if len(t) != len(found.kind) or wrong:
         raise Wrong("triggers whose times run backwards or are none")
 
 

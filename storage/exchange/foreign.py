@@ -11,8 +11,8 @@ import numpy as np
 from storage.streams import I64, U8, EventChunk, FrameChunk, Json
 
 MOST_PX = 1 << 14
-LATEST_US = 1 << 56
-"""Two thousand years; what comes later is no time, and would not fit nanoseconds."""
+LATEST_US = 1 << 53
+"""285 years; what comes later is no time, and would not fit 64 bits of nanoseconds."""
 
 
 class Wrong(ValueError):

@@ -61,7 +61,6 @@ RECORDS: dict[str, Change] = {
     ),
     "a format that is text": lambda r: r.update(format="9"),
     "seconds that are not finite": lambda r: r.update(recorded_s=float("nan")),
-    "a truth that is text": lambda r: r.update(simulation_truth="x"),
 }
 
 

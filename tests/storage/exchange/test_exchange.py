@@ -310,6 +310,20 @@ def _damaged_aedat4(change: Callable[[bytes], bytes]) -> Callable[[Path], Path]:
     return make
 
 
+def _late(folder: Path) -> Path:
+    with Aedat4Writer(
+        folder / "bad.aedat4",
+        {0: Stream("EVTS", "events", (8, 6), "x"), 1: Stream("FRME", "frames", (2, 2), "x")},
+    ) as file:
+        file.picture(1, np.zeros((2, 2), np.uint8), 1 << 55)  # its nanoseconds need 65 bits
+    return folder / "bad.aedat4"
+
+
+def _late_triggers(file: h5py.File) -> None:
+    _columns()(file)
+    file["triggers/t"], file["triggers/kind"] = [1 << 55], [1]
+
+
 BOMB = pa.compress(bytes(300 << 20), codec="zstd", asbytes=True)
 BAD: dict[str, Callable[[Path], Path]] = {
     "no aedat4": _written("bad.aedat4", lambda: b"hello"),
@@ -322,6 +336,8 @@ BAD: dict[str, Callable[[Path], Path]] = {
     "aedat4 with a packet that unpacks to 300 MB": _damaged_aedat4(
         lambda data: data + struct.pack("<ii", 0, len(BOMB)) + BOMB
     ),
+    "aedat4 with a frame beyond time": _late,
+    "triggers beyond time": _h5(_late_triggers),
     "no hdf5": _written("bad.h5", lambda: b"hello"),
     "hdf5 that leads out": _h5(_external),
     "hdf5 of 4 TB": _h5(_huge),
