@@ -90,7 +90,8 @@ def rounded_us(times: Any, per_unit: float) -> I64:
     Raises:
         Wrong: one is no number, or beyond any time.
     """
-    found = np.asarray(times, np.float64) * per_unit
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
+        found = np.asarray(times, np.float64) * per_unit
     if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
         raise Wrong("a time that is no number, or beyond any time")
     return np.rint(found).astype(np.int64)
