@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from pathlib import Path
 
 import typer
@@ -60,7 +61,7 @@ def _explain(error: Exception) -> int:
         return console.FAILED
     expected = {"RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError"}
     if type(error).__name__ not in expected and not isinstance(error, StoreError):
-        console.messages.print_exception(max_frames=8)
+        console.say("".join(traceback.format_exception(error, limit=-8)))
     console.say(f"error: {error or type(error).__name__}")
     return console.FAILED
 

@@ -8,7 +8,7 @@ from flows import console
 from flows.campaigns import Collected
 from flows.orders import set_aside
 from protocols import InputError
-from storage.store import Store, StoreError
+from storage.store import IMPORTED, Store, StoreError
 
 
 def all_aside(
@@ -23,6 +23,8 @@ def all_aside(
     found = []
     for campaign in store.campaigns():
         try:
+            if IMPORTED in campaign.info:  # nobody plans them
+                continue
             done = None if committed is None else committed.get(campaign.name, set())
             aside = set_aside(Collected(campaign).plan, campaign, done)
         except (InputError, StoreError) as error:

@@ -46,7 +46,11 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
         else:
             change = decisions.skip if request.kind == "skip" else decisions.again
             where = store.campaign(request.campaign)
-            did = {"trials": change(where, request.trials, request.by), "running": running}
+            if where.begun:
+                trials = change(where, request.trials, request.by)
+            else:
+                trials = dict.fromkeys(request.trials, "there is no such campaign")
+            did = {"trials": trials, "running": running}
         done.append((request, control.answer(store, request, did)))
     return done
 

@@ -19,6 +19,7 @@ from flows.cli_common import (
     prepare_store,
 )
 from flows.cli_control import register as register_control
+from flows.cli_exchange import register as register_exchange
 from flows.cli_rigs import rigs
 from flows.cli_serve import register as register_serve
 
@@ -147,5 +148,6 @@ cli_remote.register(app)
 app.command()(rigs)
 register_control(app)
 register_serve(app)
+register_exchange(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +23,7 @@ def trials(
         str | None, typer.Option("--where", help="Only rows for which this holds.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", help="Write a .csv or .json file instead.")
+        Path | None, typer.Option("--output", help="Write a .csv, .parquet or .json file instead.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -48,15 +47,9 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from storage.files import write_text
+        from storage.exchange.tables import write_table
 
-        kinds: dict[str, Callable[[], str]] = {
-            ".csv": lambda: table.to_csv(index=False),
-            ".json": lambda: table.to_json(orient="records"),
-        }
-        if output.suffix not in kinds:
-            raise InputError("--output", "", str(output), "must end in .csv or .json")
-        write_text(output, kinds[output.suffix]())
+        write_table(table, output)
         console.say(f"{len(table)} trials: {output}")
     if as_json:
         import json

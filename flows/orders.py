@@ -16,7 +16,7 @@ from protocols.yaml_file import parse_yaml, read_text
 from rigs.levels import at_level, with_level
 from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from storage.decisions import skipped
-from storage.store import FORGIVEN, Campaign, Store, StoreError
+from storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,10 @@ def make_order(
 
 def _check_same(order: Order, campaign: Campaign) -> None:
     info = campaign.info
+    if IMPORTED in info:
+        raise StoreError(
+            f"{campaign.folder}: was imported; give the new one its own name with --campaign"
+        )
     if info["collection_hash"] != order.plan.collection_hash:
         raise StoreError(
             f"{campaign.folder}: was begun under another `collection:` section; changing "

@@ -139,10 +139,15 @@ def _row(campaign: str, recording: Recording) -> dict[str, Any]:
         "events": record["counts"]["events"],
         "frames": record["counts"]["frames"],
         "frame_source": recording.frame_source,
-        "sync_uncertainty_us": recording.clocks["events"]["uncertainty_ns"] / 1000,
+        "sync_uncertainty_us": _us(recording.clocks["events"].get("uncertainty_ns")),
         "passed": record["quality"]["passed"],
         **_condition(record["condition"]),
     }
+
+
+def _us(ns: float | None) -> float | None:
+    """Unknown where a trial was imported."""
+    return None if ns is None else ns / 1000
 
 
 def _condition(condition: dict[str, str]) -> dict[str, Any]:

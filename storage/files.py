@@ -251,12 +251,16 @@ def read_json(path: Path) -> dict[str, Any]:
         ValueError: not JSON, or not an object; the message names the file.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
     if not isinstance(data, dict):
         raise ValueError(f"{path}: holds no JSON object")
     return data
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number of JSON")
 
 
 def sha256(path: Path) -> str:

@@ -14,6 +14,7 @@ from storage.clockmap import ClockMap
 from storage.errors import StoreError
 from storage.files import read_json
 from storage.hdf5 import StreamReader
+from storage.record_shape import check_clocks, check_record
 from storage.streams import F64, I64, U8, EventChunk, Json
 from storage.video import read_frame, read_frames
 from storage.whole import byte_problem, read_sums, to_fetch
@@ -63,10 +64,18 @@ class Recording:
             StoreError: it is damaged, or was written by a newer version.
         """
         path = self._sound(RECORD)
-        found = read_json(path)
-        if found.get("format", RECORD_FORMAT) > RECORD_FORMAT:
+        try:
+            found = read_json(path)
+            written = found.get("format", RECORD_FORMAT)
+            if not isinstance(written, int):
+                raise ValueError("format: must be an integer")
+            if written <= RECORD_FORMAT:
+                check_record(found)
+        except ValueError as error:
+            raise self._damaged(_named(path, error)) from None
+        if written > RECORD_FORMAT:
             raise StoreError(
-                f"{path}: format = {found['format']}: was written by a newer version of SlipLab; "
+                f"{path}: format = {written}: was written by a newer version of SlipLab; "
                 f"this one reads formats up to {RECORD_FORMAT}: update it"
             )
         return found
@@ -137,10 +146,20 @@ class Recording:
         """The result of fitting again, where it holds other clocks than the record's."""
         if self.sync_file is None or not self.sync_file.exists():
             return None
-        found = read_json(self.sync_file)
-        # a trial that was taken anew under this id has nothing to do with it
-        same = found.get("raw") == self.raw_checksum
-        return found if same and found.get("clocks") is not None else None
+        try:
+            found = read_json(self.sync_file)
+            # a trial that was taken anew under this id has nothing to do with it
+            if found.get("raw") != self.raw_checksum or found.get("clocks") is None:
+                return None
+            check_clocks(found["clocks"])
+            if not isinstance(found.get("key"), str):
+                raise ValueError("key: must be text")
+        except ValueError as error:
+            raise StoreError(
+                f"{_named(self.sync_file, error)}; it is damaged: delete it, and `sliplab sync` "
+                "makes it again"
+            ) from None
+        return found
 
     @property
     def clocks_elsewhere(self) -> Json | None:
@@ -235,7 +254,7 @@ class Recording:
             KeyError: the motion has no such phase.
         """
         clock = self.clock("arm")
-        for step in reversed(self.record["steps"]):
+        for step in reversed(self.record.get("steps", [])):
             if step["phase"] == phase:
                 return (
                     int(clock.to_reference(int(step["start_ns"]))),
@@ -246,7 +265,7 @@ class Recording:
     @property
     def motion_phase(self) -> str:
         """``slide`` or ``retract``: the phase in which slip is looked for."""
-        phases = {step["phase"] for step in self.record["steps"]}
+        phases = {step["phase"] for step in self.record.get("steps", [])}
         return "slide" if "slide" in phases else "retract"
 
     @property
@@ -257,4 +276,10 @@ class Recording:
     def simulation_truth(self) -> dict[str, Any] | None:
         """What really happened, on the time line; only for tests and error reports."""
         truth = self.record.get("simulation_truth")
-        return dict(truth) if truth is not None else None
+        return dict(truth) if isinstance(truth, dict) else None
+
+
+def _named(path: Path, error: ValueError) -> str:
+    """What is wrong with a file, which not every message names."""
+    said = str(error)
+    return said if said.startswith(str(path)) else f"{path}: {said}"

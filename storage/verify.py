@@ -14,6 +14,7 @@ from storage.columns import TIMING, TRACKS
 from storage.errors import StoreError
 from storage.files import read_json, temporary_files
 from storage.hdf5 import StreamReader
+from storage.record_shape import check_record
 from storage.recording import RECORD_FORMAT
 from storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
 from storage.streams import Json
@@ -179,6 +180,7 @@ def _contents(folder: Path) -> Found:
     record = read_json(folder / RECORD)
     if record.get("format", RECORD_FORMAT) > RECORD_FORMAT:
         return [(folder / RECORD, f"was written by a newer version (format {record['format']})")]
+    check_record(record)
     if record["trial"] != folder.name:
         problems.append((folder / RECORD, f"is of trial {record['trial']}"))
     with StreamReader(folder / DATA) as reader:

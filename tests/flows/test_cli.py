@@ -20,6 +20,7 @@ from storage.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 
+SECRET = "marked-secret-51b2"
 SLIPLAB = [sys.executable, "-m", "flows"]
 
 
@@ -27,6 +28,7 @@ def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess
     """Run a command to its end."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     environment.pop("PREFECT_HOME", None)
+    environment |= dict.fromkeys(("PREFECT_API_KEY", "AWS_SECRET_ACCESS_KEY"), SECRET)
     return subprocess.run(
         [*SLIPLAB, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True,
         text=True, timeout=300,
@@ -128,6 +130,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = write(folder / "p.yaml", tiny())
     done = sliplab("collect", path, "--rig", "rehearsal", "--store", folder / "store")
     assert done.returncode == 0, done.stderr
+    for kept in (folder / "store").rglob("*"):
+        assert not kept.is_file() or SECRET.encode() not in kept.read_bytes(), kept
     trials = folder / "store" / "campaigns" / "tiny" / "trials"
     return {trial.name: read_json(trial / "checksums.json") for trial in trials.iterdir()}
 
