@@ -10,6 +10,10 @@ import typer
 from flows import console
 from flows.cli_common import CampaignOption, JsonOption, RigOption, StoreArgument, run_step, step
 
+ReviewedOption = Annotated[
+    bool, typer.Option("--reviewed", help="Use what people decided in `sliplab review`.")
+]
+
 
 def sync(
     store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
@@ -39,10 +43,13 @@ def label(
 
 
 def train(
-    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: StoreArgument,
+    campaign: CampaignOption = None,
+    reviewed: ReviewedOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Train the spiking network on the labelled kinematic trials."""
-    step(store, campaign, as_json, "train")
+    step(store, campaign, as_json, "train", reviewed=reviewed)
 
 
 def evaluate(
@@ -54,10 +61,12 @@ def evaluate(
     smoothing: Annotated[
         int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
     ] = None,
+    reviewed: ReviewedOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on trials it has never seen."""
-    step(store, campaign, as_json, "evaluate", margin=margin, smoothing=smoothing)
+    options = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    step(store, campaign, as_json, "evaluate", **options)
 
 
 def report(

@@ -13,13 +13,12 @@ from analysis import dataset, model_file, training
 from analysis.dataset import SampleSet
 from flows import console
 from flows.campaigns import Collected, training_campaigns
-from flows.label import STEP as LABELS
-from flows.label import label_key
 from flows.orchestration import Parcel, run
+from flows.reviewed import Labels
 from flows.timing import timed
 from protocols.hashing import hash_integer
 from protocols.settings import AnalysisSettings
-from storage.derived import Derived, make_key
+from storage.derived import make_key
 from storage.files import read_json, write_json
 from storage.store import Store, StoreError
 
@@ -53,8 +52,13 @@ def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
     return training_campaigns(campaigns)[0].settings
 
 
-def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
+def wanted_models(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> list[Model]:
     """The models that the settings ask for, with the keys they must have.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
 
     Raises:
         StoreError: a trial has no fresh label yet.
@@ -62,13 +66,13 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     used = training_campaigns(campaigns)
     settings = used[0].settings
     inputs = []
+    labels = Labels(store, reviewed)
     for item in used:
-        labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            key = label_key(recording, item.settings.labelling)
-            if not labels.fresh(trial.id, key):
+            if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             if trial.split in {"train", "validation"}:
+                key = labels.key(item, recording)
                 inputs.append([item.name, trial.id, trial.split, key])
     parameters = {
         name: getattr(settings, name).model_dump(mode="json")
@@ -84,19 +88,18 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     return models
 
 
-def load_samples(store: Store, campaigns: list[Collected], split: str) -> SampleSet:
+def load_samples(labels: Labels, campaigns: list[Collected], split: str) -> SampleSet:
     """The samples of all trials of one split of the kinematic campaigns."""
     parts = []
     used = training_campaigns(campaigns)
     windows = used[0].settings.windows
     for item in used:
-        labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.of_split(split):
             seed = hash_integer("samples", trial.id)
             parts.append(
                 dataset.trial_samples(
                     recording,
-                    labels.read(trial.id),
+                    labels.read(item, recording),
                     trial.index,
                     windows,
                     item.settings.samples,
@@ -146,13 +149,13 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]])
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)
-def train_flow(wanted: Parcel[tuple[Store, list[Collected], list[Model]]]) -> int:
+def train_flow(wanted: Parcel[tuple[Labels, list[Collected], list[Model]]]) -> int:
     """Train the seeds that are stale, one after the other."""
-    store, campaigns, models = wanted.content
+    labels, campaigns, models = wanted.content
     settings = training_settings(campaigns)
-    with timed(store, "train"):
-        train = load_samples(store, campaigns, "train")
-        validation = load_samples(store, campaigns, "validation")
+    with timed(labels.store, "train"):
+        train = load_samples(labels, campaigns, "train")
+        validation = load_samples(labels, campaigns, "validation")
         for name, part in (("training", train), ("validation", validation)):
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
@@ -161,10 +164,20 @@ def train_flow(wanted: Parcel[tuple[Store, list[Collected], list[Model]]]) -> in
     return len(models)
 
 
-def train(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
-    """Train what is missing or stale."""
-    models = wanted_models(store, campaigns)
+def train(store: Store, campaigns: list[Collected], reviewed: bool = False) -> dict[str, Any]:
+    """Train what is missing or stale.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
     stale = [model for model in models if not model.fresh]
     if stale:
-        run(train_flow, Parcel((store, campaigns, stale)))
-    return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}
+        run(train_flow, Parcel((labels, campaigns, stale)))
+    return {
+        "step": "train",
+        "done": len(stale),
+        "fresh": len(models) - len(stale),
+        **labels.told(campaigns),
+    }
