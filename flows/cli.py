@@ -19,6 +19,7 @@ from flows.cli_common import (
     prepare_store,
 )
 from flows.cli_control import register as register_control
+from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
 
 app = typer.Typer(
@@ -140,5 +141,6 @@ cli_chain.register(app)
 cli_store.register(app)
 app.command()(rigs)
 register_control(app)
+register_review(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

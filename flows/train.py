@@ -52,9 +52,7 @@ def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
     return training_campaigns(campaigns)[0].settings
 
 
-def wanted_models(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> list[Model]:
+def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
     """The models that the settings ask for, with the keys they must have.
 
     Args:
