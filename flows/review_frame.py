@@ -12,6 +12,8 @@ from flows.review_trial import Shown
 
 _TAIL_FRAMES = 60
 """How many earlier frames a track is drawn through."""
+_RING = 0.2
+"""Radius of a ring around a marker, as a share of the skin's spacing."""
 _DARK = "#20262c"
 
 
@@ -71,7 +73,7 @@ class FramePlot:
         places = shown.places(index)
         seen = np.isfinite(places).all(axis=1)
         geometry = shown.recording.record["geometry"]
-        radius = 0.36 * geometry["px_per_mm"] * _spacing_mm(geometry["skin_mm"])
+        radius = _RING * geometry["px_per_mm"] * _spacing_mm(geometry["skin_mm"])
         self._rings.data = {
             **self._there(places[seen]),
             "r": np.full(int(seen.sum()), radius),

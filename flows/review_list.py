@@ -77,8 +77,7 @@ def doubts_of(label: Json) -> list[tuple[int, str]]:
         found.append((_SLIGHT, f"{label['markers_lost']} times a marker was not seen"))
     if label.get("plate_lost"):
         found.append((_SLIGHT, f"the plate's marker was not seen in {label['plate_lost']} frames"))
-    texts = {text: severity for severity, text in reversed(found)}  # one reason for both onsets
-    return sorted(((severity, text) for text, severity in texts.items()), key=lambda item: -item[0])
+    return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 
 
 def row_of(store: Store, item: Collected, trial: str, order: int) -> Row:

@@ -41,7 +41,7 @@ if (window.sliplab_keys) return;
 window.sliplab_keys = true;
 const known = {n: "next", ArrowDown: "next", p: "previous", ArrowUp: "previous",
   ArrowLeft: "back", ArrowRight: "forth", i: "incipient", g: "gross", a: "accept",
-  s: "adjust", r: "reason", u: "reopen", "0": "reset"};
+  s: "adjust", r: "reason", u: "reopen", "0": "reset", z: "zoom"};
 let count = 0;
 window.addEventListener("keydown", (event) => {
   const target = event.composedPath()[0];
@@ -52,7 +52,7 @@ window.addEventListener("keydown", (event) => {
   event.preventDefault();
   event.stopPropagation();
   if (known[event.key] === "reason") {
-    const view = Bokeh.index.find_one_by_id(reason.id);
+    const view = Bokeh.index.find_one(reason);
     if (view) view.input_el.focus();
   } else {
     count += 1;
@@ -60,9 +60,7 @@ window.addEventListener("keydown", (event) => {
   }
 }, true);
 """
-_CELL = HTMLTemplateFormatter(
-    template="<span title='<%- reasons %>' class='<%- state %>'><%- value %></span>"
-)
+_CELL = "<span title='<%- reasons %>' class='<%- state %>'><%- value %></span>"
 
 
 class Page:
@@ -85,6 +83,7 @@ class Page:
         self._frame: int | None = None
         self._drawing = False
         self._closed = False
+        self._close_by = False
         self._quiet = False
         self.plots = TimePlots(self._moved, self._cursor, simulated)
         self.frame = FramePlot()
@@ -96,16 +95,20 @@ class Page:
         keyboard = CustomJS(args={"pressed": self.pressed, "reason": self.reason}, code=KEYBOARD)
         doc.js_on_event(DocumentReady, keyboard)
         self._fill()
-        self._step(1)
+        doc.add_next_tick_callback(lambda: self._step(1))
 
     def _widgets(self, who: str) -> None:
         names = [_ALL, *self.trials.items]
         self.campaign = Select(title="campaign", value=_ALL, options=names, width=170)
         self.state = Select(
-            title="decision", value=_ALL, options=[_ALL, "doubtful", *STATES], width=110
+            title="decision",
+            value=_ALL,
+            options=[_ALL, "doubtful", *STATES],
+            width=110,
+            css_classes=["by-decision"],
         )
-        self.text = TextInput(title="id holds", value="", width=108)
-        self.first = Checkbox(label="doubtful first", active=True)
+        self.text = TextInput(title="id holds", value="", width=128, css_classes=["by-id"])
+        self.first = Checkbox(label="doubtful first", active=True, css_classes=["doubtful-first"])
         self.count = _div()
         for item in (self.campaign, self.state, self.text):
             item.on_change("value", lambda attr, old, new: self._fill())
@@ -113,16 +116,20 @@ class Page:
         names = ["trial", "state", "doubt", "campaign", "reasons"]
         self.source = ColumnDataSource({name: [] for name in names})
         self.source.selected.on_change("indices", self._picked)
+        cell = HTMLTemplateFormatter(template=_CELL)
         self.table = DataTable(
-            source=self.source, width=400, height=560, index_position=None, row_height=24,
+            source=self.source, width=430, height=600, index_position=None, row_height=24,
             sortable=False, reorderable=False, scroll_to_selection=True, autosize_mode="none",
             columns=[
-                TableColumn(field="doubt", title="", width=24, formatter=_CELL),
-                TableColumn(field="trial", title="trial", width=285, formatter=_CELL),
-                TableColumn(field="state", title="decision", width=75, formatter=_CELL),
+                TableColumn(field="doubt", title="", width=26, formatter=cell),
+                TableColumn(field="trial", title="trial", width=318, formatter=cell),
+                TableColumn(field="state", title="decision", width=66, formatter=cell),
             ],
             stylesheets=[_TABLE_STYLE],
         )  # fmt: skip
+        # a table draws itself anew only where its rows became more or fewer
+        redraw = "const view = Bokeh.index.find_one(table); if (view) view.updateGrid();"
+        self.source.js_on_change("data", CustomJS(args={"table": self.table}, code=redraw))
         self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
         self.said, self.caption = _div(), _div()
         self.who = TextInput(title="reviewer", value=who, width=120)
@@ -135,15 +142,17 @@ class Page:
         self.buttons: dict[str, Button] = {}
         named: tuple[tuple[Verdict, str, str], ...] = (
             ("accept", "Accept label", "success"), ("adjust", "Adjust to lines", "primary"),
-            ("reject", "Reject", "warning"), ("reopen", "Reopen", "light"),
+            ("reject", "Reject", "warning"), ("reopen", "Reopen", "default"),
         )  # fmt: skip
         for verdict, text, kind in named:
             button = Button(label=text, button_type=kind, width=110, name=verdict)
             button.on_click(partial(self._decide, verdict))
             self.buttons[verdict] = button
-        self.no_incipient = Button(label="no incipient slip", button_type="light", width=110)
-        self.no_gross = Button(label="no gross slip", button_type="light", width=110)
-        self.back = Button(label="lines back", button_type="light", width=90)
+        self.no_incipient = Button(label="no incipient slip", width=115)
+        self.no_gross = Button(label="no gross slip", width=115)
+        self.zoom = Button(label="zoom", width=70)
+        self.zoom.on_click(self._zoom)
+        self.back = Button(label="lines back", width=90)
         self.no_incipient.on_click(lambda: self.plots.put("incipient", None))
         self.no_gross.on_click(lambda: self.plots.put("gross", None))
         self.back.on_click(self._reset_lines)
@@ -153,16 +162,16 @@ class Page:
             row(self.campaign, self.state, self.text),
             row(self.first, self.count),
             self.table,
-            Div(text=words.keys(), stylesheets=[words.STYLE], width=400),
+            Div(text=words.keys(), stylesheets=[words.STYLE], width=430),
             self.pressed,
-            width=410,
+            width=440,
         )
-        tools = row(self.lines, column(row(self.no_incipient, self.no_gross, self.back)))
+        tools = row(self.no_incipient, self.no_gross, self.back, self.zoom)
         decide = row(self.who, self.reason)
         buttons = row(*self.buttons.values(), self.go_on)
         middle = column(
-            self.heading, self.plots.moved, self.plots.rate, tools, decide, buttons, self.said,
-            self.past, sizing_mode="stretch_width",
+            self.heading, self.plots.moved, self.plots.rate, self.lines, tools, decide, buttons,
+            self.said, self.past, sizing_mode="stretch_width",
         )  # fmt: skip
         right = column(self.frame.plot, self.caption, self.flags, width=410)
         return row(left, middle, right, sizing_mode="stretch_width")
@@ -252,6 +261,7 @@ class Page:
         self.shown = found
         decided = self._history()
         self.frame.frame_to(found)
+        self._close_by = False
         self.plots.show(found, kept or self._lines_of(found, decided))
         if not again:
             self.reason.value = ""
@@ -290,6 +300,14 @@ class Page:
         if self.shown is not None:
             self.plots.place(self.shown.suggested)
             self._moved()
+
+    def _zoom(self) -> None:
+        """Close to the cursor, or back."""
+        if self.shown is None:
+            return
+        self._close_by = not self._close_by and self._frame is not None
+        time = float(self.shown.frame_s[self._frame or 0]) if self._close_by else None
+        self.plots.zoom(time, self.shown.threshold_px)
 
     def _moved(self) -> None:
         if self.shown is not None:
@@ -381,6 +399,8 @@ class Page:
                 self.plots.put(name, time)  # type: ignore[arg-type]  # one of the two kinds
         elif name == "reset":
             self._reset_lines()
+        elif name == "zoom":
+            self._zoom()
         elif name in {"next", "previous"}:
             self._step(1 if name == "next" else -1)
         elif self.shown is not None and self._frame is not None:
@@ -437,6 +457,6 @@ def _div() -> Div:
 
 _TABLE_STYLE = """
 :host { font-family: sans-serif; font-size: 12px; }
-.slick-cell { font-size: 12px; } .slick-cell.selected { background: #cfe3f2; }
+.slick-cell { font-size: 11px; } .slick-cell.selected { background: #cfe3f2; }
 .accepted, .adjusted { color: #00664a; } .rejected { color: #b04700; } .stale { color: #8a6100; }
 """

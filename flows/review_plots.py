@@ -18,6 +18,8 @@ KINDS: tuple[Kind, Kind] = ("incipient", "gross")
 COLOUR = {"incipient": ORANGE, "gross": RED}
 _FAINT = "#b8bec4"
 _HOLD = "#00000008"
+_CLOSE_S = 0.3
+"""Half of what is seen close by."""
 _STEP_NS = 100_000
 """Onsets set by hand are kept to a tenth of a millisecond."""
 
@@ -38,16 +40,23 @@ class TimePlots:
         self._held: set[Kind] = set()
         self._exact = Onsets()
         self._texts: dict[Kind, Label] = {}
+        self._whole = (0.0, 1.0, 1.0)
         span = Range1d(0, 1)
         tools = "xpan,xwheel_zoom,xbox_zoom,reset"
         common: dict[str, Any] = {
             "x_range": span, "sizing_mode": "stretch_width", "tools": tools,
-            "active_scroll": "xwheel_zoom", "active_drag": None, "toolbar_location": "right",
+            "active_scroll": "xwheel_zoom", "active_drag": None,
             "min_border_left": 62,
         }  # fmt: skip
-        self.moved = figure(height=330, y_axis_label="displacement (px)", **common)
+        self.moved = figure(
+            height=330, y_axis_label="displacement (px)", toolbar_location="above", **common
+        )
         self.rate = figure(
-            height=170, y_axis_label="events (1/s)", x_axis_label="time in the trial (s)", **common
+            height=170,
+            y_axis_label="events (1/s)",
+            toolbar_location=None,
+            x_axis_label="time in the trial (s)",
+            **common,
         )
         self.moved.xaxis.visible = False
         self._markers = ColumnDataSource({"xs": [], "ys": [], "colour": [], "width": []})
@@ -69,7 +78,7 @@ class TimePlots:
         legend = (("centre marker", RED, 2.0), ("first marker to slip", ORANGE, 1.6),
                   ("other markers", _FAINT, 1.0))  # fmt: skip
         for text, colour, width in legend:
-            self.moved.line([], [], color=colour, line_width=width, legend_label=text)
+            self.moved.line([0], [np.nan], color=colour, line_width=width, legend_label=text)
         self.moved.legend.location, self.moved.legend.padding = "top_left", 4
         self.moved.legend.label_text_font_size, self.moved.legend.spacing = "11px", 0
         self.moved.legend.background_fill_alpha = 0.7
@@ -94,8 +103,8 @@ class TimePlots:
         self._below[kind] = _line(colour, 2)
         line = Span(
             dimension="height", location=0, visible=False, editable=True, name=f"onset {kind}",
-            line_color=colour, line_width=4, line_alpha=0.9, level="overlay",
-            hover_line_color=colour, hover_line_width=7,
+            line_color=colour, line_width=3, line_alpha=0.9, level="overlay",
+            hover_line_color=colour, hover_line_width=6,
         )  # fmt: skip
         text = Label(
             x=0, y=308 if kind == "incipient" else 290, y_units="screen", text=f" {kind}",
@@ -138,12 +147,9 @@ class TimePlots:
         self._events.data = {"x": shown.rate_s, "y": shown.rate}
         self._threshold.location = shown.threshold_px
         start, end = shown.span_s
-        for plot in (self.moved, self.rate):
-            plot.x_range.update(
-                start=start, end=end, reset_start=start, reset_end=end, bounds=(start, end)
-            )
-        top = float(np.nanmax(moved, initial=2 * shown.threshold_px))
-        self.moved.y_range.update(start=-0.02 * top, end=1.05 * top)
+        self.moved.x_range.update(reset_start=start, reset_end=end, bounds=(start, end))
+        self._whole = (start, end, float(np.nanmax(moved, initial=2 * shown.threshold_px)))
+        self.zoom(None, shown.threshold_px)
         self.rate.y_range.update(start=0, end=1.1 * float(np.max(shown.rate, initial=1.0)))
         for line in self._motion:
             line.update(location=shown.motion_s[0], visible=True)
@@ -152,12 +158,14 @@ class TimePlots:
             self._automatic[kind].update(location=(known or 0) / 1e9, visible=known is not None)
         self.place(onsets)
 
-    def clear(self) -> None:
-        """No trial."""
-        self._markers.data = {"xs": [], "ys": [], "colour": [], "width": []}
-        self._crossings.data = {"x": [], "y": [], "low": [], "high": []}
-        self._events.data = {"x": [], "y": []}
-        self.place(Onsets())
+    def zoom(self, time_s: float | None, threshold_px: float) -> None:
+        """Look closely at some time and at what is small, or at all of it again."""
+        start, end, top = self._whole
+        if time_s is not None:
+            start, end = max(start, time_s - _CLOSE_S), min(end, time_s + _CLOSE_S)
+            top = min(top, 5 * threshold_px)
+        self.moved.x_range.update(start=start, end=end)
+        self.moved.y_range.update(start=-0.02 * top, end=1.05 * top)
 
     def place(self, onsets: Onsets) -> None:
         """Put the lines there, without telling that somebody moved them."""

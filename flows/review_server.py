@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -66,6 +67,10 @@ def serving(
 def _server(path: str, make: Callable[[Document], None], port: int) -> Server:
     application = Application(FunctionHandler(make, trap_exceptions=True))
     try:
+        # looked at before: the server does not close a socket that it could not bind
+        with socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind((HOST, port))
         return Server(
             {path: application},
             io_loop=IOLoop.current(),

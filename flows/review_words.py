@@ -11,7 +11,7 @@ from storage.review import Decision, Onsets
 KEYS = (
     ("n, &darr;", "next"), ("p, &uarr;", "previous"), ("&larr; &rarr;", "frame"),
     ("i, g", "line to the cursor"), ("a", "accept"), ("s", "adjust"), ("r", "reason, reject"),
-    ("u", "reopen"), ("0", "lines back"),
+    ("u", "reopen"), ("0", "lines back"), ("z", "zoom"),
 )  # fmt: skip
 
 
@@ -57,6 +57,8 @@ def lines(shown: Shown, onsets: Onsets) -> str:
     for kind in ("incipient", "gross"):
         now, was = getattr(onsets, f"{kind}_ns"), getattr(shown.onsets, f"{kind}_ns")
         far = "" if now is None or was is None else f"{(now - was) / 1e6:+.1f} ms"
+        if was is None and now is not None and now == getattr(shown.suggested, f"{kind}_ns"):
+            far = "suggested by the markers that were seen"
         rows.append(
             f"<tr><th class='{kind}'>{kind}</th><td>{_seconds(was)}</td>"
             f"<td>{_seconds(now)}</td><td>{far}</td></tr>"
@@ -128,10 +130,11 @@ p { margin: 2px 0; } ul { margin: 2px 0; padding-left: 18px; }
 .state.rejected { background: #f9ddcf; } .state.stale { background: #fbe9c0; }
 .state.simulated { background: none; border: 1px solid #999; font-style: italic; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-td, th { padding: 1px 10px 1px 0; text-align: left; font-weight: 400; vertical-align: top; }
+td, th { padding: 1px 10px 1px 0; text-align: left; font-weight: 400; vertical-align: top;
+  white-space: nowrap; }
 tr:first-child th { color: #666666; }
 th.incipient { color: #b87d00; font-weight: 600; } th.gross { color: #D55E00; font-weight: 600; }
-.past td, .past th { white-space: nowrap; } .past td.why { white-space: normal; }
+.past td.why { white-space: normal; overflow-wrap: anywhere; }
 .flags td { font-size: 12px; padding-bottom: 0; }
 kbd { border: 1px solid #bbb; border-radius: 3px; padding: 0 4px; background: #f4f5f6; }
 .keys { color: #666666; font-size: 12px; line-height: 1.7; }

@@ -94,8 +94,8 @@ class Labels:
             return {}
         if states["stale"]:
             console.say(
-                f"warning: {states['stale']} decisions were made on labels that have changed "
-                f"since and are not applied; `sliplab review {self.store.folder}` shows them"
+                f"warning: decisions on {states['stale']} trials were made on labels that have "
+                f"changed since and are not applied; see `sliplab review {self.store.folder}`"
             )
         return {"reviewed": states}
 
