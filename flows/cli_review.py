@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flows import console
 from flows.cli_common import CampaignOption, JsonOption, StoreArgument
+from protocols.errors import InputError
 
 if TYPE_CHECKING:
     from flows.review_list import TrialList
@@ -43,7 +45,36 @@ def review(
     serve(Store.open(store), campaign or (), port, who, ready)
 
 
+def view(
+    store: StoreArgument,
+    trial: Annotated[str, typer.Argument(help="A trial's id, as in `sliplab trials`.")],
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write an .rrd file instead of opening it.")
+    ] = None,
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="Whose trial, where several have it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
+    from flows import view as looking
+    from storage.store import Store
+
+    subject = looking.find(Store.open(store), trial, campaign)
+    if save is None:
+        looking.show(subject)
+        return
+    if save.suffix != ".rrd" or not save.parent.is_dir():
+        raise InputError("--save", "", str(save), "must end in .rrd and stand in a folder")
+    counts = looking.save(subject, save)
+    if as_json:
+        console.print_json({"file": str(save), "trial": trial, **counts})
+    else:
+        told = {**counts, "bytes": console.size(counts["bytes"])}
+        console.print_pairs(f"{save} (open it with `rerun {save}`)", told)
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    for command in (review,):
+    for command in (review, view):
         app.command()(command)
