@@ -8,7 +8,7 @@ arm                        tool centre point as a transform; arm/path; arm/x, y,
 pulses/sync_box, events, arm
 displacement/marker_N      px
 onsets/NAME                0 before, 1 after the incipient, 2 after the gross onset, of the label,
-                           the review, the network and (simulated) the truth; onset_log in words
+                           the review and (simulated) the truth; onset_log in words
 network/no_slip ...        spike counts of the evaluated network
 """
 
