@@ -9,6 +9,7 @@ from bokeh.plotting import figure
 
 from analysis.figure_style import BLUE, GREEN, ORANGE, RED
 from flows.review_trial import Shown
+from storage.streams import U8
 
 _TAIL_FRAMES = 60
 """How many earlier frames a track is drawn through."""
@@ -59,13 +60,12 @@ class FramePlot:
         self._rings.data = {"x": [], "y": [], "r": [], "colour": []}
         self._plate.data = {"x": [], "y": []}
 
-    def draw(self, shown: Shown, index: int) -> str:
-        """Show one frame.
+    def draw(self, shown: Shown, index: int, picture: U8 | None) -> str:
+        """Show one frame, with its picture where there is one.
 
         Returns:
             what is seen, in words.
         """
-        picture = shown.picture(index)
         if picture is not None:
             height, width = picture.shape
             self._size = (width, height)

@@ -58,6 +58,15 @@ class Row:
         return self.campaign, self.trial
 
     @property
+    def word(self) -> str:
+        """How it stands, in short."""
+        if self.problem:
+            return "damaged"
+        if self.label != "fresh":
+            return "no label" if self.label == "missing" else "old label"
+        return self.state
+
+    @property
     def doubtful(self) -> bool:
         """Whether there is a reason to look at it."""
         return self.severity > 0
@@ -123,7 +132,7 @@ class TrialList:
     def __init__(self, store: Store, campaigns: Sequence[str] = ()) -> None:
         self.store = store
         self._names = list(campaigns)
-        self._signature: object = None
+        self._folders: object = None
         self.items: dict[str, Collected] = {}
         self.rows: list[Row] = []
         self.refresh()
@@ -135,9 +144,13 @@ class TrialList:
             StoreError: a campaign is damaged.
             InputError: a campaign that the store does not have.
         """
-        signature = self._look()
-        if signature == self._signature:
-            return False
+        # looked at before the rows are made: what changes meanwhile is seen the next time
+        folders, counts = self._look()
+        if folders == self._folders:
+            changed = [row for row in self.rows if row.decisions != _count(counts, row)]
+            for row in changed:
+                self.renew(row)
+            return bool(changed)
         found = {item.name: item for item in self.store.campaigns()}
         for name in self._names:
             if name not in found:
@@ -155,7 +168,7 @@ class TrialList:
                     rows.append(row_of(self.store, item, trial, len(rows)))
                 except StoreError:
                     continue  # it was damaged or taken away meanwhile: `verify` names it
-        self.items, self.rows, self._signature = items, rows, signature
+        self.items, self.rows, self._folders = items, rows, folders
         return True
 
     def renew(self, row: Row) -> Row:
@@ -164,17 +177,22 @@ class TrialList:
         self.rows = [fresh if other.name == row.name else other for other in self.rows]
         return fresh
 
-    def _look(self) -> object:
+    def _look(self) -> tuple[object, dict[str, dict[str, int]]]:
         """What changes when a row does: folders' times, and how many decisions there are."""
-        seen = []
+        seen, counts = [], {}
         for campaign in self.store.campaigns():
             derived = (Derived.of(self.store, step, campaign.name) for step in (STEP, "sync"))
             folders = (campaign.folder / "trials", *(step.folder for step in derived))
             times = [path.stat().st_mtime_ns if path.is_dir() else 0 for path in folders]
             protocol = campaign.protocol_file
             times.append(protocol.stat().st_mtime_ns if protocol.is_file() else 0)
-            seen.append((campaign.name, times, review.counts(self.store, campaign.name)))
-        return seen
+            seen.append((campaign.name, times))
+            counts[campaign.name] = review.counts(self.store, campaign.name)
+        return seen, counts
+
+
+def _count(counts: dict[str, dict[str, int]], row: Row) -> int:
+    return counts.get(row.campaign, {}).get(row.trial, 0)
 
 
 def chosen(
@@ -203,3 +221,14 @@ def chosen(
 
 def _waits(row: Row) -> bool:
     return row.state in {"open", "stale"}
+
+
+def as_columns(rows: Sequence[Row]) -> dict[str, list[str]]:
+    """The rows as a table's columns."""
+    return {
+        "trial": [row.trial for row in rows],
+        "campaign": [row.campaign for row in rows],
+        "state": [row.word for row in rows],
+        "doubt": ["?" * row.severity for row in rows],
+        "reasons": ["; ".join((row.campaign, *row.reasons)) for row in rows],
+    }

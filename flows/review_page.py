@@ -2,65 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from functools import partial
 from html import escape
-from typing import Any
 
 from bokeh.document import Document
 from bokeh.events import DocumentReady
-from bokeh.layouts import column, row
-from bokeh.models import (
-    Button,
-    Checkbox,
-    ColumnDataSource,
-    CustomJS,
-    DataTable,
-    Div,
-    HTMLTemplateFormatter,
-    Select,
-    TableColumn,
-    TextInput,
-)
 
 from flows import review_words as words
+from flows.review_aside import Aside
+from flows.review_decide import LabelChanged, keep
 from flows.review_frame import FramePlot
-from flows.review_list import Row, TrialList, chosen
+from flows.review_list import Row, TrialList, as_columns, chosen
 from flows.review_plots import TimePlots
 from flows.review_trial import Shown, load
-from flows.reviewed import STATES
+from flows.review_widgets import ALL, Widgets
 from storage import review
 from storage.errors import StoreError
 from storage.review import Onsets, Verdict
+from storage.streams import U8
 
 REFRESH_MS = 2000
-_ALL = "all"
-KEYBOARD = """
-if (window.sliplab_keys) return;
-window.sliplab_keys = true;
-const known = {n: "next", ArrowDown: "next", p: "previous", ArrowUp: "previous",
-  ArrowLeft: "back", ArrowRight: "forth", i: "incipient", g: "gross", a: "accept",
-  s: "adjust", r: "reason", u: "reopen", "0": "reset", z: "zoom"};
-let count = 0;
-window.addEventListener("keydown", (event) => {
-  const target = event.composedPath()[0];
-  const typing = target.isContentEditable || /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName || "")
-    && target.type !== "checkbox";
-  if (typing) { if (event.key === "Escape") target.blur(); return; }
-  if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in known)) return;
-  event.preventDefault();
-  event.stopPropagation();
-  if (known[event.key] === "reason") {
-    const view = Bokeh.index.find_one(reason);
-    if (view) view.input_el.focus();
-  } else {
-    count += 1;
-    pressed.value = known[event.key] + " " + count;
-  }
-}, true);
-"""
-_CELL = "<span title='<%- reasons %>' class='<%- state %>'><%- value %></span>"
 
 
 class Page:
@@ -73,136 +35,66 @@ class Page:
         who: the reviewer's name to begin with.
     """
 
-    def __init__(
-        self, doc: Document, trials: TrialList, pool: Executor, who: str, *, simulated: bool
-    ) -> None:
-        self.doc, self.trials, self.pool = doc, trials, pool
+    def __init__(self, doc: Document, trials: TrialList, pool: Executor, who: str) -> None:
+        self.trials = trials
+        self.aside = Aside(doc, pool, self._say)
         self.shown: Shown | None = None
         self._rows: list[Row] = []
         self._wanted: tuple[str, str] | None = None
         self._frame: int | None = None
         self._drawing = False
-        self._closed = False
         self._close_by = False
+        self._looking = False
+        self._listed: list[Row] | None = None
         self._quiet = False
-        self.plots = TimePlots(self._moved, self._cursor, simulated)
+        self.plots = TimePlots(self._moved, self._cursor)
         self.frame = FramePlot()
-        self._widgets(who)
+        self.see = Widgets([*trials.items], who)
+        self._connect()
         doc.title = "SlipLab review"
-        doc.add_root(self._layout())
+        doc.add_root(self.see.layout(self.plots.moved, self.plots.rate, self.frame.plot))
         doc.add_periodic_callback(self._look_again, REFRESH_MS)
         doc.on_session_destroyed(lambda _: self.close())
-        keyboard = CustomJS(args={"pressed": self.pressed, "reason": self.reason}, code=KEYBOARD)
-        doc.js_on_event(DocumentReady, keyboard)
+        doc.js_on_event(DocumentReady, self.see.keyboard)
         self._fill()
         doc.add_next_tick_callback(lambda: self._step(1))
 
-    def _widgets(self, who: str) -> None:
-        names = [_ALL, *self.trials.items]
-        self.campaign = Select(title="campaign", value=_ALL, options=names, width=170)
-        self.state = Select(
-            title="decision",
-            value=_ALL,
-            options=[_ALL, "doubtful", *STATES],
-            width=110,
-            css_classes=["by-decision"],
-        )
-        self.text = TextInput(title="id holds", value="", width=128, css_classes=["by-id"])
-        self.first = Checkbox(label="doubtful first", active=True, css_classes=["doubtful-first"])
-        self.count = _div()
-        for item in (self.campaign, self.state, self.text):
+    def _connect(self) -> None:
+        """What each control does."""
+        see = self.see
+        for item in (see.campaign, see.state, see.text):
             item.on_change("value", lambda attr, old, new: self._fill())
-        self.first.on_change("active", lambda attr, old, new: self._fill())
-        names = ["trial", "state", "doubt", "campaign", "reasons"]
-        self.source = ColumnDataSource({name: [] for name in names})
-        self.source.selected.on_change("indices", self._picked)
-        cell = HTMLTemplateFormatter(template=_CELL)
-        self.table = DataTable(
-            source=self.source, width=430, height=600, index_position=None, row_height=24,
-            sortable=False, reorderable=False, scroll_to_selection=True, autosize_mode="none",
-            columns=[
-                TableColumn(field="doubt", title="", width=26, formatter=cell),
-                TableColumn(field="trial", title="trial", width=318, formatter=cell),
-                TableColumn(field="state", title="decision", width=66, formatter=cell),
-            ],
-            stylesheets=[_TABLE_STYLE],
-        )  # fmt: skip
-        # a table draws itself anew only where its rows became more or fewer
-        redraw = "const view = Bokeh.index.find_one(table); if (view) view.updateGrid();"
-        self.source.js_on_change("data", CustomJS(args={"table": self.table}, code=redraw))
-        self.heading, self.lines, self.flags, self.past = _div(), _div(), _div(), _div()
-        self.said, self.caption = _div(), _div()
-        self.who = TextInput(title="reviewer", value=who, width=120)
-        self.reason = TextInput(
-            title="reason (needed to reject)", value="", width=300, name="reason"
-        )
-        self.go_on = Checkbox(label="then the next", active=True)
-        self.pressed = TextInput(value="", visible=False)
-        self.pressed.on_change("value", self._key)
-        self.buttons: dict[str, Button] = {}
-        named: tuple[tuple[Verdict, str, str], ...] = (
-            ("accept", "Accept label", "success"), ("adjust", "Adjust to lines", "primary"),
-            ("reject", "Reject", "warning"), ("reopen", "Reopen", "default"),
-        )  # fmt: skip
-        for verdict, text, kind in named:
-            button = Button(label=text, button_type=kind, width=110, name=verdict)
+        see.first.on_change("active", lambda attr, old, new: self._fill())
+        see.source.selected.on_change("indices", self._picked)
+        see.pressed.on_change("value", self._key)
+        for verdict, button in see.buttons.items():
             button.on_click(partial(self._decide, verdict))
-            self.buttons[verdict] = button
-        self.no_incipient = Button(label="no incipient slip", width=115)
-        self.no_gross = Button(label="no gross slip", width=115)
-        self.zoom = Button(label="zoom", width=70)
-        self.zoom.on_click(self._zoom)
-        self.back = Button(label="lines back", width=90)
-        self.no_incipient.on_click(lambda: self.plots.put("incipient", None))
-        self.no_gross.on_click(lambda: self.plots.put("gross", None))
-        self.back.on_click(self._reset_lines)
-
-    def _layout(self) -> Any:
-        left = column(
-            row(self.campaign, self.state, self.text),
-            row(self.first, self.count),
-            self.table,
-            Div(text=words.keys(), stylesheets=[words.STYLE], width=430),
-            self.pressed,
-            width=440,
-        )
-        tools = row(self.no_incipient, self.no_gross, self.back, self.zoom)
-        decide = row(self.who, self.reason)
-        buttons = row(*self.buttons.values(), self.go_on)
-        middle = column(
-            self.heading, self.plots.moved, self.plots.rate, self.lines, tools, decide, buttons,
-            self.said, self.past, sizing_mode="stretch_width",
-        )  # fmt: skip
-        right = column(self.frame.plot, self.caption, self.flags, width=410)
-        return row(left, middle, right, sizing_mode="stretch_width")
+        see.zoom.on_click(self._zoom)
+        see.no_incipient.on_click(lambda: self.plots.put("incipient", None))
+        see.no_gross.on_click(lambda: self.plots.put("gross", None))
+        see.back.on_click(self._reset_lines)
 
     # the list
 
     def _fill(self) -> None:
         """Show the rows that the filters let through; the trial that is shown stays."""
-        campaign = "" if self.campaign.value == _ALL else self.campaign.value
-        state = "" if self.state.value == _ALL else self.state.value
+        campaign = "" if self.see.campaign.value == ALL else self.see.campaign.value
+        state = "" if self.see.state.value == ALL else self.see.state.value
         self._rows = chosen(
-            self.trials.rows, campaign=campaign, state=state, text=self.text.value,
-            doubtful_first=bool(self.first.active),
+            self.trials.rows, campaign=campaign, state=state, text=self.see.text.value,
+            doubtful_first=bool(self.see.first.active),
         )  # fmt: skip
-        columns: dict[str, list[str]] = {
-            "trial": [item.trial for item in self._rows],
-            "campaign": [item.campaign for item in self._rows],
-            "state": [_state_word(item) for item in self._rows],
-            "doubt": ["?" * item.severity for item in self._rows],
-            "reasons": ["; ".join((item.campaign, *item.reasons)) for item in self._rows],
-        }
+        columns = as_columns(self._rows)
         self._quiet = True
         try:
-            if columns != dict(self.source.data):
-                self.source.data = columns
+            if columns != dict(self.see.source.data):
+                self.see.source.data = columns
             here = self._place()
-            self.source.selected.indices = [] if here is None else [here]
+            self.see.source.selected.indices = [] if here is None else [here]
         finally:
             self._quiet = False
         left = sum(item.state in {"open", "stale"} for item in self._rows)
-        self.count.text = f"{len(self._rows)} trials, {left} to decide"
+        self.see.count.text = f"{len(self._rows)} trials, {left} to decide"
 
     def _place(self) -> int | None:
         names = [item.name for item in self._rows]
@@ -222,11 +114,16 @@ class Page:
 
     def _look_again(self) -> None:
         """Decisions of others and new trials, while nobody asked."""
-        try:
-            if not self.trials.refresh() and self.trials.rows is self._listed:
-                return
-        except StoreError as error:
-            self._say(str(error), good=False)
+        if not self._looking:
+            self._looking = True
+            self.aside.do(self.trials.refresh, self._renewed, otherwise=self._looked)
+
+    def _looked(self) -> None:
+        self._looking = False
+
+    def _renewed(self, _: bool) -> None:
+        self._looked()
+        if self.trials.rows is self._listed:
             return
         self._listed = self.trials.rows
         self._fill()
@@ -236,8 +133,6 @@ class Page:
         ):
             self._choose(there[self.shown.row.name])
 
-    _listed: list[Row] | None = None
-
     # one trial
 
     def _choose(self, item: Row) -> None:
@@ -245,34 +140,33 @@ class Page:
         self._wanted = item.name
         here = self._place()
         self._quiet = True
-        self.source.selected.indices = [] if here is None else [here]
+        self.see.source.selected.indices = [] if here is None else [here]
         self._quiet = False
-        self._later(lambda: load(self.trials.store, self.trials.items[item.campaign], item),
+        self.aside.do(lambda: load(self.trials.store, self.trials.items[item.campaign], item),
                     self._show)  # fmt: skip
 
     def _show(self, found: Shown) -> None:
         if found.row.name != self._wanted:
-            found.close()
+            self._drop(found)
             return
         again = self.shown is not None and self.shown.row.name == found.row.name
         kept = self.plots.onsets() if again and self._is_moved() else None
-        if self.shown is not None:
-            self.shown.close()
+        self._drop(self.shown)
         self.shown = found
         decided = self._history()
         self.frame.frame_to(found)
         self._close_by = False
         self.plots.show(found, kept or self._lines_of(found, decided))
         if not again:
-            self.reason.value = ""
+            self.see.reason.value = ""
         place = self._place()
         position = "" if place is None else f"{place + 1} of {len(self._rows)}"
-        self.heading.text = words.heading(found, position)
-        self.flags.text = words.flags(found)
-        self.past.text = words.past(decided, found.row.key)
+        self.see.heading.text = words.heading(found, position)
+        self.see.flags.text = words.flags(found)
+        self.see.past.text = words.past(decided, found.row.key)
         self._moved()
         able = found.row.label == "fresh" and not found.row.problem
-        for button in self.buttons.values():
+        for button in self.see.buttons.values():
             button.disabled = not able
         times = [t for t in (found.suggested.incipient_ns,) if t is not None]
         self._cursor(times[0] / 1e9 if times else found.motion_s[0])
@@ -311,7 +205,7 @@ class Page:
 
     def _moved(self) -> None:
         if self.shown is not None:
-            self.lines.text = words.lines(self.shown, self.plots.onsets())
+            self.see.lines.text = words.lines(self.shown, self.plots.onsets())
 
     # the frame under the cursor
 
@@ -330,49 +224,39 @@ class Page:
             return
         self._drawing = True
 
-        def done(_: object) -> None:
+        def done(picture: U8 | None) -> None:
             self._drawing = False
             if self.shown is shown:
-                self.caption.text = self.frame.draw(shown, index)
+                self.see.caption.text = escape(self.frame.draw(shown, index, picture))
             if (self.shown, self._frame) != (shown, index):
                 self._draw()
 
-        self._later(lambda: shown.picture(index), done, otherwise=lambda: done(None))
+        self.aside.do(lambda: shown.picture(index), done, otherwise=lambda: done(None))
 
     # decisions
 
     def _decide(self, verdict: Verdict) -> None:
         shown = self.shown
-        if shown is None or self.buttons["accept"].disabled:
+        if shown is None or self.see.buttons["accept"].disabled:
             return
-        now = self.trials.renew(shown.row)
-        if now.label != "fresh" or now.key != shown.label_key:
-            self._say("The label has changed meanwhile: look at it again.", good=False)
-            self._choose(now)
-            return
-        new = {"accept": shown.onsets, "adjust": self.plots.onsets(), "reject": Onsets(),
-               "reopen": shown.onsets}[verdict]  # fmt: skip
         try:
-            if (problem := self._outside(shown, new)) is not None:
-                raise ValueError(problem)
-            made = review.decide(
-                self.trials.store, *shown.row.name, verdict, label=shown.label_key,
-                old=shown.onsets, new=new, seen=shown.row.decisions, who=self.who.value.strip(),
-                why=self.reason.value,
+            made = keep(
+                self.trials, shown, verdict, self.plots.onsets(), self.see.who.value,
+                self.see.reason.value,
             )  # fmt: skip
-        except review.Overtaken as error:
-            self._say(f"{error}. Look at it, then decide again.", good=False)
+        except (LabelChanged, review.Overtaken) as error:
+            self._say(f"Not kept: {error}. Look at it, then decide again.")
             self._choose(self.trials.renew(shown.row))
             return
         except (ValueError, OSError, StoreError) as error:
-            self._say(f"Not kept: {error}", good=False)
+            self._say(f"Not kept: {error}")
             return
-        kept = self.trials.renew(shown.row)
+        shown.row = self.trials.renew(shown.row)
         self._say(f"{shown.row.trial}: {made}", good=True)
-        after = self._after() if self.go_on.active and verdict != "reopen" else None
-        self.shown.row = kept  # type: ignore[union-attr]  # it is `shown`
+        self.plots.place(made.new if verdict == "adjust" else shown.suggested)
+        after = self._after() if self.see.go_on.active and verdict != "reopen" else None
         self._fill()
-        self._choose(after or kept)
+        self._choose(after or shown.row)
 
     def _after(self) -> Row | None:
         """The row below the one that is shown; None at the end."""
@@ -380,19 +264,11 @@ class Page:
         following = [] if here is None else self._rows[here + 1 : here + 2]
         return following[0] if following else None
 
-    @staticmethod
-    def _outside(shown: Shown, onsets: Onsets) -> str | None:
-        for kind in ("incipient", "gross"):
-            time = getattr(onsets, f"{kind}_ns")
-            if time is not None and not shown.span_s[0] <= time / 1e9 <= shown.span_s[1]:
-                return f"the {kind} onset lies outside the recording"
-        return None
-
     def _key(self, _: str, __: str, new: str) -> None:
         """A key that the browser handed on."""
         name = new.partition(" ")[0]
-        if name in self.buttons:
-            self._decide(name)  # type: ignore[arg-type]  # the buttons are named by verdicts
+        if name in self.see.buttons:
+            self._decide(name)
         elif name in {"incipient", "gross"}:
             if self.shown is not None and self._frame is not None:
                 time = float(self.shown.frame_s[self._frame])
@@ -408,55 +284,16 @@ class Page:
             last = len(self.shown.frame_s) - 1
             self._cursor(float(self.shown.frame_s[min(max(self._frame + by, 0), last)]))
 
-    # work aside
-
-    def _later(
-        self,
-        work: Callable[[], Any],
-        then: Callable[[Any], None],
-        otherwise: Callable[[], None] = lambda: None,
-    ) -> None:
-        """Do `work` in the pool and `then` with its result in this tab."""
-
-        def back(done: Future[Any]) -> None:
-            if not self._closed:
-                self.doc.add_next_tick_callback(partial(finish, done))
-
-        def finish(done: Future[Any]) -> None:
-            error = done.exception()
-            if error is None:
-                then(done.result())
-            else:
-                self._say(f"{type(error).__name__}: {error}", good=False)
-                otherwise()
-
-        self.pool.submit(work).add_done_callback(back)
-
-    def _say(self, text: str, *, good: bool) -> None:
-        self.said.text = f"<p class='{'good' if good else 'bad'}'>{escape(text)}</p>"
+    def _say(self, text: str, *, good: bool = False) -> None:
+        self.see.said.text = f"<p class='{'good' if good else 'bad'}'>{escape(text)}</p>"
 
     def close(self) -> None:
         """The tab is gone."""
-        self._closed = True
-        if self.shown is not None:
-            self.shown.close()
-            self.shown = None
+        self._drop(self.shown)
+        self.aside.close()
+        self.shown = None
 
-
-def _state_word(item: Row) -> str:
-    if item.problem:
-        return "damaged"
-    if item.label != "fresh":
-        return "no label" if item.label == "missing" else "old label"
-    return item.state
-
-
-def _div() -> Div:
-    return Div(text="", stylesheets=[words.STYLE], sizing_mode="stretch_width")
-
-
-_TABLE_STYLE = """
-:host { font-family: sans-serif; font-size: 12px; }
-.slick-cell { font-size: 11px; } .slick-cell.selected { background: #cfe3f2; }
-.accepted, .adjusted { color: #00664a; } .rejected { color: #b04700; } .stale { color: #8a6100; }
-"""
+    def _drop(self, shown: Shown | None) -> None:
+        """Close a trial's video, in the thread that reads it."""
+        if shown is not None:
+            self.aside.do(shown.close)

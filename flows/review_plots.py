@@ -32,9 +32,7 @@ class TimePlots:
             the pointer is at.
     """
 
-    def __init__(
-        self, on_move: Callable[[], None], on_cursor: Callable[[float], None], simulated: bool
-    ) -> None:
+    def __init__(self, on_move: Callable[[], None], on_cursor: Callable[[float], None]) -> None:
         self._on_move = on_move
         self._quiet = False
         self._held: set[Kind] = set()
@@ -82,10 +80,8 @@ class TimePlots:
         self.moved.legend.location, self.moved.legend.padding = "top_left", 4
         self.moved.legend.label_text_font_size, self.moved.legend.spacing = "11px", 0
         self.moved.legend.background_fill_alpha = 0.7
-        if simulated:
-            self.moved.title.text = "simulated"
-            self.moved.title.align, self.moved.title.text_color = "right", GREY
-            self.moved.title.text_font_style = "italic"
+        self.moved.title.align, self.moved.title.text_color = "right", GREY
+        self.moved.title.text_font_style = "italic"
         self._cursors = [_line(GREY, 1), _line(GREY, 1)]
         self._motion = [_line(GREY, 1, "dashed"), _line(GREY, 1, "dashed")]
         self.lines: dict[Kind, Span] = {}
@@ -132,6 +128,7 @@ class TimePlots:
 
     def show(self, shown: Shown, onsets: Onsets) -> None:
         """Another trial, with the onset lines there."""
+        self.moved.title.text = "simulated" if shown.recording.simulated else ""
         moved = shown.displacement_px
         count = moved.shape[1]
         first = shown.label.get("first_marker")

@@ -48,11 +48,10 @@ def serving(
         StoreError: a campaign is damaged.
     """
     trials = TrialList(store, campaigns)
-    simulated = store.simulated
     with ThreadPoolExecutor(1, thread_name_prefix="review") as pool:
 
         def make(doc: Document) -> None:
-            Page(doc, trials, pool, who or user_name(), simulated=simulated)
+            Page(doc, trials, pool, who or user_name())
 
         path = f"/{secrets.token_urlsafe(24)}"
         server = _server(path, make, port)
