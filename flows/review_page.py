@@ -55,7 +55,7 @@ class Page:
         doc.add_root(self.see.layout(self.plots.moved, self.plots.rate, self.frame.plot))
         doc.add_periodic_callback(self._look_again, REFRESH_MS)
         doc.on_session_destroyed(lambda _: self.close())
-        doc.js_on_event(DocumentReady, self.see.keyboard)
+        doc.js_on_event(DocumentReady, self.see.keyboard, self.plots.drag)
         self._fill()
         doc.add_next_tick_callback(lambda: self._step(1))
 
@@ -94,7 +94,14 @@ class Page:
         finally:
             self._quiet = False
         left = sum(item.state in {"open", "stale"} for item in self._rows)
+        self._head()
         self.see.count.text = f"{len(self._rows)} trials, {left} to decide"
+
+    def _head(self) -> None:
+        if self.shown is not None:
+            place = self._place()
+            position = "" if place is None else f"{place + 1} of {len(self._rows)}"
+            self.see.heading.text = words.heading(self.shown, position)
 
     def _place(self) -> int | None:
         names = [item.name for item in self._rows]
@@ -159,9 +166,7 @@ class Page:
         self.plots.show(found, kept or self._lines_of(found, decided))
         if not again:
             self.see.reason.value = ""
-        place = self._place()
-        position = "" if place is None else f"{place + 1} of {len(self._rows)}"
-        self.see.heading.text = words.heading(found, position)
+        self._head()
         self.see.flags.text = words.flags(found)
         self.see.past.text = words.past(decided, found.row.key)
         self._moved()

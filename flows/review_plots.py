@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CustomJS, Label, Range1d, Span
+from bokeh.models import ColumnDataSource, CustomJS, Label, NumeralTickFormatter, Range1d, Span
 from bokeh.plotting import figure
 
 from analysis.figure_style import BLUE, GREY, ORANGE, RED
@@ -20,6 +20,29 @@ _FAINT = "#b8bec4"
 _HOLD = "#00000008"
 _CLOSE_S = 0.3
 """Half of what is seen close by."""
+_DRAG = """
+const view = Bokeh.index.find_one(plot);
+if (!view || plot.sliplab_drag) return;
+plot.sliplab_drag = true;
+let held = null;
+const scale = () => view.frame.x_scale;
+const place = (event) => event.clientX - view.el.getBoundingClientRect().left;
+const nearest = (event) => {
+  const far = (line) => Math.abs(scale().compute(line.location) - place(event));
+  return lines.filter((line) => line.visible && far(line) < 9).sort((a, b) => far(a) - far(b))[0];
+};
+view.el.addEventListener("pointerdown", (event) => {
+  held = event.button == 0 ? nearest(event) : null;
+}, true);
+view.el.addEventListener("pointermove", (event) => {
+  view.el.style.cursor = held || nearest(event) ? "ew-resize" : "";
+}, true);
+window.addEventListener("pointermove", (event) => {
+  if (held) held.location = scale().invert(place(event));
+}, true);
+window.addEventListener("pointerup", () => { held = null; }, true);
+"""
+"""Bokeh's own editable lines are caught within 2 pixels only, and beside where they are drawn."""
 _STEP_NS = 100_000
 """Onsets set by hand are kept to a tenth of a millisecond."""
 
@@ -40,10 +63,10 @@ class TimePlots:
         self._texts: dict[Kind, Label] = {}
         self._whole = (0.0, 1.0, 1.0)
         span = Range1d(0, 1)
-        tools = "xpan,xwheel_zoom,xbox_zoom,reset"
+        tools = "xwheel_zoom,reset"
         common: dict[str, Any] = {
             "x_range": span, "sizing_mode": "stretch_width", "tools": tools,
-            "active_scroll": "xwheel_zoom", "active_drag": None,
+            "active_scroll": "xwheel_zoom",
             "min_border_left": 62,
         }  # fmt: skip
         self.moved = figure(
@@ -70,16 +93,20 @@ class TimePlots:
         self.moved.add_layout(self._threshold)
         self._events = ColumnDataSource({"x": [], "y": []})
         self.rate.step("x", "y", source=self._events, mode="center", line_color=BLUE)
+        self.rate.yaxis.formatter = NumeralTickFormatter(format="0,0")
         for plot in (self.moved, self.rate):
             plot.on_event("mousemove", lambda event: on_cursor(float(event.x)))
             plot.xgrid.grid_line_alpha = plot.ygrid.grid_line_alpha = 0.4
-        legend = (("centre marker", RED, 2.0), ("first marker to slip", ORANGE, 1.6),
+        named = (("centre marker", RED, 2.0), ("first marker to slip", ORANGE, 1.6),
                   ("other markers", _FAINT, 1.0))  # fmt: skip
-        for text, colour, width in legend:
+        for text, colour, width in named:
             self.moved.line([0], [np.nan], color=colour, line_width=width, legend_label=text)
-        self.moved.legend.location, self.moved.legend.padding = "top_left", 4
-        self.moved.legend.label_text_font_size, self.moved.legend.spacing = "11px", 0
-        self.moved.legend.background_fill_alpha = 0.7
+        legend = self.moved.legend[0]
+        legend.update(
+            orientation="horizontal", label_text_font_size="11px", padding=2, border_line_width=0,
+            spacing=12,
+        )  # fmt: skip
+        self.moved.add_layout(legend, "above")
         self.moved.title.align, self.moved.title.text_color = "right", GREY
         self.moved.title.text_font_style = "italic"
         self._cursors = [_line(GREY, 1), _line(GREY, 1)]
@@ -89,6 +116,7 @@ class TimePlots:
         self._below: dict[Kind, Span] = {}
         for kind in KINDS:
             self._add_onset(kind)
+        self.drag = CustomJS(args={"plot": self.moved, "lines": [*self.lines.values()]}, code=_DRAG)
         for pair in (self._cursors, self._motion):
             for plot, line in zip((self.moved, self.rate), pair, strict=True):
                 plot.add_layout(line)
@@ -98,14 +126,13 @@ class TimePlots:
         self._automatic[kind] = _line(colour, 1, "dashed")
         self._below[kind] = _line(colour, 2)
         line = Span(
-            dimension="height", location=0, visible=False, editable=True, name=f"onset {kind}",
+            dimension="height", location=0, visible=False, name=f"onset {kind}",
             line_color=colour, line_width=3, line_alpha=0.9, level="overlay",
-            hover_line_color=colour, hover_line_width=6,
         )  # fmt: skip
         text = Label(
-            x=0, y=308 if kind == "incipient" else 290, y_units="screen", text=f" {kind}",
-            text_color=colour, text_font_size="12px", text_font_style="bold", visible=False,
-            background_fill_color="white", background_fill_alpha=0.7, x_offset=4, y_offset=-32,
+            x=0, y=0, text=f"{kind} \u2194", text_color=colour, text_font_size="12px",
+            text_font_style="bold", visible=False, background_fill_color="white",
+            background_fill_alpha=0.7, x_offset=5, y_offset=-18 if kind == "incipient" else -36,
         )  # fmt: skip
         follow = CustomJS(
             args={"text": text, "below": self._below[kind]},
@@ -163,6 +190,8 @@ class TimePlots:
             top = min(top, 5 * threshold_px)
         self.moved.x_range.update(start=start, end=end)
         self.moved.y_range.update(start=-0.02 * top, end=1.05 * top)
+        for text in self._texts.values():
+            text.y = 1.05 * top
 
     def place(self, onsets: Onsets) -> None:
         """Put the lines there, without telling that somebody moved them."""
