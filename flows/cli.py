@@ -20,6 +20,7 @@ from flows.cli_common import (
 )
 from flows.cli_control import register as register_control
 from flows.cli_exchange import register as register_exchange
+from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
 from flows.cli_serve import register as register_serve
 
@@ -149,5 +150,6 @@ app.command()(rigs)
 register_control(app)
 register_serve(app)
 register_exchange(app)
+register_review(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

@@ -20,6 +20,10 @@ from flows.cli_common import (
     step,
 )
 
+ReviewedOption = Annotated[
+    bool, typer.Option("--reviewed", help="Use what people decided in `sliplab review`.")
+]
+
 
 def sync(
     store: PlaceArgument,
@@ -57,11 +61,12 @@ def label(
 def train(
     store: PlaceArgument,
     campaign: CampaignOption = None,
+    reviewed: ReviewedOption = False,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Train the spiking network on the labelled kinematic trials."""
-    step(store, campaign, as_json, "train", dask=dask)
+    step(store, campaign, as_json, "train", dask=dask, reviewed=reviewed)
 
 
 def evaluate(
@@ -73,11 +78,13 @@ def evaluate(
     smoothing: Annotated[
         int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
     ] = None,
+    reviewed: ReviewedOption = False,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on trials it has never seen."""
-    step(store, campaign, as_json, "evaluate", margin=margin, smoothing=smoothing, dask=dask)
+    options = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    step(store, campaign, as_json, "evaluate", dask=dask, **options)
 
 
 def report(

@@ -19,8 +19,8 @@ from flows import counting
 from flows.campaigns import Collected, training_campaigns
 from flows.counting import COUNTS, count_spikes
 from flows.label import STEP as LABELS
-from flows.label import label_key
 from flows.orchestration import Parcel, run
+from flows.reviewed import Labels
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
 from protocols import Trial
@@ -44,6 +44,7 @@ class Job:
 
     store: Store
     campaigns: list[Collected]
+    labels: Labels
     model: Model
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
@@ -60,7 +61,10 @@ def choose_model(models: list[Model]) -> Model:
     """
     for model in models:
         if not model.fresh:
-            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
+            raise StoreError(
+                f"{model.path}: is missing or stale; run `sliplab train` first, with `--reviewed` "
+                "where the evaluation has it"
+            )
     return max(models, key=lambda model: read_json(model.info_path)["validation"]["strict"])
 
 
@@ -70,43 +74,41 @@ def make_job(
     margin: float | None = None,
     smoothing: int | None = None,
     cluster: Cluster | None = None,
+    reviewed: bool = False,
 ) -> Job:
     """Find what is to be evaluated, and by what detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own.
         cluster: what counts spikes and makes samples, instead of this machine.
+        reviewed: people's decisions are applied to the labels.
     """
-    models = wanted_models(store, campaigns)
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
     model = choose_model(models)
     windows = training_settings(campaigns).windows.model_dump(mode="json")
     change = {"margin": margin, "smoothing": smoothing}
     change = {name: value for name, value in change.items() if value is not None}
     detection, trials, inputs = {}, [], []
     for item in campaigns:
-        labels = Derived.of(store, LABELS, item.name)
         detection[item.name] = Detection.model_validate(
             {**item.settings.detection.model_dump(), **change}
         )
         for trial, recording in item.trials:
             if trial.split != "test":
                 continue
-            label = label_key(recording, item.settings.labelling)
-            if not labels.fresh(trial.id, label):
+            if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            label = labels.key(item, recording)
             counts = make_key(COUNTS, counting.VERSION, [model.key, recording.checksum], windows)
             trials.append((item, trial, recording, counts))
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
-    return Job(
-        store,
-        campaigns,
-        model,
-        detection,
-        trials,
-        make_key(STEP, VERSION, [model.key, inputs], used),
-        cluster,
-    )
+    # what people decided on trials beside the test trials is counted in the result
+    states = labels.states(campaigns)
+    of_review = [] if states is None else [states]
+    key = make_key(STEP, VERSION, [model.key, inputs, *of_review], used)
+    return Job(store, campaigns, labels, model, detection, trials, key, cluster)
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
@@ -120,6 +122,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "trials": rows,
         "experiments": _summaries(rows),
         "label_error_ms": _label_errors(job),
+        "reviewed": job.labels.states(job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
@@ -148,8 +151,8 @@ def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any
 def _score_trials(job: Job) -> list[dict[str, Any]]:
     """One row a trial: onsets, detections, latency."""
     rows = []
-    for item, trial, _, _ in job.trials:
-        label = Derived.of(job.store, LABELS, item.name).read(trial.id)
+    for item, trial, recording, _ in job.trials:
+        label = job.labels.read(item, recording)
         found = trial_counts(job.store, item.name, trial.id)
         settings = job.detection[item.name]
         detections = detect(found["counts"], found["end_ns"], settings)
@@ -198,7 +201,7 @@ def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _label_errors(job: Job) -> dict[str, Any]:
-    """Labels against the simulation's truth, over every labelled simulated trial; ms."""
+    """Automatic labels against the simulation's truth, over every simulated trial; ms."""
     errors: dict[str, list[float]] = {"incipient": [], "gross": []}
     for item in job.campaigns:
         labels = Derived.of(job.store, LABELS, item.name)
@@ -236,7 +239,7 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
             job.cluster,
         )
         train, test = (
-            load_samples(job.store, job.campaigns, split, job.cluster)
+            load_samples(job.labels, job.campaigns, split, job.cluster)
             for split in ("train", "test")
         )
         score(Parcel((job, train, test)))
@@ -248,11 +251,17 @@ def evaluate(
     margin: float | None = None,
     smoothing: int | None = None,
     cluster: Cluster | None = None,
+    reviewed: bool = False,
 ) -> dict[str, Any]:
     """Evaluate if any input or setting changed."""
     training_campaigns(campaigns)
-    job = make_job(store, campaigns, margin, smoothing, cluster)
+    job = make_job(store, campaigns, margin, smoothing, cluster, reviewed)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
         run(evaluate_flow, Parcel(job), cluster)
-    return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}
+    return {
+        "step": "evaluate",
+        "done": int(stale),
+        "fresh": int(not stale),
+        **job.labels.told(campaigns),
+    }

@@ -45,7 +45,11 @@ def make_summary(
         "kinematic": kinematic,
         "gravity": experiments["gravity"],
         "disturbance": experiments["disturbance"],
-        "labels": {"error_ms": evaluation["label_error_ms"], "source": _sources(campaigns)},
+        "labels": {
+            "error_ms": evaluation["label_error_ms"],
+            "source": _sources(campaigns),
+            "reviewed": evaluation.get("reviewed"),
+        },
         "detection": evaluation["detection"],
         "sync": _sync(campaigns),
         "quality": _quality(campaigns),

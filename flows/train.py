@@ -13,14 +13,13 @@ from analysis import dataset, model_file, training
 from analysis.dataset import SampleSet
 from flows import console
 from flows.campaigns import Collected, training_campaigns
-from flows.label import STEP as LABELS
-from flows.label import label_key
 from flows.orchestration import Parcel, run
+from flows.reviewed import Labels
 from flows.timing import timed
 from flows.trial_work import TrialWork, each_trial
 from protocols.hashing import hash_integer
 from protocols.settings import AnalysisSettings, Samples, Windows
-from storage.derived import Derived, make_key
+from storage.derived import make_key
 from storage.files import read_json, write_json
 from storage.recording import Recording
 from storage.store import Store, StoreError
@@ -58,8 +57,11 @@ def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
     return training_campaigns(campaigns)[0].settings
 
 
-def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
+def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
     """The models that the settings ask for, with the keys they must have.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
 
     Raises:
         StoreError: a trial has no fresh label yet.
@@ -67,13 +69,13 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     used = training_campaigns(campaigns)
     settings = used[0].settings
     inputs = []
+    labels = Labels(store, reviewed)
     for item in used:
-        labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            key = label_key(recording, item.settings.labelling)
-            if not labels.fresh(trial.id, key):
+            if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             if trial.split in {"train", "validation"}:
+                key = labels.key(item, recording)
                 inputs.append([item.name, trial.id, trial.split, key])
     parameters = {
         name: getattr(settings, name).model_dump(mode="json")
@@ -90,7 +92,7 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
 
 
 def load_samples(
-    store: Store, campaigns: list[Collected], split: str, cluster: Cluster | None = None
+    labels: Labels, campaigns: list[Collected], split: str, cluster: Cluster | None = None
 ) -> SampleSet:
     """The samples of all trials of one split of the kinematic campaigns.
 
@@ -102,7 +104,7 @@ def load_samples(
         TrialWork(
             recording, item.name, "",
             _Wanted(
-                Derived.of(store, LABELS, item.name).read(trial.id), trial.index, windows,
+                labels.read(item, recording), trial.index, windows,
                 item.settings.samples, hash_integer("samples", trial.id),
             ),
         )
@@ -111,7 +113,13 @@ def load_samples(
     ]  # fmt: skip
     parts: dict[int, SampleSet] = {}
     each_trial(
-        store, f"samples to {split}", work, _samples, parts.__setitem__, cluster, processes=False
+        labels.store,
+        f"samples to {split}",
+        work,
+        _samples,
+        parts.__setitem__,
+        cluster,
+        processes=False,
     )
     return SampleSet.join([parts[number] for number in range(len(work))], windows)
 
@@ -174,14 +182,14 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]])
 
 @flow(name="train", validate_parameters=False, persist_result=False)
 def train_flow(
-    wanted: Parcel[tuple[Store, list[Collected], list[Model], Cluster | None]],
+    wanted: Parcel[tuple[Labels, list[Collected], list[Model], Cluster | None]],
 ) -> int:
     """Train the seeds that are stale, one after the other."""
-    store, campaigns, models, cluster = wanted.content
+    labels, campaigns, models, cluster = wanted.content
     settings = training_settings(campaigns)
-    with timed(store, "train"):
-        train = load_samples(store, campaigns, "train", cluster)
-        validation = load_samples(store, campaigns, "validation", cluster)
+    with timed(labels.store, "train"):
+        train = load_samples(labels, campaigns, "train", cluster)
+        validation = load_samples(labels, campaigns, "validation", cluster)
         for name, part in (("training", train), ("validation", validation)):
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
@@ -191,11 +199,25 @@ def train_flow(
 
 
 def train(
-    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
+    store: Store,
+    campaigns: list[Collected],
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
 ) -> dict[str, Any]:
-    """Train what is missing or stale; the cluster makes the samples, this machine trains."""
-    models = wanted_models(store, campaigns)
+    """Train what is missing or stale.
+
+    Args:
+        cluster: what makes the samples; this machine trains.
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
     stale = [model for model in models if not model.fresh]
     if stale:
-        run(train_flow, Parcel((store, campaigns, stale, cluster)), cluster)
-    return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}
+        run(train_flow, Parcel((labels, campaigns, stale, cluster)), cluster)
+    return {
+        "step": "train",
+        "done": len(stale),
+        "fresh": len(models) - len(stale),
+        **labels.told(campaigns),
+    }

@@ -16,7 +16,7 @@ from storage.files import read_json
 from storage.hdf5 import StreamReader
 from storage.record_shape import check_clocks, check_record
 from storage.streams import F64, I64, U8, EventChunk, Json
-from storage.video import read_frame, read_frames
+from storage.video import FrameReader, read_frame, read_frames
 from storage.whole import byte_problem, read_sums, to_fetch
 from storage.writer import DATA, FRAMES, RECORD
 
@@ -229,6 +229,10 @@ class Recording:
     def frame(self, index: int) -> U8:
         """One decoded frame."""
         return read_frame(self._sound(FRAMES), index)
+
+    def frame_reader(self) -> FrameReader:
+        """The video, opened for frames in any order; a context manager."""
+        return FrameReader(self._sound(FRAMES))
 
     def tracks(self) -> Tracks:
         """The markers' places, where they were recorded instead of a video.

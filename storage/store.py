@@ -8,6 +8,7 @@
     STORE/campaigns/NAME/bench/          who stood at the rig, one file a stretch of work
     STORE/campaigns/NAME/skipped.json    trials that a person set aside (`storage.decisions`)
     STORE/control/                       what people asked for meanwhile (`storage.control`)
+    STORE/review/                        what people decided about labels (`storage.review`)
     STORE/derived/ models/ report/       what analysis made of it; may be deleted at any time
     STORE/before/                        copies of what a migration changed
 
