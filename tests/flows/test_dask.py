@@ -150,14 +150,15 @@ def mark(job: tuple[str, int]) -> None:
 
 
 def test_a_stop_cancels_what_is_queued(tmp_path: Path, cluster: Cluster) -> None:
+    jobs = [(str(tmp_path), k) for k in range(15)]  # few enough to be a chunk each
     with pytest.raises(KeyboardInterrupt):
-        everywhere(mark, [(str(tmp_path), k) for k in range(40)], cluster, stopping.stop)
+        everywhere(mark, jobs, cluster, stopping.stop)
     stopping._requested.clear()
     (tmp_path / "go").touch()
     begun = len(list(tmp_path.iterdir())) - 1
     assert everywhere(abs, [-1, -2], cluster, lambda: None) == [1, 2]
     assert len(list(tmp_path.iterdir())) - 1 <= begun + 1
-    assert begun < 20
+    assert begun < 8
 
 
 def test_a_pushed_store_is_labelled_where_its_trials_are_fetched(
