@@ -40,7 +40,7 @@ def _line(frame, y, left, right):  # type: ignore[no-untyped-def]
     for j in range(row.size):
         total += row[j]
     for j in range(row.size - 1):
-        step = np.int32(row[j + 1]) - np.int32(row[j])
+        step: Any = np.int32(row[j + 1]) - np.int32(row[j])
         squares += min(step * step, 400)
     return float(total), right - left, float(squares)
 

@@ -43,7 +43,18 @@ def load(path: Path) -> Fitted:
         OSError: there is none, or it cannot be read.
         ValueError: it is not a model file, is damaged, or its weights do not fit its settings.
     """
-    data = path.read_bytes()
+    return parse(path.read_bytes(), str(path))
+
+
+def parse(data: bytes, name: str) -> Fitted:
+    """A model from a file's bytes.
+
+    Args:
+        name: what the message calls it.
+
+    Raises:
+        ValueError: as `load`.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             spoilt = archive.testzip()  # torch does not look at the checksums
@@ -73,5 +84,5 @@ def load(path: Path) -> Fitted:
         pickle.UnpicklingError,
         zipfile.BadZipFile,
     ) as error:
-        raise ValueError(f"{path}: not a model file of this program: {error}") from error
+        raise ValueError(f"{name}: not a model file of this program: {error}") from error
     return fitted

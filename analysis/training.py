@@ -186,6 +186,11 @@ def predict_counts(fitted: Fitted, x: Array) -> npt.NDArray[np.int64]:
     return fused_counts(restore(fitted), x)
 
 
+def limit_threads(count: int) -> None:
+    """Compute in `count` threads of this process from now on; results do not depend on it."""
+    torch.set_num_threads(count)
+
+
 @dataclass(frozen=True)
 class _Part:
     """What a few samples contribute to a step."""

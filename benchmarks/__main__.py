@@ -16,7 +16,7 @@ from benchmarks.measure import RUNS, SEED, Figures, machine, versions
 
 NAMES = (
     "storage", "scene", "clocks", "labels", "labels_truth", "network", "orchestration",
-    "acquisition",
+    "acquisition", "scale",
 )  # fmt: skip
 RESULTS = Path(__file__).with_name("RESULTS.md")
 LIMIT_S = 900

@@ -20,7 +20,7 @@ RUNS = 5
 PACKAGES = (
     "sliplab", "numpy", "scipy", "numba", "h5py", "hdf5plugin", "av",
     "opencv-contrib-python-headless", "torch", "sinabs", "prefect",
-    "pypylon", "dv-processing",
+    "pypylon", "dv-processing", "bluesky", "pandas", "pyarrow",
 )  # fmt: skip
 
 Figures = dict[str, float]
@@ -78,9 +78,9 @@ def peak_mb() -> float:
     return float(peak.split()[0]) * 1024 / 1e6 if peak else float("nan")
 
 
-def resident_mb() -> float:
-    """The memory that this process holds now, MB; NaN where the system does not tell."""
-    held = _from_file("/proc/self/status", "VmRSS")
+def resident_mb(pid: int | None = None) -> float:
+    """The memory that a process, by default this one, holds now, MB; NaN where nobody tells."""
+    held = _from_file(f"/proc/{pid or 'self'}/status", "VmRSS")
     return float(held.split()[0]) * 1024 / 1e6 if held else float("nan")
 
 

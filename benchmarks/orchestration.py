@@ -1,72 +1,203 @@
-"""What Prefect costs a collection of 864 empty trials, in the shape of `flows.collect`.
+"""What Prefect costs a collection a trial, beside a bare loop and Bluesky; catalogue and start-up.
 
-One flow, a task for every 25 trials. `loop_ms` is the bare loop; `batched_ms` is what the flow
-takes over it, to the flow's end, and with what it leaves for the server to do: the time that an
-empty flow right behind it takes longer than another empty flow after that. Both are for all 864
-together. `empty_flow_ms` is what any flow costs. The server is started before the clock runs.
+864 empty trials go through the task of `flows.collect`, 25 a task as on a mock rig (`batched_ms`)
+and one a task as on a real one (`per_trial_ms`). Both are milliseconds a trial over the bare loop,
+until the server has kept every task run as completed, and with what an empty flow right behind
+takes longer than one after that. `bluesky_ms` is a run of the RunEngine a trial (open, an empty
+message, close) and nothing that listens, `bluesky_plan_ms` one plan with all of them. The server is
+started before the clock runs. Processor time stands beside wall time (`*_cpu_ms`: this program
+and the server), for it tells more on a machine that has other things to do.
+
+`catalogue_100k_s` is one filtered query over 100,000 trial records whose index is built;
+`startup_s` from the command to the first motion of a mock rig in a new store, with the caches that
+a first collection leaves; `memory_growth_mb` what this program holds more after 10,000 trials, one
+a task, than after 1,000 (`server_growth_mb`: the server).
 """
 
 from __future__ import annotations
 
+import json
+import os
 import tempfile
+import time
+import urllib.request
 from pathlib import Path
+from statistics import median
 from typing import Any
 
-from benchmarks.measure import RUNS, Figures, alternate, spread
-from flows.orchestration import Parcel, prepare, run
+from benchmarks.catalogues import catalogue_figures
+from benchmarks.measure import RUNS, Figures, Seconds, alternate, spread
+from benchmarks.start_up import startup_seconds
+from flows.orchestration import Parcel, begin, embedded, prepare, run
+
+DRAIN_LIMIT_S = 120.0
 
 
-def measure(trials: int = 864, runs: int = RUNS) -> Figures:
-    """Milliseconds for `trials` empty steps, bare and in batches."""
+class _Steps:
+    """Stands where a session does: takes trials and does nothing."""
+
+    def __init__(self) -> None:
+        self.taken = 0
+
+    def take(self, trials: range) -> None:
+        """Take some."""
+        for _ in trials:
+            self.taken += 1
+
+
+def measure(
+    trials: int = 864, runs: int = RUNS, records: int = 100_000, starts: int = RUNS,
+    long: int = 10_000,
+) -> Figures:  # fmt: skip
+    """Everything in one go."""
+    figures: Figures = {}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         prepare(Path(folder))  # before Prefect is imported
-        return _compare(trials, runs)
+        begin()
+        figures |= _compare(trials, runs)
+        figures |= _memory(long)
+    figures |= catalogue_figures(records, runs)
+    if starts:
+        figures |= spread("startup_s", startup_seconds(starts))
+    return figures
 
 
-def _compare(trials: int, runs: int) -> Figures:
-    from prefect import flow, task
-    from prefect.cache_policies import NO_CACHE
+def _flows() -> Any:
+    """A flow of so many trials, so many a task, and one of none."""
+    from prefect import flow
+    from prefect.runtime import flow_run
 
-    from flows.collect import MOCK_BATCH
-
-    def step(trial: int) -> int:
-        return trial
-
-    @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
-    def take(part: Parcel[range]) -> int:
-        return sum(1 for trial in part.content if step(trial) >= 0)
+    from flows.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
-    def collect(wanted: Parcel[range]) -> int:
-        every = wanted.content
-        return sum(
-            take(Parcel(every[at : at + MOCK_BATCH])) for at in range(0, len(every), MOCK_BATCH)
-        )
+    def collect(wanted: Parcel[tuple[range, int, Any]]) -> str:
+        every, size, look = wanted.content
+        session: Any = _Steps()
+        for at in range(0, len(every), size):
+            take_trials(Parcel(session), Parcel(every[at : at + size]))
+            look(session.taken)
+        if session.taken != len(every):
+            raise RuntimeError(f"{session.taken} of {len(every)} trials were taken")
+        return str(flow_run.id)
 
     @flow(name="empty", validate_parameters=False, persist_result=False)
     def empty(wanted: Parcel[None]) -> None:
         assert wanted.content is None
 
-    def loop() -> int:
-        return sum(1 for trial in range(trials) if step(trial) >= 0)
+    return collect, empty
 
-    def batched() -> None:
-        done: Any = run(collect, Parcel(range(trials)))
-        if done != trials:
-            raise RuntimeError(f"{done} of {trials} steps were taken")
+
+def _compare(trials: int, runs: int) -> Figures:
+    from flows.collect import MOCK_BATCH
+
+    collect, empty = _flows()
+    every = range(trials)
+    spent: dict[str, Seconds] = {"batched": [], "per_trial": []}
+
+    def loop() -> None:
+        _Steps().take(every)
+
+    def through_prefect(name: str, size: int) -> None:
+        before = time.process_time() + _server_cpu_s()
+        run_id = run(collect, Parcel((every, size, lambda taken: None)))
+        _drained(run_id, -(-trials // size))
+        spent[name].append(time.process_time() + _server_cpu_s() - before)
 
     def alone() -> None:
         run(empty, Parcel(None))
 
-    taken = alternate(runs, loop=loop, batched=batched, behind=alone, empty=alone)
-    over = [
-        1e3 * (full + max(0.0, behind - empty_s) - bare)
-        for full, behind, empty_s, bare in zip(
-            taken["batched"], taken["behind"], taken["empty"], taken["loop"], strict=True
+    one_plan, a_run_each = _bluesky(trials)
+    taken = alternate(
+        runs,
+        loop=loop,
+        batched=lambda: through_prefect("batched", MOCK_BATCH),
+        behind_batched=alone,
+        per_trial=lambda: through_prefect("per_trial", 1),
+        behind_per_trial=alone,
+        empty=alone,
+        bluesky=a_run_each,
+        bluesky_plan=one_plan,
+    )
+    figures = spread("loop_ms", [1e3 * each / trials for each in taken["loop"]])
+    for name in ("batched", "per_trial"):
+        rounds = zip(
+            taken[name], taken[f"behind_{name}"], taken["empty"], taken["loop"], strict=True
         )
-    ]
-    return {
-        **spread("loop_ms", [each * 1e3 for each in taken["loop"]]),
-        **spread("batched_ms", over),
-        **spread("empty_flow_ms", [each * 1e3 for each in taken["empty"]]),
+        over = [full + max(0.0, behind - empty_s) - bare for full, behind, empty_s, bare in rounds]
+        figures |= spread(f"{name}_ms", [1e3 * each / trials for each in over])
+        figures[f"{name}_cpu_ms"] = 1e3 * median(spent[name][1:]) / trials
+    for name in ("bluesky", "bluesky_plan"):
+        over = [full - bare for full, bare in zip(taken[name], taken["loop"], strict=True)]
+        figures |= spread(f"{name}_ms", [1e3 * each / trials for each in over])
+    return figures | spread("empty_flow_ms", [1e3 * each for each in taken["empty"]])
+
+
+def _bluesky(trials: int) -> Any:
+    """All trials as one plan, and as a run of the engine each."""
+    import bluesky.plan_stubs as bps
+    from bluesky import RunEngine
+
+    engine = RunEngine(context_managers=[])  # without its handler of Ctrl-C, which costs more
+
+    def one() -> Any:
+        yield from bps.open_run()
+        yield from bps.null()
+        yield from bps.close_run()
+
+    def plan() -> Any:
+        for _ in range(trials):
+            yield from one()
+
+    def a_run_each() -> None:
+        for _ in range(trials):
+            engine(one())
+
+    return lambda: engine(plan()), a_run_each
+
+
+def _memory(long: int) -> Figures:
+    """What is held after all trials more than after a tenth of them."""
+    from benchmarks.measure import resident_mb
+
+    server = embedded()
+    held: dict[int, tuple[float, float]] = {}
+
+    def look(taken: int) -> None:
+        if taken in {long // 10, long}:
+            held[taken] = (resident_mb(), resident_mb(server.pid))
+
+    collect, _ = _flows()
+    run_id = run(collect, Parcel((range(long), 1, look)))
+    _drained(run_id, long)
+    (ours, its), (ours_late, its_late) = held[long // 10], held[long]
+    return {"memory_growth_mb": ours_late - ours, "server_growth_mb": its_late - its}
+
+
+def _server_cpu_s() -> float:
+    """What the server has used of processors so far, s; 0 where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{embedded().pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _drained(run_id: str, count: int) -> None:
+    """Wait until the server has kept so many task runs of a flow run as completed."""
+    wanted = {
+        "flow_runs": {"id": {"any_": [run_id]}},
+        "task_runs": {"state": {"type": {"any_": ["COMPLETED"]}}},
     }
+    question = urllib.request.Request(
+        f"{embedded().url}/task_runs/count",
+        json.dumps(wanted).encode(),
+        {"Content-Type": "application/json"},
+    )
+    end = time.monotonic() + DRAIN_LIMIT_S
+    kept = 0
+    while time.monotonic() < end:
+        with urllib.request.urlopen(question, timeout=DRAIN_LIMIT_S) as answer:
+            kept = json.load(answer)
+        if kept >= count:
+            return
+    raise RuntimeError(f"the server keeps {kept} of {count} task runs")

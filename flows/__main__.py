@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from pathlib import Path
 
 import typer
@@ -12,7 +13,7 @@ from typer.exceptions import TyperException
 from flows import console, stopping
 from flows.cli import app
 from protocols.errors import InputError
-from storage.errors import disk_error
+from storage.errors import StoreError, disk_error
 
 
 def main() -> None:
@@ -58,9 +59,9 @@ def _explain(error: Exception) -> int:
     ):
         console.say(f"error: {said}")
         return console.FAILED
-    expected = {"StoreError", "RigError", "ArmFault", "Locked", "CampaignStopped"}
-    if type(error).__name__ not in expected:
-        console.messages.print_exception(max_frames=8)
+    expected = {"RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError"}
+    if type(error).__name__ not in expected and not isinstance(error, StoreError):
+        console.say("".join(traceback.format_exception(error, limit=-8)))
     console.say(f"error: {error or type(error).__name__}")
     return console.FAILED
 

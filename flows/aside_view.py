@@ -8,19 +8,25 @@ from flows import console
 from flows.campaigns import Collected
 from flows.orders import set_aside
 from protocols import InputError
-from storage.store import Store, StoreError
+from storage.store import IMPORTED, Store, StoreError
 
 
-def all_aside(store: Store, unreadable: list[str]) -> list[dict[str, Any]]:
+def all_aside(
+    store: Store, unreadable: list[str], committed: dict[str, set[str]] | None = None
+) -> list[dict[str, Any]]:
     """What was set aside in every campaign, as `flows.orders.set_aside`, with its campaign.
 
     Args:
         unreadable: gets a line for every campaign that cannot be read.
+        committed: whole trials by campaign, for whoever knows them already.
     """
     found = []
     for campaign in store.campaigns():
         try:
-            aside = set_aside(Collected(campaign).plan, campaign)
+            if IMPORTED in campaign.info:  # nobody plans them
+                continue
+            done = None if committed is None else committed.get(campaign.name, set())
+            aside = set_aside(Collected(campaign).plan, campaign, done)
         except (InputError, StoreError) as error:
             unreadable.append(f"campaign {campaign.name}: {error}")
             continue

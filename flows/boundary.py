@@ -6,13 +6,15 @@ Nothing of this is looked at while the arm moves, and all of it before it moves 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
+from datetime import datetime
 
 from flows import console, stopping
 from flows.disk_watch import DiskWatch
 from flows.orders import Order, pending_trials
 from flows.reference_watch import ReferenceWatch
-from flows.stops import CampaignStopped
+from flows.stops import CampaignStopped, WindowOver
 from protocols import Trial
 from storage import control, decisions
 from storage.control import Request
@@ -44,7 +46,11 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
         else:
             change = decisions.skip if request.kind == "skip" else decisions.again
             where = store.campaign(request.campaign)
-            did = {"trials": change(where, request.trials, request.by), "running": running}
+            if where.begun:
+                trials = change(where, request.trials, request.by)
+            else:
+                trials = dict.fromkeys(request.trials, "there is no such campaign")
+            did = {"trials": trials, "running": running}
         done.append((request, control.answer(store, request, did)))
     return done
 
@@ -69,6 +75,7 @@ class Boundary:
         wait: lets some seconds pass, and answers stop requests.
         on_pause: called with the seconds of a pause when it is over.
         fresh_start: called when a pause is over: the rig may not be what it was.
+        clock: seconds since 1970, by which a window ends.
     """
 
     def __init__(
@@ -80,6 +87,7 @@ class Boundary:
         self.wait: Callable[[float], None] = stopping.wait
         self.on_pause: Callable[[float], None] = lambda seconds: None
         self.fresh_start: Callable[[], None] = lambda: None
+        self.clock: Callable[[], float] = time.time
         self._seen: frozenset[str] = frozenset()
         self._paused: Request | None = None
         self._skipped = frozenset(decisions.skipped(campaign))
@@ -99,11 +107,13 @@ class Boundary:
         Raises:
             KeyboardInterrupt: somebody asked to stop.
             CampaignStopped: the disk has no room for it, or a pause was never ended.
+            WindowOver: it would not be over in time.
         """
         if self._look():
             self._stand_still(trial)
         if trial.id in self._skipped:
             return False
+        self._check_window(trial)
         self.disk.check(trial)
         return True
 
@@ -148,6 +158,20 @@ class Boundary:
         for trial, did in answer["did"].get("trials", {}).items():
             console.say(f"{request.kind} {trial}: {did}")
 
+    def _check_window(self, trial: Trial) -> None:
+        """A trial is begun only if its planned time fits in: the arm rests when people come."""
+        until = self._order.until
+        if until is None:
+            return
+        virtual = self._order.rig.in_virtual_time
+        planned = 0.0 if virtual else self._order.plan.seconds(trial)
+        if self.clock() + planned > until:
+            raise WindowOver(
+                f"the window of campaign {self._campaign.name} ends "
+                f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, too soon for "
+                f"{trial.id}; the next collection goes on"
+            )
+
     def _stand_still(self, trial: Trial) -> None:
         console.say(
             f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
@@ -155,6 +179,7 @@ class Boundary:
         )
         waited = 0.0
         while request := self._look():
+            self._check_window(trial)
             if waited >= PAUSE_LIMIT_S:
                 raise CampaignStopped(
                     f"{self._store.folder} was paused ({request}) for "

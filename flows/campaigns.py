@@ -9,7 +9,7 @@ from functools import cached_property
 from protocols import InputError, Plan, Trial, load_plan
 from protocols.settings import AnalysisSettings
 from storage.recording import Recording
-from storage.store import Campaign, Store, StoreError
+from storage.store import IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,12 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
     campaigns = {campaign.name: campaign for campaign in store.campaigns()}
     if not campaigns:
         raise StoreError(f"{store.folder}: holds no campaign yet; run `sliplab collect` first")
+    imported = {name for name, campaign in campaigns.items() if IMPORTED in campaign.info}
+    if imported >= campaigns.keys():
+        raise StoreError(f"{store.folder}: holds imported campaigns only, which have no protocol")
     for name in names or ():
+        if name in imported:
+            raise InputError("--campaign", "", name, "was imported: it has no protocol")
         if name not in campaigns:
             raise InputError(
                 "--campaign",
@@ -72,7 +77,8 @@ def collected(store: Store, names: list[str] | None = None) -> list[Collected]:
                 name,
                 f"is not in {store.folder}; there are {', '.join(campaigns)}",
             )
-    return [Collected(campaigns[name]) for name in (names or campaigns)]
+    names = names or [name for name in campaigns if name not in imported]
+    return [Collected(campaigns[name]) for name in names]
 
 
 def training_campaigns(campaigns: list[Collected]) -> list[Collected]:

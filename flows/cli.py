@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flows import cli_chain, cli_steps, cli_store, console
+from flows import cli_chain, cli_remote, cli_steps, cli_store, console
 from flows.cli_calibrate import calibrate_app, teach_app
 from flows.cli_common import (
     EnableOption,
@@ -19,7 +19,10 @@ from flows.cli_common import (
     prepare_store,
 )
 from flows.cli_control import register as register_control
+from flows.cli_exchange import register as register_exchange
+from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
+from flows.cli_serve import register as register_serve
 
 app = typer.Typer(
     name="sliplab",
@@ -105,7 +108,9 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
+    from flows import orchestration
     from flows.orders import Bench, check_disk, make_order
+    from storage.store import Store
 
     order = make_order(
         protocol,
@@ -120,6 +125,8 @@ def collect(
         console.say(f"note: {warning}")
     check_disk([order])
     prepare_store(store)
+    if order.wanted(Store(store).campaign(order.campaign)):
+        orchestration.begin()  # starts beside all that is imported below
     from flows.collect import collect as run
 
     result = run(order)
@@ -138,7 +145,11 @@ def collect(
 cli_steps.register(app)
 cli_chain.register(app)
 cli_store.register(app)
+cli_remote.register(app)
 app.command()(rigs)
 register_control(app)
+register_serve(app)
+register_exchange(app)
+register_review(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

@@ -11,6 +11,13 @@ from flows import console
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+PlaceArgument = Annotated[
+    str, typer.Argument(help="A store's folder, or the URL of a pushed one (s3://..., file://...).")
+]
+DaskOption = Annotated[
+    str | None,
+    typer.Option("--dask", help="HOST:PORT of a Dask scheduler whose workers take the trials."),
+]
 RigOption = Annotated[
     Path, typer.Option("--rig", help="A rig file (YAML), or the name of one that ships: mock.")
 ]
@@ -34,13 +41,43 @@ def prepare_store(folder: Path) -> None:
     orchestration.prepare(Store.create(folder).folder)
 
 
-def step(folder: Path, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
+def located(place: str) -> Path:
+    """The folder of a store: itself, or the mirror of a URL, brought up to date.
+
+    Raises:
+        StoreError: there is none.
+    """
+    from storage.mirror import open_mirror
+    from storage.urls import is_url
+
+    if not is_url(place):
+        return Path(place)
+    with console.bar(f"look at {place} (trials)", 0) as bar:
+
+        def seen(name: str) -> None:
+            bar.extend(1)
+            bar.advance(1, name)
+
+        store, done = open_mirror(place, seen)
+    for problem in done.problems:
+        console.say(f"left out: {problem}")
+    console.say(f"working on {store.folder}; events and videos come when they are read")
+    return store.folder
+
+
+def step(place: str, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
     """Run one analysis step on a store and print what it did."""
-    finish(run_step(folder, names, step, **options), f"{step} {folder}", as_json)
+    finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
 
 
-def run_step(folder: Path, names: list[str] | None, step: str, **options: Any) -> dict[str, Any]:
-    """Run one analysis step on a store."""
+def run_step(
+    folder: Path, names: list[str] | None, step: str, dask: str | None = None, **options: Any
+) -> dict[str, Any]:
+    """Run one analysis step on a store.
+
+    Args:
+        dask: the scheduler whose workers take the trials.
+    """
     from importlib import import_module
 
     from storage.store import Store
@@ -48,16 +85,22 @@ def run_step(folder: Path, names: list[str] | None, step: str, **options: Any) -
     store = Store.open(folder)
     prepare_store(folder)
     from flows.campaigns import collected
+    from flows.cluster import connected
 
-    result: dict[str, Any] = getattr(import_module(f"flows.{step}"), step)(
-        store, collected(store, names), **options
-    )
+    campaigns = collected(store, names)
+    with connected(dask) as cluster:
+        if cluster is not None:
+            options["cluster"] = cluster
+        result: dict[str, Any] = getattr(import_module(f"flows.{step}"), step)(
+            store, campaigns, **options
+        )
     if not result["done"]:
         console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
     return result
 
 
 def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+    """Print what a command did, as one JSON object or for a person."""
     if as_json:
         console.print_json(result)
         return

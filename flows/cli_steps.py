@@ -8,14 +8,31 @@ from typing import Annotated
 import typer
 
 from flows import console
-from flows.cli_common import CampaignOption, JsonOption, RigOption, StoreArgument, run_step, step
+from flows.cli_common import (
+    CampaignOption,
+    DaskOption,
+    JsonOption,
+    PlaceArgument,
+    RigOption,
+    finish,
+    located,
+    run_step,
+    step,
+)
+
+ReviewedOption = Annotated[
+    bool, typer.Option("--reviewed", help="Use what people decided in `sliplab review`.")
+]
 
 
 def sync(
-    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: PlaceArgument,
+    campaign: CampaignOption = None,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Fit the clocks of every trial again and write report/sync.html about them."""
-    result = run_step(store, campaign, "sync")
+    result = run_step(located(store), campaign, "sync", dask)
     if as_json:
         console.print_json(result)
         return
@@ -32,21 +49,28 @@ def sync(
 
 
 def label(
-    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: PlaceArgument,
+    campaign: CampaignOption = None,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the true onsets of every trial from its video, or from the tracks in its place."""
-    step(store, campaign, as_json, "label")
+    step(store, campaign, as_json, "label", dask=dask)
 
 
 def train(
-    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: PlaceArgument,
+    campaign: CampaignOption = None,
+    reviewed: ReviewedOption = False,
+    dask: DaskOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Train the spiking network on the labelled kinematic trials."""
-    step(store, campaign, as_json, "train")
+    step(store, campaign, as_json, "train", dask=dask, reviewed=reviewed)
 
 
 def evaluate(
-    store: StoreArgument,
+    store: PlaceArgument,
     campaign: CampaignOption = None,
     margin: Annotated[
         float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
@@ -54,18 +78,22 @@ def evaluate(
     smoothing: Annotated[
         int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
     ] = None,
+    reviewed: ReviewedOption = False,
+    dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on trials it has never seen."""
-    step(store, campaign, as_json, "evaluate", margin=margin, smoothing=smoothing)
+    options = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    step(store, campaign, as_json, "evaluate", dask=dask, **options)
 
 
 def report(
-    store: StoreArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: PlaceArgument, campaign: CampaignOption = None, as_json: JsonOption = False
 ) -> None:
     """Write report/index.html and report/summary.json."""
-    step(store, campaign, as_json, "report")
-    console.say(f"report: {store / 'report' / 'index.html'}")
+    folder = located(store)
+    finish(run_step(folder, campaign, "report"), f"report {store}", as_json)
+    console.say(f"report: {folder / 'report' / 'index.html'}")
 
 
 def tradeoff(
@@ -80,13 +108,14 @@ def tradeoff(
     sensitivity: Annotated[
         bool, typer.Option("--sensitivity", help="Also what each guessed number changes.")
     ] = False,
+    dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure what simulating a protocol's scene costs, and how far off cheaper ways are."""
     from flows import tradeoff as steps
     from flows.tradeoff_page import choice_pairs, short_table
 
-    result = steps.tradeoff(scene, rig, out, trials, sensitivity)
+    result = steps.tradeoff(scene, rig, out, trials, sensitivity, dask=dask)
     if as_json:
         console.print_json(result)
         return

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from flows import console
-from flows.cli_common import JsonOption, StoreArgument
+from flows.cli_common import JsonOption, PlaceArgument, StoreArgument, located
 from protocols.errors import InputError
 
 SHOWN = (
@@ -19,12 +18,12 @@ SHOWN = (
 
 
 def trials(
-    store: StoreArgument,
+    store: PlaceArgument,
     where: Annotated[
         str | None, typer.Option("--where", help="Only rows for which this holds.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", help="Write a .csv or .json file instead.")
+        Path | None, typer.Option("--output", help="Write a .csv, .parquet or .json file instead.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -34,8 +33,12 @@ def trials(
     from storage.store import Store
 
     unreadable: list[str] = []
-    table = catalogue(Store.open(store), unreadable)
-    aside = all_aside(Store.open(store), unreadable)
+    opened = Store.open(located(store))
+    table = catalogue(opened, unreadable)
+    whole = None
+    if not unreadable and len(table):  # else what is whole may be more than what can be read
+        whole = {name: set(part) for name, part in table.groupby("campaign")["trial"]}
+    aside = all_aside(opened, unreadable, whole)
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:
@@ -44,15 +47,9 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from storage.files import write_text
+        from storage.exchange.tables import write_table
 
-        kinds: dict[str, Callable[[], str]] = {
-            ".csv": lambda: table.to_csv(index=False),
-            ".json": lambda: table.to_json(orient="records"),
-        }
-        if output.suffix not in kinds:
-            raise InputError("--output", "", str(output), "must end in .csv or .json")
-        write_text(output, kinds[output.suffix]())
+        write_table(table, output)
         console.say(f"{len(table)} trials: {output}")
     if as_json:
         import json
@@ -74,7 +71,7 @@ def trials(
 
 
 def verify(
-    store: StoreArgument,
+    store: PlaceArgument,
     quarantine: Annotated[
         bool,
         typer.Option("--quarantine", help="Set damaged trials aside, to be taken again."),
@@ -83,10 +80,16 @@ def verify(
 ) -> None:
     """Check every checksum, count and clock of a store; changes nothing unless told to."""
     from storage.store import Store
+    from storage.urls import is_url
     from storage.verify import set_aside, trial_folders
     from storage.verify import verify as look
 
-    opened = Store.open(store)
+    if is_url(store):
+        from flows.cli_remote import verify_pushed
+
+        verify_pushed(store, quarantine, as_json)
+        return
+    opened = Store.open(Path(store))
     total = sum(len(trial_folders(campaign)) for campaign in opened.campaigns())
     with console.bar("verify (trials)", total) as bar:
         problems = look(opened, lambda name: bar.advance(1, name))

@@ -17,6 +17,7 @@ from flows.orchestration import Parcel, run
 from flows.orders import Order, campaign_counts, check_disk, pending_trials
 from flows.remaining import Remaining
 from flows.session import Session
+from flows.showing import shown
 from flows.stretch import owned, refresh, stretch
 from flows.timing import timed
 from protocols import Trial
@@ -37,15 +38,21 @@ def take_trials(session: Parcel[Session], trials: Parcel[list[Trial]]) -> int:
 def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
     """Take the trials of an order that its store lacks."""
     wanted = order.content
-    with stretch(wanted) as work, timed(Store(wanted.store), f"collect {wanted.campaign}"):
+    with (
+        shown(wanted) as page,
+        stretch(wanted) as work,
+        timed(Store(wanted.store), f"collect {wanted.campaign}"),
+    ):
         session, trials = work.session, work.trials
         simulated = "simulated " if wanted.rig.simulated else ""
+        page.begin(len(trials))
         left = Remaining(wanted.plan, trials, real_time=not wanted.rig.in_virtual_time)
         title = f"collect {wanted.campaign} ({simulated}trials)"
         with console.bar(title, len(trials), str(left)) as bar:
 
             def told(trial: Trial, outcome: str) -> None:
                 left.done(trial)
+                page.told(trial, outcome)
                 bar.advance(1, f"{trial.id} {outcome}", str(left))
 
             session.on_trial, work.boundary.on_pause = told, left.pause
@@ -57,6 +64,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
                         take_trials(Parcel(session), Parcel(trials[start : start + size]))
                     trials = work.boundary.more() if wanted.most is None else []
                     bar.extend(len(trials))
+                    page.more(len(trials))
                     left.add(trials)
         return {
             **campaign_counts(wanted, session.campaign),

@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Table
 
 from flows import stopping
+from storage.secrets import masked
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -34,7 +35,7 @@ results = Console(highlight=False)
 
 def say(text: str) -> None:
     """A line for people."""
-    messages.print(text, markup=False)
+    messages.print(masked(text), markup=False)
 
 
 def print_json(data: Any) -> None:

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis import dataset, metrics, model_file, training
+from analysis import metrics, model_file, training
 from analysis.baselines import evaluate_baselines
+from analysis.dataset import SampleSet
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
-from flows import console
+from flows import counting
 from flows.campaigns import Collected, training_campaigns
-from flows.label import STEP as LABELS
-from flows.label import label_key
+from flows.counting import COUNTS, count_spikes
 from flows.label_errors import label_errors, rules_compared
 from flows.orchestration import Parcel, run
+from flows.reviewed import Labels
 from flows.timing import timed
 from flows.train import Model, load_samples, training_settings, wanted_models
 from protocols import Trial
@@ -29,10 +30,11 @@ from storage.files import read_json
 from storage.recording import Recording
 from storage.store import Store, StoreError
 
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
+
 STEP = "evaluation"
-COUNTS = "counts"
-VERSION = 2
-COUNTS_VERSION = 1
+VERSION = 1
 NAME = "evaluation"
 
 
@@ -42,11 +44,13 @@ class Job:
 
     store: Store
     campaigns: list[Collected]
+    labels: Labels
     model: Model
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
     key: str
+    cluster: Cluster | None = None
 
 
 def choose_model(models: list[Model]) -> Model:
@@ -57,7 +61,10 @@ def choose_model(models: list[Model]) -> Model:
     """
     for model in models:
         if not model.fresh:
-            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
+            raise StoreError(
+                f"{model.path}: is missing or stale; run `sliplab train` first, with `--reviewed` "
+                "where the evaluation has it"
+            )
     return max(models, key=lambda model: read_json(model.info_path)["validation"]["strict"])
 
 
@@ -66,86 +73,65 @@ def make_job(
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
 ) -> Job:
     """Find what is to be evaluated, and by what detection settings.
 
     Args:
         margin, smoothing: instead of the protocols' own.
+        cluster: what counts spikes and makes samples, instead of this machine.
+        reviewed: people's decisions are applied to the labels.
     """
-    models = wanted_models(store, campaigns)
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
     model = choose_model(models)
     windows = training_settings(campaigns).windows.model_dump(mode="json")
     change = {"margin": margin, "smoothing": smoothing}
     change = {name: value for name, value in change.items() if value is not None}
     detection, trials, inputs = {}, [], []
     for item in campaigns:
-        labels = Derived.of(store, LABELS, item.name)
         detection[item.name] = Detection.model_validate(
             {**item.settings.detection.model_dump(), **change}
         )
         for trial, recording in item.trials:
             if trial.split != "test":
                 continue
-            label = label_key(recording, item.settings.labelling)
-            if not labels.fresh(trial.id, label):
+            if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
-            counts = make_key(COUNTS, COUNTS_VERSION, [model.key, recording.checksum], windows)
+            label = labels.key(item, recording)
+            counts = make_key(COUNTS, counting.VERSION, [model.key, recording.checksum], windows)
             trials.append((item, trial, recording, counts))
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
-    return Job(
-        store,
-        campaigns,
-        model,
-        detection,
-        trials,
-        make_key(STEP, VERSION, [model.key, inputs], used),
-    )
-
-
-@task(name="spike counts", cache_policy=NO_CACHE, persist_result=False)
-def count_spikes(wanted: Parcel[Job]) -> int:
-    """Run the network over all consecutive windows of every trial that needs it."""
-    job = wanted.content
-    windows = training_settings(job.campaigns).windows
-    work = [
-        (item, trial, recording, key)
-        for item, trial, recording, key in job.trials
-        if not Derived.of(job.store, COUNTS, item.name).fresh(trial.id, key)
-    ]
-    if work:
-        fitted = model_file.load(job.model.path)
-        with console.bar("evaluate (trials)", len(work)) as bar:
-            for item, trial, recording, key in work:
-                x, end_ns = dataset.trial_windows(recording, windows)
-                arrays = {"counts": training.predict_counts(fitted, x), "end_ns": end_ns}
-                Derived.of(job.store, COUNTS, item.name).write(trial.id, key, {}, arrays)
-                bar.advance(1, trial.id)
-    return len(work)
+    # what people decided on trials beside the test trials is counted in the result
+    states = labels.states(campaigns)
+    of_review = [] if states is None else [states]
+    key = make_key(STEP, VERSION, [model.key, inputs, *of_review], used)
+    return Job(store, campaigns, labels, model, detection, trials, key, cluster)
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(wanted: Parcel[Job]) -> None:
+def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
-    job = wanted.content
+    job, train, test = wanted.content
     rows = _score_trials(job)
     result = {
         "seed": job.model.seed,
-        "windows": _score_windows(job),
+        "windows": _score_windows(job, train, test),
         "trials": rows,
         "experiments": _summaries(rows),
         "label_error_ms": label_errors(job.store, job.campaigns),
         "label_rules_ms": rules_compared(job.store, job.campaigns),
+        "reviewed": job.labels.states(job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 
 
-def _score_windows(job: Job) -> dict[str, Any]:
+def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
     """The chosen samples of the test trials: the network and the baselines beside it."""
     settings = training_settings(job.campaigns)
-    train = load_samples(job.store, job.campaigns, "train")
-    test = load_samples(job.store, job.campaigns, "test")
     counts = training.predict_counts(model_file.load(job.model.path), test.x)
     margin = settings.detection.margin
     by_trial = {
@@ -166,8 +152,8 @@ def _score_windows(job: Job) -> dict[str, Any]:
 def _score_trials(job: Job) -> list[dict[str, Any]]:
     """One row a trial: onsets, detections, latency."""
     rows = []
-    for item, trial, _, _ in job.trials:
-        label = Derived.of(job.store, LABELS, item.name).read(trial.id)
+    for item, trial, recording, _ in job.trials:
+        label = job.labels.read(item, recording)
         found = trial_counts(job.store, item.name, trial.id)
         settings = job.detection[item.name]
         detections = detect(found["counts"], found["end_ns"], settings)
@@ -220,8 +206,18 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
     """Count spikes where needed, then score."""
     job = wanted.content
     with timed(job.store, "evaluate"):
-        count_spikes(Parcel(job))
-        score(Parcel(job))
+        count_spikes(
+            job.store,
+            job.model.path,
+            training_settings(job.campaigns).windows,
+            [(item.name, recording, key) for item, _, recording, key in job.trials],
+            job.cluster,
+        )
+        train, test = (
+            load_samples(job.labels, job.campaigns, split, job.cluster)
+            for split in ("train", "test")
+        )
+        score(Parcel((job, train, test)))
 
 
 def evaluate(
@@ -229,11 +225,18 @@ def evaluate(
     campaigns: list[Collected],
     margin: float | None = None,
     smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
 ) -> dict[str, Any]:
     """Evaluate if any input or setting changed."""
     training_campaigns(campaigns)
-    job = make_job(store, campaigns, margin, smoothing)
+    job = make_job(store, campaigns, margin, smoothing, cluster, reviewed)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
-        run(evaluate_flow, Parcel(job))
-    return {"step": "evaluate", "done": int(stale), "fresh": int(not stale)}
+        run(evaluate_flow, Parcel(job), cluster)
+    return {
+        "step": "evaluate",
+        "done": int(stale),
+        "fresh": int(not stale),
+        **job.labels.told(campaigns),
+    }

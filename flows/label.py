@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analysis import labelling
 from flows.campaigns import Collected
@@ -11,6 +11,9 @@ from protocols.settings import Labelling
 from storage.derived import make_key
 from storage.recording import Recording
 from storage.store import Store
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 STEP = "labels"
 
@@ -30,9 +33,11 @@ def _wanted(campaigns: list[Collected]) -> list[TrialWork]:
     ]
 
 
-def label(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+def label(
+    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
+) -> dict[str, Any]:
     """Label every trial of `campaigns` that needs it."""
     wanted = _wanted(campaigns)
     stale = stale_trials(store, STEP, wanted)
-    run_trials(store, STEP, "label", stale, labelling.label_results)
+    run_trials(store, STEP, "label", stale, labelling.label_results, cluster)
     return {"step": "label", "done": len(stale), "fresh": len(wanted) - len(stale)}

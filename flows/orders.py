@@ -16,7 +16,7 @@ from protocols.yaml_file import parse_yaml, read_text
 from rigs.levels import at_level, with_level
 from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from storage.decisions import skipped
-from storage.store import FORGIVEN, Campaign, Store, StoreError
+from storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,8 @@ class Order:
     bench: Bench = Bench()
     most: int | None = None
     """Trials that were asked for at most."""
+    until: float | None = None
+    """When the rig has to be free again, seconds since 1970; None for no such time."""
 
     def wanted(self, campaign: Campaign) -> list[Trial]:
         """Trials to take now, in the plan's order."""
@@ -57,6 +59,7 @@ def make_order(
     campaign: str | None = None,
     bench: Bench = Bench(),
     most: int | None = None,
+    until: float | None = None,
 ) -> Order:
     """Read and check everything that can be known before anything moves.
 
@@ -77,7 +80,7 @@ def make_order(
     # one campaign, one physics: a level of a factor that is added later must not change it
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
-    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most, until)
     if begun:
         _check_same(order, begun)
     return order
@@ -85,6 +88,10 @@ def make_order(
 
 def _check_same(order: Order, campaign: Campaign) -> None:
     info = campaign.info
+    if IMPORTED in info:
+        raise StoreError(
+            f"{campaign.folder}: was imported; give the new one its own name with --campaign"
+        )
     if info["collection_hash"] != order.plan.collection_hash:
         raise StoreError(
             f"{campaign.folder}: was begun under another `collection:` section; changing "
@@ -137,13 +144,16 @@ def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
     return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
 
 
-def set_aside(plan: Plan, campaign: Campaign) -> list[dict[str, Any]]:
+def set_aside(
+    plan: Plan, campaign: Campaign, committed: set[str] | None = None
+) -> list[dict[str, Any]]:
     """Trials of the plan that no collection takes, in its order, each with its cause.
 
     By JSON names: ``trial``, ``cause``, ``attempts`` that failed, ``by`` (a person, or None for
-    the gates), ``when``.
+    the gates), ``when``. Whoever knows which trials are whole spares looking with `committed`.
     """
-    done, by_person, failed = campaign.committed(), skipped(campaign), campaign.failed_attempts()
+    done = campaign.committed() if committed is None else committed
+    by_person, failed = skipped(campaign), campaign.failed_attempts()
     retakes = plan.protocol.collection.gates.retakes
     causes: dict[str, list[str]] = {}
     for item in campaign.quarantined():

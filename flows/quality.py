@@ -44,12 +44,16 @@ class Assessment:
     @property
     def causes(self) -> str:
         """The failed gates in words."""
-        failed = [
-            f"{name} = {gate['value']} (limit {gate['limit']})"
-            for name, gate in self.gates.items()
-            if not gate["passed"]
-        ]
-        return "; ".join(failed)
+        failed = {name: gate for name, gate in self.gates.items() if not gate["passed"]}
+        return "; ".join(_cause(name, gate) for name, gate in failed.items())
+
+
+def _cause(name: str, gate: dict[str, Any]) -> str:
+    """Why one gate was not passed: its figure, or why there is none."""
+    value, limit = gate["value"], gate["limit"]
+    if isinstance(value, str):  # why a clock was refused
+        return f"{name}: {value}"
+    return f"{name}: cannot be told" if value < 0 else f"{name} = {value} (limit {limit})"
 
 
 def assess(

@@ -58,7 +58,9 @@ def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with timing.timed(store, "report"):
         evaluation = Derived.of(store, evaluate.STEP).read(evaluate.NAME)
-        model = evaluate.choose_model(wanted_models(store, campaigns))
+        model = evaluate.choose_model(
+            wanted_models(store, campaigns, evaluation.get("reviewed") is not None)
+        )
         fitted = model_file.load(model.path)
         summary = make_summary(store, campaigns, evaluation)
         html = page.render(

@@ -8,7 +8,7 @@ event rates from whole runs of two trials, with noise and read-out as the rig fi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -61,11 +61,33 @@ def runs_needed() -> int:
     return EVENT_TRIALS * (2 + 2 * len(CONTACT + CAMERA))
 
 
-def measure_sensitivity(rig: RigFile, plan: Plan, advance: Callable[[], None]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Job:
+    """A setting that is tried.
+
+    Attributes:
+        known_s: onsets that do not depend on it.
+    """
+
+    rig: RigFile
+    plan: Plan
+    trials: list[Trial]
+    other_seed: bool = False
+    known_s: np.ndarray[Any, np.dtype[np.float64]] | None = None
+
+
+Each = Callable[..., list[Any]]
+"""Of a function, jobs and ``done=``, which is called after each: what came of all, in order."""
+
+
+def measure_sensitivity(
+    rig: RigFile, plan: Plan, advance: Callable[[], None], each: Each | None = None
+) -> dict[str, Any]:
     """Change of onsets and event rates for each parameter, 20 % lower and higher, as JSON.
 
     Args:
-        advance: called after each whole run.
+        advance: called after each whole run, or, with `each`, after a setting's runs.
+        each: makes the settings elsewhere.
 
     Returns:
         `rows`, each with `parameter`, `value`, and `change`: a list of two (lower, higher) of
@@ -74,24 +96,33 @@ def measure_sensitivity(rig: RigFile, plan: Plan, advance: Callable[[], None]) -
     """
     rig = with_level(rig, plan)
     trials = sample_trials(plan, CONTACT_TRIALS)
-    base = _outcome(rig, plan, trials, False, advance)
-    rows = []
+    base = _outcome(_Job(rig, plan, trials), advance)
+    jobs = {(OTHER_SEED, 0): _Job(rig, plan, trials, other_seed=True)}
     for name in CONTACT + CAMERA:
         value = _value(rig.scene, name)
-        changes: list[dict[str, Any] | None] = []
-        for factor in (1.0 - CHANGE, 1.0 + CHANGE):
+        for k, factor in enumerate((1.0 - CHANGE, 1.0 + CHANGE)):
             if not value:
-                changes.append(None)  # a rigid base, or something switched off
-                continue
+                continue  # a rigid base, or something switched off
             new = value * factor
             if name.endswith("poisson_ratio"):
                 new = min(new, LARGEST_POISSON)
             other = changed(rig, _nested(name, new))
             onsets = base.onsets_s if name in CAMERA else None
-            changes.append(_change(base, _outcome(other, plan, trials, False, advance, onsets)))
-        rows.append({"parameter": name, "value": value, "change": changes})
-    other_seed = _change(base, _outcome(rig, plan, trials, True, advance))
-    rows.append({"parameter": OTHER_SEED, "value": None, "change": [other_seed]})
+            jobs[name, k] = _Job(other, plan, trials, known_s=onsets)
+    if each is None:
+        made = [_outcome(job, advance) for job in jobs.values()]
+    else:
+        made = each(_outcome, list(jobs.values()), done=advance)
+    changes = {key: _change(base, other) for key, other in zip(jobs, made, strict=True)}
+    rows = [
+        {
+            "parameter": name,
+            "value": _value(rig.scene, name),
+            "change": [changes.get((name, k)) for k in range(2)],
+        }
+        for name in CONTACT + CAMERA
+    ]
+    rows.append({"parameter": OTHER_SEED, "value": None, "change": [changes[OTHER_SEED, 0]]})
     return {
         "simulated": True,
         "change": CHANGE,
@@ -106,22 +137,17 @@ def measure_sensitivity(rig: RigFile, plan: Plan, advance: Callable[[], None]) -
     }
 
 
-def _outcome(
-    rig: RigFile,
-    plan: Plan,
-    trials: Sequence[Trial],
-    other_seed: bool,
-    advance: Callable[[], None],
-    known_s: np.ndarray[Any, np.dtype[np.float64]] | None = None,
-) -> _Outcome:
+def _outcome(job: _Job, advance: Callable[[], None] | None = None) -> _Outcome:
+    rig, plan, trials, known_s = job.rig, job.plan, job.trials, job.known_s
     analysis = plan.protocol.analysis
-    variant = Variant("", 3, rig.scene.scene.step_ms, other_seed=other_seed)
+    variant = Variant("", 3, rig.scene.scene.step_ms, other_seed=job.other_seed)
     seen: list[Seen] = []
     counted: list[SceneWindows] = []
     for trial in trials[:EVENT_TRIALS]:
         seen.append(run(with_true_times(rig), plan, trial, variant.seed(trial)))
         counted.append(look(seen[-1], analysis.windows, analysis.samples, trial.seed))
-        advance()
+        if advance is not None:
+            advance()
     if known_s is None:
         onsets = [_slide_onsets(rig.scene, plan, trial, variant.seed(trial)) for trial in trials]
         slides = [onset for onset in onsets if onset is not None]

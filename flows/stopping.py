@@ -32,6 +32,11 @@ def requested() -> bool:
     return _requested.is_set()
 
 
+def request() -> None:
+    """Ask whatever waits in this program to stop."""
+    _requested.set()
+
+
 def check() -> None:
     """Stop here if somebody asked for it.
 

@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class CampaignStopped(RuntimeError):
     """A campaign ended between two trials; the message says why, and how it goes on."""
+
+
+class WindowOver(CampaignStopped):
+    """The time that the collection was given is over: the next one goes on."""

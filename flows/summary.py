@@ -49,6 +49,7 @@ def make_summary(
             "error_ms": evaluation["label_error_ms"],
             "rules_ms": evaluation["label_rules_ms"],
             "source": _sources(campaigns),
+            "reviewed": evaluation.get("reviewed"),
         },
         "detection": evaluation["detection"],
         "sync": _sync(campaigns),

@@ -9,7 +9,7 @@ its results become stale exactly then.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analysis import synchronise
 from flows import console
@@ -24,6 +24,9 @@ from storage.files import write_text
 from storage.recording import Recording
 from storage.store import SYNC, Store
 
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
+
 PAGE_VERSION = 1
 
 
@@ -32,7 +35,9 @@ def sync_key(recording: Recording) -> str:
     return make_key(SYNC, synchronise.VERSION, recording.raw_checksum, None)
 
 
-def sync(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+def sync(
+    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
+) -> dict[str, Any]:
     """Fit what is stale, and write the page if anything on it has changed."""
     wanted = [
         TrialWork(recording, item.name, sync_key(recording))
@@ -40,7 +45,7 @@ def sync(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         for _, recording in item.trials
     ]
     stale = stale_trials(store, SYNC, wanted)
-    run_trials(store, SYNC, "sync", stale, fit_again)
+    run_trials(store, SYNC, "sync", stale, fit_again, cluster)
     for work in wanted:
         work.recording.forget_clocks()
     trials = {item.name: read_trials(store, item) for item in campaigns}

@@ -7,35 +7,40 @@ compared with the dearest variant without noise and read-out, so that the scene 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from analysis.scene_error import SceneError, Seen, choose_by_windows, compare, mean_error
-from analysis.scene_windows import look, pooled
-from flows import console
-from flows.scene_runs import (
-    Variant,
-    closed_form,
-    ideal,
-    run,
-    sample_trials,
-    timed,
-)
+from analysis.scene_error import SceneError, choose_by_windows, compare, mean_error
+from analysis.scene_windows import pooled
+from flows import console, orchestration
+from flows.cluster import connected
+from flows.scene_runs import Variant, closed_form, sample_trials, timed
 from flows.sensitivity import measure_sensitivity, runs_needed
 from flows.tradeoff_page import render, sensitivity_markdown
-from protocols import Plan, Trial
+from flows.tradeoff_runs import (
+    REFERENCE,
+    Comparing,
+    compare_trial,
+    everywhere,
+    total_runs,
+    variant_key,
+    wall_seconds,
+)
+from protocols import Plan
 from protocols.errors import InputError
 from protocols.plan import load_plan
 from rigs.levels import HIGHEST, at_level, choose_level
 from rigs.rig_file import RigFile, check_plan, load_rig_file
-from storage.files import write_json, write_text
+from storage.files import make_folder, write_json, write_text
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 ROUNDS = 2
 STEPS = (1, 2, 4, 8, 16, 32)
-REFERENCE = Variant("1", HIGHEST, 1)
-OTHER_SEED = Variant("another seed", HIGHEST, 1, other_seed=True)
 PAGE, NUMBERS, TABLE = "tradeoff.html", "tradeoff.json", "sensitivity.md"
 
 
@@ -46,11 +51,13 @@ def tradeoff(
     trials: int = 4,
     sensitivity: bool = False,
     steps: Sequence[int] = STEPS,
+    dask: str | None = None,
 ) -> dict[str, Any]:
     """Measure, and write page and numbers into `folder`; returns the numbers.
 
     Args:
         steps: of the contact, ms; the first is the reference's.
+        dask: the scheduler whose workers run what is compared; seconds are measured here.
 
     Raises:
         InputError: anything wrong with the protocol or the rig file, a rig that is real, or a
@@ -65,15 +72,19 @@ def tradeoff(
     check_plan(rig, plan, str(rig_path))
     chosen = sample_trials(plan, trials)
     families = variants_of(rig, plan, steps)
-    wanted = {variant_key(item) for family in families.values() for item in family}
-    compared = wanted | {variant_key(REFERENCE), variant_key(OTHER_SEED)}
-    total = len(chosen) * (len(compared) + ROUNDS * len(wanted))
+    jobs = [Comparing(rig, plan, trial, families) for trial in chosen]
+    compared, timings = total_runs(families, len(chosen), ROUNDS)
+    total = len(chosen) * compared + timings
     if sensitivity:
         total += runs_needed()
-    with console.bar("trade-off (runs)", total) as bar:
-        result = _measure(rig, plan, chosen, families, bar)
+    if dask is not None:
+        make_folder(folder)
+        orchestration.prepare(folder)
+    with connected(dask) as cluster, console.bar("trade-off (runs)", total) as bar:
+        result = _measure(jobs, bar, cluster, compared)
         if sensitivity:
-            result["sensitivity"] = measure_sensitivity(rig, plan, lambda: bar.advance())
+            each = None if cluster is None else partial(everywhere, cluster=cluster)
+            result["sensitivity"] = measure_sensitivity(rig, plan, lambda: bar.advance(), each)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / NUMBERS, result)
     if sensitivity:
@@ -103,79 +114,36 @@ def falls(plan: Plan) -> bool:
     return plan.protocol.collection.plate is not None
 
 
-def variant_key(variant: Variant) -> tuple[int, int, str, bool]:
-    """What a run depends on, whatever it is called."""
-    return variant.level, variant.step_ms, variant.path, variant.other_seed
-
-
-class _Runs:
-    """Runs of one trial, each compared once and timed in two rounds."""
-
-    def __init__(self, rig: RigFile, plan: Plan, trial: Trial, bar: console.Bar) -> None:
-        self._rig, self._plan, self._trial, self._bar = rig, plan, trial, bar
-        self._seen: dict[tuple[int, int, str, bool], Seen] = {}
-
-    def of(self, variant: Variant) -> Seen:
-        key = variant_key(variant)
-        if key not in self._seen:
-            rig, seed = variant.of(self._rig), variant.seed(self._trial)
-            self._seen[key] = run(ideal(rig), self._plan, self._trial, seed)
-            self._bar.advance(1, self._trial.id)
-        return self._seen[key]
-
-    def wall_s(self, variants: Iterable[Variant]) -> dict[tuple[int, int, str, bool], float]:
-        """The faster of two runs of each; a burst of other work rarely meets both rounds."""
-        wall_s: dict[tuple[int, int, str, bool], float] = {}
-        wanted = {variant_key(variant): variant for variant in variants}
-        for _ in range(ROUNDS):
-            for key, variant in wanted.items():
-                rig, seed = variant.of(self._rig), variant.seed(self._trial)
-                seconds = timed(rig, self._plan, self._trial, seed)
-                wall_s[key] = min(seconds, wall_s.get(key, math.inf))
-                self._bar.advance(1, self._trial.id)
-        return wall_s
-
-
 def _measure(
-    rig: RigFile,
-    plan: Plan,
-    trials: list[Trial],
-    families: dict[str, list[Variant]],
-    bar: console.Bar,
+    jobs: list[Comparing], bar: console.Bar, cluster: Cluster | None, compared: int
 ) -> dict[str, Any]:
-    analysis = plan.protocol.analysis
-    walls: dict[str, list[list[float]]] = {name: [[] for _ in f] for name, f in families.items()}
-    errors: dict[str, list[list[SceneError]]] = {
-        name: [[] for _ in family] for name, family in families.items()
-    }
-    seeds: list[SceneError] = []
-    gaps: dict[int, list[SceneError]] = {1: [], 2: []}
-    closed: list[tuple[float, SceneError]] = []
-    windows = []
-    timed(REFERENCE.of(rig), plan, trials[0], 0)  # so that compiling is not timed
-    for trial in trials:
-        runs = _Runs(rig, plan, trial, bar)
-        reference = runs.of(REFERENCE)
-        wall_s = runs.wall_s(variant for family in families.values() for variant in family)
-        for name, family in families.items():
-            for index, variant in enumerate(family):
-                errors[name][index].append(compare(reference, runs.of(variant), analysis.windows))
-                walls[name][index].append(wall_s[variant_key(variant)])
-        levels = [runs.of(variant) for variant in families["levels"]]
-        for level in gaps:
-            gaps[level].append(compare(levels[level], levels[level - 1], analysis.windows))
-        seeds.append(compare(reference, runs.of(OTHER_SEED), analysis.windows))
-        windows.append(look(reference, analysis.windows, analysis.samples, trial.seed))
-        told = closed_form(rig, plan, trial)
-        if told is not None:
-            forms = replace(reference, events=None, slips=told[0], markers=None)
-            closed.append((told[1], compare(reference, forms, analysis.windows)))
-    steps = {level: mean_error(gap) for level, gap in gaps.items()}
-    measured = choose_by_windows(steps, mean_error(seeds))
+    """All timings first, one at a time; then, perhaps elsewhere, what the runs differ by."""
+    rig, plan, families = jobs[0].rig, jobs[0].plan, jobs[0].families
+    timed(REFERENCE.of(rig), plan, jobs[0].trial, 0)  # so that compiling is not timed
+    wall_s = [wall_seconds(job, ROUNDS, lambda: bar.advance()) for job in jobs]
+    told = [closed_form(rig, plan, job.trial) for job in jobs]
+    if cluster is None:
+        done = [compare_trial(job, lambda: bar.advance()) for job in jobs]
+    else:
+        done = everywhere(compare_trial, jobs, cluster, lambda: bar.advance(compared))
+    windows = plan.protocol.analysis.windows
+    closed = [
+        (form[1], compare(item.onsets, replace(item.onsets, slips=form[0], markers=None), windows))
+        for form, item in zip(told, done, strict=True)
+        if form is not None
+    ]
+    steps = {level: mean_error([item.gaps[level] for item in done]) for level in (1, 2)}
+    seeds = mean_error([item.seed for item in done])
+    measured = choose_by_windows(steps, seeds)
     reckoned = choose_level(at_level(rig, "auto"), plan)
     assert reckoned is not None
     rows = [
-        _row(name, variant, _mean(walls[name][index]), mean_error(errors[name][index]))
+        _row(
+            name,
+            variant,
+            _mean([seconds[variant_key(variant)] for seconds in wall_s]),
+            mean_error([item.errors[name][index] for item in done]),
+        )
         for name, family in families.items()
         for index, variant in enumerate(family)
     ]
@@ -187,17 +155,17 @@ def _measure(
         "protocol": plan.protocol.name,
         "rig": rig.name,
         "rig_step_ms": rig.scene.scene.step_ms,
-        "trials": [trial.id for trial in trials],
+        "trials": [job.trial.id for job in jobs],
         "variants": rows,
-        "seeds": asdict(mean_error(seeds)),
+        "seeds": asdict(seeds),
         "levels": {f"L{k} against L{k + 1}": asdict(error) for k, error in steps.items()},
         "choice": {
             "measured": {"level": f"L{measured.level}", "reason": measured.reason},
             "closed_form": {"level": reckoned.name, "reason": reckoned.reason},
             "agree": measured.level == reckoned.level,
         },
-        "windows": pooled(windows),
-        "left_out": _left_out(plan, len(closed), len(trials)),
+        "windows": pooled([item.windows for item in done]),
+        "left_out": _left_out(plan, len(closed), len(jobs)),
     }
 
 

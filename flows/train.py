@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -13,15 +13,19 @@ from analysis import dataset, model_file, training
 from analysis.dataset import SampleSet
 from flows import console
 from flows.campaigns import Collected, training_campaigns
-from flows.label import STEP as LABELS
-from flows.label import label_key
 from flows.orchestration import Parcel, run
+from flows.reviewed import Labels
 from flows.timing import timed
+from flows.trial_work import TrialWork, each_trial
 from protocols.hashing import hash_integer
-from protocols.settings import AnalysisSettings
-from storage.derived import Derived, make_key
+from protocols.settings import AnalysisSettings, Samples, Windows
+from storage.derived import make_key
 from storage.files import read_json, write_json
+from storage.recording import Recording
 from storage.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
 VERSION = 1
 
@@ -53,8 +57,11 @@ def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
     return training_campaigns(campaigns)[0].settings
 
 
-def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
+def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
     """The models that the settings ask for, with the keys they must have.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
 
     Raises:
         StoreError: a trial has no fresh label yet.
@@ -62,13 +69,13 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     used = training_campaigns(campaigns)
     settings = used[0].settings
     inputs = []
+    labels = Labels(store, reviewed)
     for item in used:
-        labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            key = label_key(recording, item.settings.labelling)
-            if not labels.fresh(trial.id, key):
+            if not labels.fresh(item, recording):
                 raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
             if trial.split in {"train", "validation"}:
+                key = labels.key(item, recording)
                 inputs.append([item.name, trial.id, trial.split, key])
     parameters = {
         name: getattr(settings, name).model_dump(mode="json")
@@ -84,26 +91,54 @@ def wanted_models(store: Store, campaigns: list[Collected]) -> list[Model]:
     return models
 
 
-def load_samples(store: Store, campaigns: list[Collected], split: str) -> SampleSet:
-    """The samples of all trials of one split of the kinematic campaigns."""
-    parts = []
+def load_samples(
+    labels: Labels, campaigns: list[Collected], split: str, cluster: Cluster | None = None
+) -> SampleSet:
+    """The samples of all trials of one split of the kinematic campaigns.
+
+    Without a cluster in this process: a trial takes 10 ms. With one it stands in a flow.
+    """
     used = training_campaigns(campaigns)
     windows = used[0].settings.windows
-    for item in used:
-        labels = Derived.of(store, LABELS, item.name)
-        for trial, recording in item.of_split(split):
-            seed = hash_integer("samples", trial.id)
-            parts.append(
-                dataset.trial_samples(
-                    recording,
-                    labels.read(trial.id),
-                    trial.index,
-                    windows,
-                    item.settings.samples,
-                    seed,
-                )
-            )
-    return SampleSet.join(parts, windows)
+    work = [
+        TrialWork(
+            recording, item.name, "",
+            _Wanted(
+                labels.read(item, recording), trial.index, windows,
+                item.settings.samples, hash_integer("samples", trial.id),
+            ),
+        )
+        for item in used
+        for trial, recording in item.of_split(split)
+    ]  # fmt: skip
+    parts: dict[int, SampleSet] = {}
+    each_trial(
+        labels.store,
+        f"samples to {split}",
+        work,
+        _samples,
+        parts.__setitem__,
+        cluster,
+        processes=False,
+    )
+    return SampleSet.join([parts[number] for number in range(len(work))], windows)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What a trial's samples depend on besides the trial: see `dataset.trial_samples`."""
+
+    label: dict[str, Any]
+    number: int
+    windows: Windows
+    samples: Samples
+    seed: int
+
+
+def _samples(recording: Recording, wanted: _Wanted) -> SampleSet:
+    return dataset.trial_samples(
+        recording, wanted.label, wanted.number, wanted.windows, wanted.samples, wanted.seed
+    )
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
@@ -146,13 +181,15 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]])
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)
-def train_flow(wanted: Parcel[tuple[Store, list[Collected], list[Model]]]) -> int:
+def train_flow(
+    wanted: Parcel[tuple[Labels, list[Collected], list[Model], Cluster | None]],
+) -> int:
     """Train the seeds that are stale, one after the other."""
-    store, campaigns, models = wanted.content
+    labels, campaigns, models, cluster = wanted.content
     settings = training_settings(campaigns)
-    with timed(store, "train"):
-        train = load_samples(store, campaigns, "train")
-        validation = load_samples(store, campaigns, "validation")
+    with timed(labels.store, "train"):
+        train = load_samples(labels, campaigns, "train", cluster)
+        validation = load_samples(labels, campaigns, "validation", cluster)
         for name, part in (("training", train), ("validation", validation)):
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
@@ -161,10 +198,26 @@ def train_flow(wanted: Parcel[tuple[Store, list[Collected], list[Model]]]) -> in
     return len(models)
 
 
-def train(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
-    """Train what is missing or stale."""
-    models = wanted_models(store, campaigns)
+def train(
+    store: Store,
+    campaigns: list[Collected],
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> dict[str, Any]:
+    """Train what is missing or stale.
+
+    Args:
+        cluster: what makes the samples; this machine trains.
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
     stale = [model for model in models if not model.fresh]
     if stale:
-        run(train_flow, Parcel((store, campaigns, stale)))
-    return {"step": "train", "done": len(stale), "fresh": len(models) - len(stale)}
+        run(train_flow, Parcel((labels, campaigns, stale, cluster)), cluster)
+    return {
+        "step": "train",
+        "done": len(stale),
+        "fresh": len(models) - len(stale),
+        **labels.told(campaigns),
+    }

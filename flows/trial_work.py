@@ -1,33 +1,33 @@
-"""What a step makes of every trial by itself: on all cores, in chunks, each kept at once.
+"""What a step makes of every trial by itself: on all cores or a Dask cluster, each kept at once.
 
-Labels and clocks are made this way. A stop is answered between two trials; what was made until
-then is kept, and the next run makes the rest.
+Labels and clocks are made this way, samples and spike counts on a cluster. A stop is answered
+between two trials; what was made until then is kept, and the next run makes the rest.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from prefect import flow, task
-from prefect.cache_policies import NO_CACHE
+from prefect import flow
 
-from flows import console, stopping
+from flows import console
 from flows.orchestration import Parcel, run
+from flows.spread import Done, spread
 from flows.timing import timed
 from storage.derived import Derived
+from storage.mirror import place_of, reach
 from storage.recording import Recording
-from storage.store import Store
+from storage.store import Store, StoreError
+from storage.streams import Json
 
-CHUNK = 64
+if TYPE_CHECKING:
+    from flows.cluster import Cluster
 
-Make = Callable[[Recording, Any], tuple[dict[str, Any], dict[str, Any]]]
-"""Of a trial and settings, a result's JSON and its arrays. It runs in processes of their own, so it
-stands in a module, best in one that loads quickly."""
+Make = Callable[[Recording, Any], Any]
+"""Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
+module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,26 @@ class _Step:
     title: str
     work: list[TrialWork]
     make: Make
+    cluster: Cluster | None
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A trial as another process, perhaps on another machine, finds it.
+
+    Attributes:
+        place: the store's path or URL.
+        checksum: what the trial and its clocks must be there, too.
+        clocks: those that were fitted again; None for the record's.
+    """
+
+    place: str
+    campaign: str
+    trial: str
+    checksum: str
+    clocks: Json | None
+    make: Make
+    settings: Any
 
 
 def stale_trials(store: Store, step: str, wanted: list[TrialWork]) -> list[TrialWork]:
@@ -70,45 +90,98 @@ def run_trials(
     title: str,
     work: list[TrialWork],
     make: Make,
+    cluster: Cluster | None = None,
 ) -> None:
     """Make every result of `work` and keep it among the derived results of `step`."""
     if work:
         named = _trials_flow.with_options(name=title, validate_parameters=False)
-        run(named, Parcel(_Step(store, step, title, work, make)))
-
-
-@task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
-def _chunk(parcel: Parcel[tuple[_Step, list[TrialWork], ProcessPoolExecutor, console.Bar]]) -> int:
-    """Some trials on all cores; each is kept as soon as it is there."""
-    step, work, pool, bar = parcel.content
-    futures = {pool.submit(step.make, item.recording, item.settings): item for item in work}
-    for future in as_completed(futures):
-        item = futures[future]
-        name = item.recording.folder.name
-        data, arrays = future.result()
-        Derived.of(step.store, step.name, item.campaign).write(name, item.key, data, arrays)
-        bar.advance(1, name)
-    return len(work)
+        run(named, Parcel(_Step(store, step, title, work, make, cluster)), cluster)
 
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
 def _trials_flow(wanted: Parcel[_Step]) -> int:
-    """All that is stale, in core-sized chunks."""
+    """All that is stale."""
     step = wanted.content
-    chunk = _chunk.with_options(name=f"{step.title} trials")
-    workers = max(1, min(len(step.work), os.cpu_count() or 1))
-    with (
-        timed(step.store, step.title),
-        ProcessPoolExecutor(
-            workers, mp_context=get_context("spawn"), initializer=stopping.leave_to_parent
-        ) as pool,
-        console.bar(f"{step.title} (trials)", len(step.work)) as bar,
-    ):
-        try:
-            for start in range(0, len(step.work), CHUNK):
-                chunk(Parcel((step, step.work[start : start + CHUNK], pool, bar)))
-        except BaseException:
-            for worker in active_children():
-                worker.terminate()  # what a worker had not handed over is simply made again
-            raise
+    with timed(step.store, step.title):
+        keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)
     return len(step.work)
+
+
+def keep_trials(
+    store: Store,
+    step: str,
+    title: str,
+    work: list[TrialWork],
+    make: Make,
+    cluster: Cluster | None = None,
+    *,
+    processes: bool = True,
+) -> None:
+    """As `run_trials`, inside a flow that runs already."""
+    with console.bar(f"{title} (trials)", len(work)) as bar:
+
+        def keep(number: int, result: tuple[dict[str, Any], dict[str, Any]]) -> None:
+            item = work[number]
+            name = item.recording.folder.name
+            Derived.of(store, step, item.campaign).write(name, item.key, *result)
+            bar.advance(1, name)
+
+        each_trial(store, title, work, make, keep, cluster, processes=processes)
+
+
+def each_trial(
+    store: Store,
+    title: str,
+    work: Sequence[TrialWork],
+    make: Make,
+    done: Done,
+    cluster: Cluster | None = None,
+    *,
+    processes: bool = True,
+) -> None:
+    """Hand over what `make` gives of every trial, in any order. Stands in a flow.
+
+    Args:
+        done: called with the number of an item of `work` and what came of it.
+        processes: without a cluster, use all cores; False where `make` does that by itself, or
+            takes less time than starting processes.
+    """
+    if cluster is None and not processes:
+        for number, item in enumerate(work):
+            done(number, make(item.recording, item.settings))
+        return
+    place = place_of(store)
+    jobs = [
+        _Job(
+            place, item.campaign, item.recording.folder.name, item.recording.checksum,
+            item.recording.clocks_elsewhere, make, item.settings,
+        )
+        for item in work
+    ]  # fmt: skip
+    if cluster is not None and jobs:
+        cluster.check_store(_find, jobs[0])
+    spread(title, _make, jobs, done, cluster)
+
+
+def _find(job: _Job) -> None:
+    """Asked of a worker: is the trial there?
+
+    Raises:
+        StoreError: it is not, or is another take of it.
+    """
+    _recording(job)
+
+
+def _make(job: _Job) -> Any:
+    return job.make(_recording(job), job.settings)
+
+
+def _recording(job: _Job) -> Recording:
+    store = reach(job.place, job.campaign, job.trial)
+    recording = store.campaign(job.campaign).recording(job.trial)
+    recording.use_clocks(job.clocks)
+    if recording.checksum != job.checksum:
+        raise StoreError(
+            f"{recording.folder}: is not the take that the command began with; run it again"
+        )
+    return recording

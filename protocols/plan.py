@@ -25,6 +25,8 @@ from protocols.split import assign, check_split
 from protocols.yaml_file import KeyedError, load
 
 Role = Literal["measured", "reference"]
+MAX_ID = 240
+"""A trial's id is a folder's name, which has 255 bytes at most; in quarantine it gets a number."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,14 @@ def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan
     plan = Plan(protocol, file, levels, tuple(_expand(protocol, levels)))
     limit = float(protocol.collection.limits.duration)
     for trial in plan:
+        if len(trial.id) > MAX_ID:
+            raise InputError(
+                file,
+                "collection.factors",
+                trial.id,
+                f"gives ids of {len(trial.id)} characters; a folder's name has {MAX_ID} at most: "
+                "shorten names of factors or levels",
+            )
         if plan.seconds(trial) > limit:
             raise InputError(
                 file,

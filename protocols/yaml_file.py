@@ -9,6 +9,8 @@ their decimal digits.
 from __future__ import annotations
 
 import difflib
+import os
+import stat
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
@@ -100,10 +102,12 @@ def read_text(path: Path, what: str) -> str:
     """The text of a small UTF-8 file.
 
     Raises:
-        InputError: missing, a folder, unreadable, over 1 MiB, or not UTF-8.
+        InputError: missing, no plain file, unreadable, over 1 MiB, or not UTF-8.
     """
     try:
-        with path.open("rb") as handle:
+        with open(path, "rb", opener=_at_once) as handle:
+            if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
+                raise InputError(path, "", None, f"is no plain file; give the path of a {what}")
             data = handle.read(MAX_BYTES + 1)
     except FileNotFoundError:
         raise InputError(path, "", None, f"no such file; give the path of a {what}") from None
@@ -122,6 +126,11 @@ def read_text(path: Path, what: str) -> str:
             data[error.start : error.start + 1].hex(),
             "is not UTF-8; save the file as UTF-8 text",
         ) from None
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open without waiting for whoever writes into a pipe."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def parse_yaml(text: str, path: str | Path) -> dict[str, Any]:
@@ -236,7 +245,8 @@ def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
             return []
         current = field.annotation
         current = _inner(current)
-    return list(getattr(current, "model_fields", {}))
+    fields = getattr(current, "model_fields", {})
+    return [field.alias or name for name, field in fields.items()]
 
 
 def _inner(annotation: Any) -> Any:

@@ -81,7 +81,7 @@ def read_rig(path: Path) -> RigSource:
         parts.append((here, data))
         if parent is None:
             break
-        if not isinstance(parent, str):
+        if not isinstance(parent, str) or "\0" in parent:
             raise InputError(here, KEY, parent, "must be the path of a rig file")
         there = here.parent / parent
         if any(_same(there, file) for file, _ in parts) or len(parts) == _DEEPEST:

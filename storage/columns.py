@@ -60,6 +60,8 @@ TIMING: dict[str, Kind] = {
     "frame_camera_reads/t": ("int64", (), "ns of the frame camera's clock"),
     "frame_camera_reads/before": ("int64", (), "ns of the host's monotonic clock"),
     "frame_camera_reads/after": ("int64", (), "ns of the host's monotonic clock"),
+    "triggers/t": ("int64", (), "ns of the event camera's clock"),
+    "triggers/kind": ("uint8", (), "what the event camera noted, as AEDAT4 numbers it"),
 }
 TIMES = "events/t"
 WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])

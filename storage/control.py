@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from storage.errors import StoreError
 from storage.files import make_folder, read_json, write_new_json
 from storage.process import now, user_name
-from storage.store import Store
+from storage.store import Store, safe_name
 from storage.streams import Json
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]
@@ -104,10 +105,10 @@ def requests(store: Store, after: int = 0) -> list[Request]:
                 str(data["when"]),
                 str(data.get("why", "")),
                 str(data.get("host", "")),
-                str(data.get("campaign", "")),
-                tuple(map(str, data.get("trials", ()))),
+                safe_name(name) if (name := str(data.get("campaign", ""))) else "",
+                tuple(safe_name(str(trial)) for trial in data.get("trials", ())),
             )
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, StoreError):
             continue
         if made.kind in get_args(Kind):
             found.append(made)
@@ -118,17 +119,18 @@ def answer(store: Store, request: Request, did: Json) -> Json:
     """Keep what came of a request; an answer that is there already stands."""
     path = _answer_path(store, request)
     write_new_json(path, {"when": now(), "by": user_name(), "did": did})
-    return read_json(path)
+    return answered(store, request) or {"did": {}}
 
 
 def answered(store: Store, request: Request) -> Json | None:
     """What came of a request, None while it is open."""
     try:
-        return read_json(_answer_path(store, request))
+        found = read_json(_answer_path(store, request))
     except FileNotFoundError:
         return None
     except (OSError, ValueError):
-        return {"did": {}}
+        found = {}
+    return found if isinstance(found.get("did"), dict) else {"did": {}}
 
 
 def open_requests(store: Store, after: int = 0) -> list[Request]:

@@ -26,7 +26,10 @@ def skipped(campaign: Campaign) -> dict[str, Json]:
     """
     path = campaign.folder / SKIPPED
     try:
-        return read_json(path)
+        found = read_json(path)
+        if not all(isinstance(by, dict) for by in found.values()):
+            raise ValueError(f"{path}: does not say who set which trial aside")
+        return found
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

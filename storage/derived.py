@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from protocols.hashing import hash_data
 from storage.files import read_json, write_bytes, write_json
-from storage.store import Store, safe_name
+from storage.store import Store, inside, safe_name
 from storage.streams import Json
 
 
@@ -36,7 +36,8 @@ class Derived:
     def of(store: Store, step: str, campaign: str | None = None) -> Derived:
         """Results of `step`; those about single trials stand under their campaign."""
         folder = store.folder / "derived" / safe_name(step)
-        return Derived(folder if campaign is None else folder / safe_name(campaign))
+        folder = folder if campaign is None else folder / safe_name(campaign)
+        return Derived(inside(folder, store.folder))
 
     def key(self, name: str) -> str | None:
         """The key that the result `name` was made with; None if there is none."""

@@ -29,7 +29,7 @@ from storage.columns import (
 )
 from storage.errors import StoreError
 from storage.rows import RowFile, Rows
-from storage.streams import I64, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import I64, U8, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 
 _LAST_32 = 2**32 - 1
 _READS = ("t", "before", "after")
@@ -101,7 +101,11 @@ class StreamFile:
         columns = zip(_READS, (chunk.device_ns, chunk.before_ns, chunk.after_ns), strict=True)
         self._append_late({f"{group}/{name}": values for name, values in columns})
 
-    def _append_late(self, columns: dict[str, I64]) -> None:
+    def add_triggers(self, t_ns: I64, kind: U8) -> None:
+        """Append what else an event camera noted, of an imported trial."""
+        self._append_late({"triggers/t": t_ns, "triggers/kind": kind})
+
+    def _append_late(self, columns: dict[str, Array]) -> None:
         """Append to columns of `TIMING`, which are made when the first row comes."""
         for name, values in columns.items():
             if not len(values):

@@ -10,6 +10,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+from storage.secrets import masked
 from storage.streams import Json
 
 _COMMAND_CHARACTERS = 300
@@ -23,7 +24,7 @@ def this_process() -> Json:
         "pid": os.getpid(),
         "host": socket.gethostname(),
         "user": user_name(),
-        "command": f"sliplab {' '.join(sys.argv[1:])}"[:_COMMAND_CHARACTERS].strip(),
+        "command": masked(f"sliplab {' '.join(sys.argv[1:])}")[:_COMMAND_CHARACTERS].strip(),
         "since": now(),
         "boot": _boot(),
         "ticks": started_ticks(os.getpid()),

@@ -14,9 +14,10 @@ from storage.clockmap import ClockMap
 from storage.errors import StoreError
 from storage.files import read_json
 from storage.hdf5 import StreamReader
+from storage.record_shape import check_clocks, check_record
 from storage.streams import F64, I64, U8, EventChunk, Json
-from storage.video import read_frame, read_frames
-from storage.whole import byte_problem, read_sums
+from storage.video import FrameReader, read_frame, read_frames
+from storage.whole import byte_problem, read_sums, to_fetch
 from storage.writer import DATA, FRAMES, RECORD
 
 RECORD_FORMAT = 1
@@ -63,10 +64,18 @@ class Recording:
             StoreError: it is damaged, or was written by a newer version.
         """
         path = self._sound(RECORD)
-        found = read_json(path)
-        if found.get("format", RECORD_FORMAT) > RECORD_FORMAT:
+        try:
+            found = read_json(path)
+            written = found.get("format", RECORD_FORMAT)
+            if not isinstance(written, int):
+                raise ValueError("format: must be an integer")
+            if written <= RECORD_FORMAT:
+                check_record(found)
+        except ValueError as error:
+            raise self._damaged(_named(path, error)) from None
+        if written > RECORD_FORMAT:
             raise StoreError(
-                f"{path}: format = {found['format']}: was written by a newer version of SlipLab; "
+                f"{path}: format = {written}: was written by a newer version of SlipLab; "
                 f"this one reads formats up to {RECORD_FORMAT}: update it"
             )
         return found
@@ -99,6 +108,10 @@ class Recording:
         if name not in self._checked:
             if name not in self._sums:
                 raise self._damaged(f"{path}: is not among the checksums")
+            if to_fetch(path):
+                from storage.mirror import fetch  # which stands on this module
+
+                fetch(path, self._sums[name])
             if (problem := byte_problem(path, self._sums[name])) is not None:
                 raise self._damaged(f"{path}: {problem}")
             self._checked.add(name)
@@ -133,10 +146,30 @@ class Recording:
         """The result of fitting again, where it holds other clocks than the record's."""
         if self.sync_file is None or not self.sync_file.exists():
             return None
-        found = read_json(self.sync_file)
-        # a trial that was taken anew under this id has nothing to do with it
-        same = found.get("raw") == self.raw_checksum
-        return found if same and found.get("clocks") is not None else None
+        try:
+            found = read_json(self.sync_file)
+            # a trial that was taken anew under this id has nothing to do with it
+            if found.get("raw") != self.raw_checksum or found.get("clocks") is None:
+                return None
+            check_clocks(found["clocks"])
+            if not isinstance(found.get("key"), str):
+                raise ValueError("key: must be text")
+        except ValueError as error:
+            raise StoreError(
+                f"{_named(self.sync_file, error)}; it is damaged: delete it, and `sliplab sync` "
+                "makes it again"
+            ) from None
+        return found
+
+    @property
+    def clocks_elsewhere(self) -> Json | None:
+        """What another process needs to use the same clocks (`use_clocks`): None, the record's."""
+        return self._refitted
+
+    def use_clocks(self, refitted: Json | None) -> None:
+        """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
+        self.__dict__.pop("clocks", None)
+        self.__dict__["_refitted"] = refitted
 
     def forget_clocks(self) -> None:
         """Look for refitted clocks anew: they have just been written."""
@@ -146,7 +179,7 @@ class Recording:
     @property
     def has_video(self) -> bool:
         """Whether the frames themselves were recorded."""
-        return (self.folder / FRAMES).exists()
+        return FRAMES in self._sums
 
     @cached_property
     def has_tracks(self) -> bool:
@@ -157,7 +190,10 @@ class Recording:
     @property
     def frame_source(self) -> str:
         """``video``, ``tracks`` or ``none``: what is there of the outside camera."""
-        return "video" if self.has_video else "tracks" if self.has_tracks else "none"
+        if self.has_video:
+            return "video"
+        # frames that are in no video are tracks, and the record is a small file
+        return "tracks" if self.record["counts"]["frames"] else "none"
 
     def open(self) -> StreamReader:
         """The HDF5 file, as a context manager."""
@@ -194,6 +230,10 @@ class Recording:
         """One decoded frame."""
         return read_frame(self._sound(FRAMES), index)
 
+    def frame_reader(self) -> FrameReader:
+        """The video, opened for frames in any order; a context manager."""
+        return FrameReader(self._sound(FRAMES))
+
     def tracks(self) -> Tracks:
         """The markers' places, where they were recorded instead of a video.
 
@@ -218,7 +258,7 @@ class Recording:
             KeyError: the motion has no such phase.
         """
         clock = self.clock("arm")
-        for step in reversed(self.record["steps"]):
+        for step in reversed(self.record.get("steps", [])):
             if step["phase"] == phase:
                 return (
                     int(clock.to_reference(int(step["start_ns"]))),
@@ -229,7 +269,7 @@ class Recording:
     @property
     def motion_phase(self) -> str:
         """``slide`` or ``retract``: the phase in which slip is looked for."""
-        phases = {step["phase"] for step in self.record["steps"]}
+        phases = {step["phase"] for step in self.record.get("steps", [])}
         return "slide" if "slide" in phases else "retract"
 
     @property
@@ -240,4 +280,10 @@ class Recording:
     def simulation_truth(self) -> dict[str, Any] | None:
         """What really happened, on the time line; only for tests and error reports."""
         truth = self.record.get("simulation_truth")
-        return dict(truth) if truth is not None else None
+        return dict(truth) if isinstance(truth, dict) else None
+
+
+def _named(path: Path, error: ValueError) -> str:
+    """What is wrong with a file, which not every message names."""
+    said = str(error)
+    return said if said.startswith(str(path)) else f"{path}: {said}"

@@ -8,6 +8,7 @@
     STORE/campaigns/NAME/bench/          who stood at the rig, one file a stretch of work
     STORE/campaigns/NAME/skipped.json    trials that a person set aside (`storage.decisions`)
     STORE/control/                       what people asked for meanwhile (`storage.control`)
+    STORE/review/                        what people decided about labels (`storage.review`)
     STORE/derived/ models/ report/       what analysis made of it; may be deleted at any time
     STORE/before/                        copies of what a migration changed
 
@@ -35,6 +36,7 @@ from storage.files import (
     write_json,
 )
 from storage.recording import Recording
+from storage.secrets import masked
 from storage.streams import Json
 from storage.whole import partial, write_sums
 from storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
@@ -48,8 +50,11 @@ SYNC = "sync"
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
+IMPORTED = "imported"
+"""In a campaign's description: where its trials come from, if nobody collected them here."""
 AGAIN, FORGIVEN = "again", "forgiven"
 """A committed trial that a person wants anew; a failed attempt that counts no longer."""
+_FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
@@ -66,6 +71,19 @@ def safe_name(name: str) -> str:
     if not _SAFE.fullmatch(name) or ".." in name:
         raise StoreError(f"'{name}' cannot be the name of a folder in a store")
     return name
+
+
+def inside(path: Path, store: Path) -> Path:
+    """`path`, if no link on the way to it leads out of the store's folder.
+
+    Raises:
+        StoreError: one does.
+    """
+    if not path.resolve().is_relative_to(store.resolve()):
+        raise StoreError(
+            f"{path}: a link leads out of the store; put a folder of its own in its place"
+        )
+    return path
 
 
 @dataclass(frozen=True)
@@ -192,7 +210,7 @@ class Campaign:
     def quarantine(self, folder: Path, cause: str, **more: object) -> Path:
         """Move a folder that is no trial, or no longer, out of the way, with its cause."""
         sweep_temporary(folder)
-        write_json(folder / CAUSE, {"cause": cause, "trial": folder.name, **more})
+        write_json(folder / CAUSE, {"cause": masked(cause), "trial": folder.name, **more})
         target = self.quarantine_path(folder.name)
         os.rename(folder, target)
         sync_folder(target.parent)
@@ -200,6 +218,7 @@ class Campaign:
 
     def quarantine_path(self, trial_id: str) -> Path:
         """A free folder in quarantine for this trial."""
+        self._inside(self.folder / "quarantine")
         number = 1
         while (path := self.folder / "quarantine" / f"{trial_id}.{number}").exists():
             number += 1
@@ -267,12 +286,7 @@ class Campaign:
         Raises:
             StoreError: one does.
         """
-        store = self.folder.parent.parent
-        if not path.resolve().is_relative_to(store.resolve()):
-            raise StoreError(
-                f"{path}: a link leads out of the store; put a folder of its own in its place"
-            )
-        return path
+        return inside(path, self.folder.parent.parent)
 
 
 @dataclass(frozen=True)
@@ -307,6 +321,9 @@ class Store:
             )
         if isinstance(found, bool) or not isinstance(found, int) or found < 1:
             raise StoreError(f"{path}: format = {found!r}: must be a number from 1 to {FORMAT}")
+        for name in _FOLDERS:
+            if (folder / name).is_symlink():
+                inside(folder / name, folder)
         return Store(folder)
 
     @property

@@ -14,14 +14,15 @@ from storage.columns import TIMING, TRACKS
 from storage.errors import StoreError
 from storage.files import read_json, temporary_files
 from storage.hdf5 import StreamReader
+from storage.record_shape import check_record
 from storage.recording import RECORD_FORMAT
 from storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
 from storage.streams import Json
 from storage.video import count_frames
-from storage.whole import byte_problem, read_sums
+from storage.whole import ELSEWHERE, byte_problem, read_sums, to_fetch
 from storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD
 
-_KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE}
+_KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
 DAMAGED, UNFINISHED = "damaged", "unfinished"
 
@@ -103,7 +104,8 @@ def _trial(folder: Path) -> Found:
     found = [
         (folder / name, problem)
         for name, said in sorted(sums.items())
-        if (problem := byte_problem(folder / name, said)) is not None
+        if not to_fetch(folder / name)
+        and (problem := byte_problem(folder / name, said)) is not None
     ]
     found += [
         (path, "does not belong here")
@@ -114,7 +116,7 @@ def _trial(folder: Path) -> Found:
         read_json(folder / PROVENANCE)
     except (OSError, ValueError) as error:
         found.append((folder / PROVENANCE, f"cannot be read: {error}"))
-    if found:
+    if found or any(to_fetch(folder / name) for name in sums):
         return found
     try:
         return _contents(folder)
@@ -178,6 +180,7 @@ def _contents(folder: Path) -> Found:
     record = read_json(folder / RECORD)
     if record.get("format", RECORD_FORMAT) > RECORD_FORMAT:
         return [(folder / RECORD, f"was written by a newer version (format {record['format']})")]
+    check_record(record)
     if record["trial"] != folder.name:
         problems.append((folder / RECORD, f"is of trial {record['trial']}"))
     with StreamReader(folder / DATA) as reader:

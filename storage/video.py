@@ -150,6 +150,46 @@ def read_frame(path: Path, index: int) -> U8:
     raise IndexError(f"{path}: has no frame {index}")
 
 
+class FrameReader:
+    """One frame after another in any order, from a video that stays open; a context manager.
+
+    Every frame is a key frame, so a frame costs a seek and its own decoding. One thread at a time.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._container = av.open(str(path))
+        self._stream = self._container.streams.video[0]
+        self._stream.codec_context.thread_type = "SLICE"
+
+    def frame(self, index: int) -> U8:
+        """One decoded frame, uint8 of shape (height, width).
+
+        Raises:
+            IndexError: the video has no such frame.
+        """
+        step = 1 / (self._stream.average_rate * self._stream.time_base)  # ticks a frame
+        if index >= 0:
+            self._container.seek(round(index * step), stream=self._stream)
+            for frame in self._container.decode(self._stream):
+                number = round(frame.pts / step)
+                if number == index:
+                    return frame.to_ndarray(format="gray")  # type: ignore[no-any-return]
+                if number > index:
+                    break
+        raise IndexError(f"{self.path}: has no frame {index}")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def __enter__(self) -> FrameReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
 def count_frames(path: Path) -> int:
     """Number of frames, counted by packets without decoding."""
     with av.open(str(path)) as container:

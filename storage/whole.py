@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import re
 import stat
 from pathlib import Path
 
 from storage.files import read_json, sha256, write_json
 from storage.streams import Json
 from storage.writer import CHECKSUMS, DATA, RECORD
+
+ELSEWHERE = "elsewhere.json"
+"""Of a trial in a mirror (`storage.mirror`): files that it lacks are fetched when they are read."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""Of a file that stands beside its checksums."""
 
 
 def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
@@ -23,8 +30,12 @@ def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     for name, said in sums.items():
-        plain = isinstance(said, dict) and {"sha256", "bytes"} <= said.keys()
-        if not plain or name != Path(name).name or name in {"", ".", ".."}:
+        plain = (
+            isinstance(said, dict)
+            and isinstance(said.get("sha256"), str)
+            and type(said.get("bytes")) is int
+        )
+        if not plain or not _NAME.fullmatch(name):
             raise ValueError(f"{path}: is no list of checksums")
     for name in needed:
         if name not in sums:
@@ -66,9 +77,15 @@ def partial(folder: Path) -> str | None:
     except ValueError as error:
         return str(error)
     for name, said in sums.items():
-        if (problem := size_problem(folder / name, said)) is not None:
+        problem = size_problem(folder / name, said)
+        if problem is not None and not to_fetch(folder / name):
             return f"{folder / name}: {problem}"
     return None
+
+
+def to_fetch(path: Path) -> bool:
+    """Whether a file of a trial is not here, but where this store is a mirror of."""
+    return not os.path.lexists(path) and (path.parent / ELSEWHERE).is_file()
 
 
 def write_sums(folder: Path, names: tuple[str, ...]) -> None:

@@ -11,8 +11,18 @@ import numpy as np
 
 from storage.files import sha256, sync_file, sync_folder, write_json_aside
 from storage.hdf5 import StreamFile
+from storage.secrets import masked
 from storage.spool import Spool
-from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.streams import (
+    I64,
+    U8,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    Json,
+    PoseChunk,
+    PulseChunk,
+)
 from storage.video import VideoWriter
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
@@ -83,6 +93,10 @@ class TrialWriter:
         """Append reads of the frame camera's clock."""
         self._streams.add_clock_reads("frame_camera_reads", chunk)
 
+    def add_triggers(self, t_ns: I64, kind: U8) -> None:
+        """Append what else an event camera noted, of an imported trial."""
+        self._streams.add_triggers(t_ns, kind)
+
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""
         self._streams.add_poses(chunk)
@@ -152,7 +166,9 @@ class TrialWriter:
     def set_aside(self, quarantine: Path, record: Json, provenance: Json, cause: Json) -> None:
         """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
         self.seal()
-        write_json_aside(self.folder / "cause.json", cause)
+        write_json_aside(
+            self.folder / "cause.json", {**cause, "cause": masked(str(cause["cause"]))}
+        )
         self._finish_folder(record, provenance)
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)

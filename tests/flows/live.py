@@ -22,11 +22,14 @@ from tests.flows.conftest import write
 from tests.rigs.loopback import own_address
 
 
-def quick(distance_mm: float = 7.0, speed_mm_s: float = 6.0, trials: int = 1) -> dict[str, Any]:
+def quick(
+    distance_mm: float = 7.0, speed_mm_s: float = 6.0, trials: int = 1, repetitions: int = 1
+) -> dict[str, Any]:
     """Slides that are over in three or four seconds, pressing and letting go included."""
     data = copy.deepcopy(SMALL)
     data["name"] = "quick"
     collection = data["collection"]
+    collection["repetitions"] = repetitions
     for factor, values in (("depth", [2.4]), ("speed", [speed_mm_s]), ("direction", [0, 180])):
         collection["factors"][factor]["values"] = values[:trials]
     collection["motion"] = [

@@ -1,4 +1,4 @@
-"""Faults in the middle of a slide on a loopback rig: the arm stops, a person is told what to do.
+"""Faults in one campaign on a loopback rig: the arm stops, a person is told what to do.
 
 Every fault happens once the sensor has passed a point of its slide. How long the arm went on is
 reckoned from how far it went on, so it does not matter how quick this test is. Bounds are the
@@ -12,21 +12,22 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from flows.orders import Order
+from flows.orders import Order, pending_trials
+from flows.session import Session
 from rigs.arms.ur import SILENCE_S, UrArm
 from rigs.arms.ur_control import WATCHDOG_HZ
 from rigs.build import calibrated_arm
 from rigs.capabilities import ArmFault, ArmState, RigError
 from rigs.wire.loopback import Loopback
 from storage.files import read_json
-from storage.store import Store
+from storage.store import Campaign, Store
 from storage.verify import verify
-from tests.flows.live import at_work, order_in, quick, rig_yaml, stage_of, take_all
+from tests.flows.live import at_work, order_in, quick, rig_yaml, stage_of
+from tests.flows.test_session import checksums
 from tests.rigs.loopback import until
 
 pytestmark = pytest.mark.realtime
@@ -43,13 +44,24 @@ WATCHING_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, Path]]:
-    """Stand-ins for all tests here, and the rig file that they belong to."""
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, Order]]:
+    """Stand-ins for all tests here, and the campaign of which each takes the next trial."""
     folder = tmp_path_factory.mktemp("faults")
-    rig = rig_yaml(folder)
-    order = order_in(folder / "begin", quick(LENGTH_MM, SPEED_MM_S), rig)
+    data = quick(LENGTH_MM, SPEED_MM_S, repetitions=len(CASES) + 2)
+    order = order_in(folder / "begin", data, rig_yaml(folder))
     with stage_of(order.rig) as stage:
-        yield stage, rig
+        yield stage, order
+
+
+def take_next(work: Session) -> None:
+    """Take the campaign's next trial."""
+    work.take(pending_trials(work.plan, work.campaign)[:1])
+
+
+def new_in_quarantine(campaign: Campaign, before: list[Any]) -> dict[str, Any]:
+    """The one trial that was set aside since."""
+    (new,) = [item for item in campaign.quarantined() if item not in before]
+    return dict(new)
 
 
 @contextmanager
@@ -102,11 +114,11 @@ CASES = [
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.device}-{case.kind}")
 def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
-    tmp_path: Path, scene: tuple[Loopback, Path], case: Case
+    scene: tuple[Loopback, Order], case: Case
 ) -> None:
-    stage, rig = scene
-    order = order_in(tmp_path, quick(LENGTH_MM, SPEED_MM_S), rig)
+    stage, order = scene
     with at_work(order, stage) as (work, campaign):
+        good, aside = checksums(campaign), campaign.quarantined()
 
         def happen() -> None:
             if case.device == "frame_camera":
@@ -116,7 +128,7 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
 
         with once_sliding(stage, happen) as happened:
             with pytest.raises(RigError, match=f"{case.says}.*{case.advises}") as raised:
-                take_all(work)
+                take_next(work)
             at_mm, _ = happened.result(WATCHING_S)
         until(stage.at_rest, case.bound_s + BUSY_S)
         x_mm, _, depth_mm = stage.arm_place()
@@ -132,9 +144,9 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
             assert depth_mm == pytest.approx(DEPTH_MM, abs=0.1)  # an unhealthy arm is not moved
         else:
             assert depth_mm == pytest.approx(-1.0, abs=0.1)  # clear of the plate
-    assert campaign.committed() == set()
+    assert checksums(campaign) == good
     assert campaign.failed_attempts() == {}
-    (failed,) = campaign.quarantined()
+    failed = new_in_quarantine(campaign, aside)
     assert str(raised.value) in failed["cause"]
     kept = read_json(campaign.folder / "quarantine" / failed["folder"] / "cause.json")
     assert kept["cause"] == f"{type(raised.value).__name__}: {raised.value}"
@@ -142,10 +154,12 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
         nobody_unlocks_it(order, stage)
     put_right(stage, case.device)
     with at_work(order, stage) as (work, campaign):
-        take_all(work)
+        take_next(work)
         assert work.rig.arm.state() is ArmState.READY
-    assert [again["cause"] for again in campaign.quarantined()] == [failed["cause"]]
-    assert len(campaign.committed()) == 1
+    assert new_in_quarantine(campaign, aside) == failed
+    now = checksums(campaign)
+    assert good.items() <= now.items()
+    assert now.keys() - good.keys() == {failed["trial"]}
     assert verify(Store.open(order.store)) == []
 
 
@@ -167,27 +181,23 @@ def put_right(stage: Loopback, device: str) -> None:
 
 
 def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
-    tmp_path: Path, scene: tuple[Loopback, Path]
+    scene: tuple[Loopback, Order],
 ) -> None:
-    stage, rig = scene
-    order = order_in(tmp_path, quick(), rig)
+    stage, order = scene
     with at_work(order, stage) as (work, campaign):
+        aside = campaign.quarantined()
         camera = cast("Any", work.rig.frames)
         with once_sliding(stage, lambda: camera.device.drop_frames(3)):
-            take_all(work)
+            take_next(work)
     assert (work.taken, work.retaken) == (2, 1)
-    (failed,) = campaign.quarantined()
+    failed = new_in_quarantine(campaign, aside)
     assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
-    (recording,) = campaign.recordings()
-    assert recording.record["attempt"] == 1
+    assert campaign.recording(failed["trial"]).record["attempt"] == 1
     assert verify(Store.open(order.store)) == []
 
 
-def test_a_second_program_gets_no_arm_that_slides(
-    tmp_path: Path, scene: tuple[Loopback, Path]
-) -> None:
-    stage, rig = scene
-    order = order_in(tmp_path, quick(LENGTH_MM, SPEED_MM_S), rig)
+def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, Order]) -> None:
+    stage, order = scene
     assert order.rig.devices is not None
     second = UrArm(cast("Any", calibrated_arm(order.rig, order.rig.devices)))
 
@@ -198,9 +208,10 @@ def test_a_second_program_gets_no_arm_that_slides(
         return str(refused.value)
 
     with at_work(order, stage) as (work, campaign):
+        good = campaign.committed()
         with once_sliding(stage, take_it) as tried:
-            take_all(work)
+            take_next(work)
         _, said = tried.result(SILENCE_S)
     assert said == "arm: runs somebody's program; end it at the pendant first"
     assert (work.taken, work.retaken) == (1, 0)
-    assert len(campaign.committed()) == 1
+    assert len(campaign.committed()) == len(good) + 1

@@ -1,5 +1,6 @@
 """Whatever is wrong with a protocol file is said with file, key, value and what would be right."""
 
+import os
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
@@ -228,6 +229,24 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     assert "none.yaml" in caught.value.message
     with pytest.raises(InputError, match="is a folder"):
         load_plan(tmp_path)
+
+
+def test_what_is_no_plain_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for path in (tmp_path / "pipe.yaml", Path("/dev/zero")):
+        with pytest.raises(InputError, match="is no plain file"):
+            load_plan(path)
+
+
+def test_ids_that_no_folder_can_have_are_refused(
+    small: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "long.yaml"
+    path.write_text(yaml.safe_dump(small))
+    load_plan(path)
+    monkeypatch.setattr("protocols.plan.MAX_ID", 30)
+    with pytest.raises(InputError, match="30 at most"):
+        load_plan(path)
 
 
 def test_a_number_is_shown_as_it_was_written() -> None:

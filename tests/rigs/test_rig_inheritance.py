@@ -119,6 +119,8 @@ def test_a_fault_is_blamed_on_the_file_that_has_it(
         ("extends: none.yaml\n", "extends = none.yaml: no such file"),
         ("extends: child.yaml\n", "extends = child.yaml: leads in a circle"),
         ("extends: [mock.yaml]\n", "must be the path of a rig file"),
+        ('extends: "a\\0b"\n', "must be the path of a rig file"),
+        ("extends: /dev/zero\n", "is no plain file"),
         ("extends: loop.yaml\n", "extends = child.yaml: leads in a circle"),
     ],
 )

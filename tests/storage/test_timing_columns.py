@@ -62,7 +62,7 @@ def test_they_come_back_however_they_were_chunked(pieces: int, tmp_path: Path) -
     assert (counts["exposures/t"], counts["frame_camera_reads/after"]) == (COUNT, 300)
     assert verify(Store.open(tmp_path / "s")) == []
     with h5py.File(folder / "data.h5") as file:
-        for name in TIMING:
+        for name in TIMING.keys() - {"triggers/t", "triggers/kind"}:  # of imported trials
             assert file[name].attrs["unit"].startswith("ns of the ")
 
 

@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from storage.video import VideoWriter, count_frames, read_frame, read_frames
+from storage.video import FrameReader, VideoWriter, count_frames, read_frame, read_frames
 from tests.storage.trials import FRAME, frames
 
 
@@ -96,3 +96,17 @@ def test_no_frames_are_no_file(tmp_path: Path) -> None:
     writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)
     writer.close()
     assert not (tmp_path / "v.mkv").exists()
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 144])
+def test_frames_are_found_in_any_order(tmp_path: Path, rate_hz: int) -> None:
+    wanted = frames(40).images
+    writer = VideoWriter(tmp_path / "v.mkv", *FRAME, rate_hz)
+    writer.write(wanted)
+    writer.close()
+    with FrameReader(tmp_path / "v.mkv") as reader:
+        for index in (20, 0, 39, 1, 20, 21, 3):
+            assert np.array_equal(reader.frame(index), wanted[index])
+        for index in (-1, 40, 1000):
+            with pytest.raises(IndexError, match=f"has no frame {index}"):
+                reader.frame(index)

@@ -1,0 +1,283 @@
+"""AEDAT4 read and written: the files of iniVation's cameras and of dv-processing.
+
+A file is a line, a header that describes its streams in XML, and packets: stream, length, and a
+flatbuffer, mostly compressed. It is read here and not through dv-processing, which is C++ that
+believes what a file says; and it is written here, because that library takes events one by one.
+Both directions are held against it by tests. Times are microseconds as the file has them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow as pa
+
+from storage.exchange.dv_buffers import (
+    EVENT,
+    GREY,
+    events_buffer,
+    frame_buffer,
+    header_buffer,
+    triggers_buffer,
+)
+from storage.exchange.flatbuffer import Table
+from storage.exchange.foreign import LATEST_US, Triggers, Wrong, event_chunk
+from storage.streams import U8, EventChunk
+
+LINE = b"#!AER-DAT4.0\r\n"
+EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"
+_CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
+_MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
+_PACKET_EVENTS = 1 << 16
+_PIECE = 1 << 20
+_ZSTD = 3
+_COLOUR = {16: 3, 24: 4}
+"""OpenCV's numbers of 8-bit pictures with three and four channels."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One stream of a file: what is in it, and how large its pictures are."""
+
+    kind: str
+    name: str
+    size: tuple[int, int] | None
+    source: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame: grey levels (height, width), middle of exposure in us."""
+
+    image: U8
+    t_us: int
+
+
+class Aedat4File:
+    """A file that is open for reading; a context manager.
+
+    Raises:
+        Wrong: it is none, or damaged.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._handle = path.open("rb")
+        try:
+            self._bytes = path.stat().st_size
+            if self._handle.read(len(LINE)) != LINE:
+                raise Wrong("is no AEDAT4 file")
+            header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
+            table = Table.root(memoryview(_prefixed(header)), b"IOHE")
+            self._codec = _CODECS.get(table.number(0, "<i"), "")
+            if self._codec == "":
+                raise Wrong("is compressed in an unknown way")
+            end = table.number(1, "<q", -1)
+            self._begin = self._handle.tell()
+            self._end = self._bytes if end <= 0 else end
+            if not self._begin <= self._end <= self._bytes:
+                raise Wrong("is cut short")
+            self.streams = _streams(bytes(table.vector(2, 1)[1]))
+        except BaseException:
+            self._handle.close()
+            raise
+
+    def __enter__(self) -> Aedat4File:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._handle.close()
+
+    def first(self, kind: str) -> int | None:
+        """The first stream of a kind."""
+        return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
+
+    def events(self, number: int) -> Iterator[EventChunk]:
+        """The events of a stream, packet by packet."""
+        last = None
+        for data in self._packets(number):
+            rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], EVENT)
+            chunk = event_chunk(rows["x"], rows["y"], rows["p"] & 1, rows["t"])
+            if last is not None and len(chunk) and chunk.t_us[0] < last:
+                raise Wrong("events whose times run backwards")
+            last = int(chunk.t_us[-1]) if len(chunk) else last
+            yield chunk
+
+    def triggers(self, number: int) -> Triggers:
+        """All triggers of a stream."""
+        found = [
+            (table.number(0, "<q"), table.number(1, "<B"))
+            for data in self._packets(number)
+            for table in Table.root(data, b"TRIG").tables(0)
+        ]
+        times = np.array([t for t, _ in found], np.int64)
+        if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
+            raise Wrong("triggers whose times run backwards or are none")
+        return Triggers(times, np.array([kind for _, kind in found], np.uint8))
+
+    def pictures(self, number: int) -> Iterator[Picture]:
+        """The frames of a stream, colours as grey levels."""
+        last = -1
+        for data in self._packets(number):
+            table = Table.root(data, b"FRME")
+            t_us, form = table.number(0, "<q"), table.number(5, "<b")
+            width, height = table.number(6, "<h"), table.number(7, "<h")
+            channels = 1 if form == GREY else _COLOUR.get(form, 0)
+            count, pixels = table.vector(10, 1)
+            if not channels or width <= 0 or height <= 0 or count != width * height * channels:
+                raise Wrong(f"a frame of {width} x {height} with {count} bytes of kind {form}")
+            if not last <= t_us < LATEST_US:
+                raise Wrong("frames whose times run backwards or are none")
+            last = t_us
+            yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_us)
+
+    def _packets(self, number: int) -> Iterator[memoryview]:
+        """Unpacked packets of one stream; the others are passed over."""
+        self._handle.seek(self._begin)
+        while (at := self._handle.tell()) < self._end:
+            stream, size = struct.unpack("<ii", self._exactly(8))
+            if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
+                raise Wrong(f"a packet of {size} bytes in stream {stream}, at byte {at}")
+            if stream != number:
+                self._handle.seek(size, 1)
+                continue
+            try:
+                yield memoryview(_unpacked(self._exactly(size), self._codec))
+            except (pa.ArrowException, OSError) as error:
+                raise Wrong(f"a packet that cannot be unpacked, at byte {at}: {error}") from None
+
+    def _exactly(self, count: int) -> bytes:
+        found = self._handle.read(count)
+        if len(found) != count:
+            raise Wrong("is cut short")
+        return found
+
+
+def _length(data: bytes, most: int) -> int:
+    count = int(struct.unpack("<I", data)[0])
+    if count > most:
+        raise Wrong(f"has a header of {count} bytes")
+    return count
+
+
+def _prefixed(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _unpacked(data: bytes, codec: Any) -> bytes:
+    if codec is None:
+        return data
+    parts: list[bytes] = []  # as much is made room for as is asked for, whatever comes
+    left = _MOST_PACKET
+    with pa.CompressedInputStream(pa.BufferReader(data), codec) as stream:
+        while part := stream.read(_PIECE):
+            parts.append(part)
+            left -= len(part)
+            if left < 0:
+                raise Wrong("a packet that unpacks to too much")
+    return b"".join(parts)
+
+
+def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
+    if channels == 1:
+        return np.asarray(pixels, np.uint8).reshape(height, width)
+    levels = pixels.reshape(height, width, channels)[..., :3].astype(np.uint32)  # blue, green, red
+    weighed = levels @ np.array([114, 587, 299], np.uint32) + 500
+    return np.asarray(weighed // 1000, np.uint8)
+
+
+def _streams(text: bytes) -> dict[int, Stream]:
+    if b"<!" in text:
+        raise Wrong("a header that defines words of its own")
+    try:
+        root = ElementTree.fromstring(text.rstrip(b"\0").decode("utf-8"))
+        found = {}
+        for node in root.iterfind("./node[@name='outInfo']/node"):
+            values = {item.get("key"): item.text or "" for item in node.iter("attr")}
+            size = None
+            if "sizeX" in values and "sizeY" in values:
+                size = (int(values["sizeX"]), int(values["sizeY"]))
+            kind = values.get("typeIdentifier", "")
+            name = values.get("originalOutputName", kind)
+            found[int(node.get("name", ""))] = Stream(kind, name, size, values.get("source", ""))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise Wrong(f"a header that cannot be read: {error}") from None
+    return found
+
+
+class Aedat4Writer:
+    """Writes a file; packets are compressed with zstd. A context manager.
+
+    Args:
+        streams: those that will come, by number.
+    """
+
+    def __init__(self, path: Path, streams: dict[int, Stream]) -> None:
+        self._handle = path.open("wb")
+        self._handle.write(LINE + header_buffer(_described(streams), _ZSTD))
+
+    def __enter__(self) -> Aedat4Writer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._handle.close()
+
+    def events(self, number: int, chunk: EventChunk) -> None:
+        """Append events; times must not run backwards, over all calls."""
+        for start in range(0, len(chunk), _PACKET_EVENTS):
+            part = slice(start, start + _PACKET_EVENTS)
+            few = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+            self._write(number, events_buffer(few))
+
+    def triggers(self, number: int, found: Triggers) -> None:
+        """Append triggers."""
+        if len(found.t_us):
+            self._write(number, triggers_buffer(found.t_us, found.kind))
+
+    def picture(self, number: int, image: U8, t_us: int) -> None:
+        """Append a frame of grey levels."""
+        self._write(number, frame_buffer(image, t_us))
+
+    def _write(self, number: int, made: bytes) -> None:
+        packed = pa.compress(made, codec="zstd", asbytes=True)
+        self._handle.write(struct.pack("<ii", number, len(packed)) + packed)
+
+
+def _described(streams: dict[int, Stream]) -> str:
+    root = ElementTree.Element("dv", version="2.0")
+    out = ElementTree.SubElement(root, "node", name="outInfo", path="/outInfo/")
+    for number, stream in sorted(streams.items()):
+        path = f"/outInfo/{number}/"
+        node = ElementTree.SubElement(out, "node", name=str(number), path=path)
+        for key, text in (
+            ("compression", "ZSTD"),
+            ("originalModuleName", "sliplab"),
+            ("originalOutputName", stream.name),
+            ("typeIdentifier", stream.kind),
+        ):
+            ElementTree.SubElement(node, "attr", key=key, type="string").text = text
+        info = ElementTree.SubElement(node, "node", name="info", path=f"{path}info/")
+        if stream.size is not None:
+            for axis, value in zip("XY", stream.size, strict=True):
+                item = ElementTree.SubElement(info, "attr", key=f"size{axis}", type="int")
+                item.text = str(value)
+        ElementTree.SubElement(info, "attr", key="source", type="string").text = stream.source
+    return ElementTree.tostring(root, encoding="unicode")

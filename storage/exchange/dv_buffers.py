@@ -1,0 +1,90 @@
+"""Events, triggers, frames and headers as dv's flatbuffers, on the wire and in AEDAT4 files.
+
+Each buffer has its length in front: `EVTS` is a vector of 16-byte structs, `TRIG` a vector of
+tables, `FRME` a table with pixels, `IOHE` a header with a description. Layouts were read off what
+dv-processing 2.0.4 writes (tests hold them against it); all numbers little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import numpy.typing as npt
+
+from storage.streams import I64, U8, EventChunk
+
+EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "p"],
+        "formats": ["<i8", "<i2", "<i2", "u1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+"""One event: time in us, column, row, whether it became brighter."""
+GREY = 0
+"""OpenCV's number of an 8-bit picture with one channel."""
+_VECTOR = bytes.fromhex("0000 0600 0800 0400 06000000 04000000")
+"""A table with one field, a vector, whose length follows: padding, vtable, table."""
+_TRIGGER_VTABLE = struct.pack("<4H", 8, 16, 8, 7)
+"""Of a trigger's table of 16 bytes: time at 8, kind at 7."""
+_FRAME_VTABLE = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 44, 46, 48, 50, 52, 56)
+"""Five times, kind, width, height, place, and where the pixels are."""
+
+
+def events_buffer(chunk: EventChunk) -> bytes:
+    """Events in order of time."""
+    rows = np.zeros(len(chunk), EVENT)
+    rows["t"], rows["x"], rows["y"], rows["p"] = chunk.t_us, chunk.x, chunk.y, chunk.p
+    return _whole(b"EVTS", struct.pack("<I", len(chunk)) + rows.tobytes())
+
+
+def triggers_buffer(t_us: I64, kind: int | U8) -> bytes:
+    """Triggers at these times, us, of one kind or of a kind each."""
+    n = len(t_us)
+    # counted from the length in front of the flatbuffer: count at 28, then an offset for each
+    tables = (32 + 4 * n + 8 + 7) // 8 * 8
+    places = tables + 16 * np.arange(n, dtype=np.int64)
+    offsets: npt.NDArray[np.uint32] = (places - (32 + 4 * np.arange(n))).astype("<u4")
+    rows = np.zeros(
+        n,
+        np.dtype(
+            {
+                "names": ["vtable", "kind", "t"],
+                "formats": ["<i4", "u1", "<i8"],
+                "offsets": [0, 7, 8],
+                "itemsize": 16,
+            }
+        ),
+    )
+    rows["vtable"], rows["kind"], rows["t"] = places - (tables - 8), kind, t_us
+    padding = bytes(tables - 8 - (32 + 4 * n))
+    vector = struct.pack("<I", n) + offsets.tobytes()
+    return _whole(b"TRIG", vector + padding + _TRIGGER_VTABLE + rows.tobytes())
+
+
+def frame_buffer(image: U8, t_us: int) -> bytes:
+    """A frame of grey levels (height, width); all of its times are the middle of exposure, us."""
+    height, width = image.shape
+    # counted from the length in front: the list of fields at 12, its table at 44, pixels at 108
+    table = struct.pack("<i5qbx4h2xI", 44 - 14, *(5 * [t_us]), GREY, width, height, 0, 0, 4)
+    body = struct.pack("<I", 40) + b"FRME" + bytes(2) + _FRAME_VTABLE + bytes(4) + table
+    return _with_length(body + struct.pack("<I", image.size) + image.tobytes())
+
+
+def header_buffer(text: str, compression: int) -> bytes:
+    """Compression (0: none, 3: zstd), position of an index (-1: none) and description."""
+    data = text.encode()
+    table = struct.pack("<iiIq", 10, compression, 12, -1)
+    body = struct.pack("<I", 24) + b"IOHE" + bytes(6) + struct.pack("<5H", 10, 20, 4, 12, 8) + table
+    return _with_length(body + struct.pack("<I", len(data)) + data + b"\0")
+
+
+def _whole(kind: bytes, vector: bytes) -> bytes:
+    return _with_length(struct.pack("<I", 16) + kind + _VECTOR + vector)
+
+
+def _with_length(body: bytes) -> bytes:
+    body += bytes(-len(body) % 4)
+    return struct.pack("<I", len(body)) + body

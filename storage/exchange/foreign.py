@@ -1,0 +1,97 @@
+"""One trial out of somebody else's files, before it is in a store: what is known of it, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from storage.streams import I64, U8, EventChunk, FrameChunk, Json
+
+MOST_PX = 1 << 14
+LATEST_US = 1 << 53
+"""285 years; what comes later is no time, and would not fit 64 bits of nanoseconds."""
+
+
+class Wrong(ValueError):
+    """What a foreign file holds cannot be right; the message says what."""
+
+
+@dataclass(frozen=True)
+class Triggers:
+    """What else the event camera noted, as the file has it, shape (n,)."""
+
+    t_us: I64
+    kind: U8
+    """As AEDAT4 numbers them; 1 is a rising edge of the external input."""
+
+
+@dataclass(frozen=True)
+class ForeignTrial:
+    """A trial that can be read.
+
+    Attributes:
+        name: its id in the store.
+        events: its events in order of time; read anew by each call.
+        epoch: what the times count from, in words.
+        about: what else the file tells of itself, to be kept in the record.
+        unknown: what nobody knows of it any more.
+    """
+
+    name: str
+    source: str
+    events: Callable[[], Iterator[EventChunk]]
+    epoch: str
+    event_px: tuple[int, int] | None = None
+    triggers: Triggers | None = None
+    frames: Callable[[], Iterator[FrameChunk]] | None = None
+    frame_px: tuple[int, int] | None = None
+    condition: dict[str, str] = field(default_factory=dict)
+    repetition: int = 0
+    simulated: bool = False
+    about: Json = field(default_factory=dict)
+    unknown: tuple[str, ...] = ()
+
+
+def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
+    """Columns of a foreign file as a chunk.
+
+    Raises:
+        Wrong: they differ in length, a pixel or time is none, or times run backwards.
+    """
+    columns = [np.asarray(column) for column in (x, y, p, t_us)]
+    if any(c.ndim != 1 or len(c) != len(columns[3]) for c in columns):
+        raise Wrong("columns of events that differ in length")
+    if any(c.dtype.kind not in "iub" for c in columns):
+        raise Wrong("events that are no integers")
+    limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
+    for column, (what, most) in zip(columns, limits, strict=True):
+        if len(column) and (int(column.min()) < 0 or int(column.max()) >= most):
+            raise Wrong(f"an event whose {what} is {int(column.min())} or {int(column.max())}")
+    times = columns[3].astype(np.int64)
+    if np.any(times[1:] < times[:-1]):
+        raise Wrong("events whose times run backwards")
+    return EventChunk(
+        columns[0].astype(np.uint16),
+        columns[1].astype(np.uint16),
+        columns[2].astype(np.uint8),
+        times,
+    )
+
+
+def rounded_us(times: Any, per_unit: float) -> I64:
+    """Times in another unit as whole microseconds.
+
+    Args:
+        per_unit: microseconds of one unit.
+
+    Raises:
+        Wrong: one is no number, or beyond any time.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
+        found = np.asarray(times, np.float64) * per_unit
+    if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
+        raise Wrong("a time that is no number, or beyond any time")
+    return np.rint(found).astype(np.int64)

@@ -1,0 +1,167 @@
+"""Foreign trials into a campaign of their own: each one whole or not at all.
+
+A trial is committed by the store's own rename after all of it was read and found right. What nobody
+knows of it (clocks against one another, poses, what was asked for) is said to be unknown and not
+made up: its time line is the event camera's own clock.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from protocols.errors import InputError
+from storage.clockmap import IDENTITY
+from storage.exchange.foreign import ForeignTrial, Wrong
+from storage.files import json_text
+from storage.process import now
+from storage.recording import RECORD_FORMAT
+from storage.store import IMPORTED, Campaign, Store, safe_name
+from storage.streams import Json, PulseChunk
+from storage.writer import TrialWriter
+
+RISING = 1
+"""A rising edge of the external input, as AEDAT4 numbers triggers."""
+_FRAME_RATE = 100
+"""Of the video's own time base only; when frames were taken stands in their times."""
+
+
+def take_in(
+    store: Store,
+    name: str,
+    trials: Iterable[ForeignTrial],
+    origin: Path,
+    kind: str,
+    on_trial: Callable[[str], None] = lambda name: None,
+) -> Json:
+    """Commit trials that are not there yet; whoever calls holds the store's lock.
+
+    Args:
+        name: the campaign's, which is made.
+        origin: the file or folder that they come from, for messages and the campaign's description.
+        kind: the format's name.
+
+    Returns:
+        ``imported`` and ``there`` (already) with ids, and ``events`` and ``frames`` imported.
+
+    Raises:
+        InputError: a file is damaged or cannot be right. Trials before it stay committed; of this
+            one nothing is left.
+    """
+    campaign = store.campaign(name)
+    fresh = not campaign.begun
+    if not fresh and IMPORTED not in campaign.info:
+        raise InputError("--name", "", name, "is a campaign that was collected; give another name")
+    there = campaign.committed()
+    made: list[str] = []
+    found: list[str] = []
+    counts = {"events": 0, "frames": 0}
+    try:
+        for trial in trials:
+            on_trial(trial.name)
+            if trial.name in there:
+                found.append(trial.name)
+                continue
+            if trial.name in made:
+                raise Wrong(f"two files for the trial {trial.name}")
+            if not campaign.begun:
+                _describe(campaign, trial, origin, kind)
+            taken = _take(campaign, trial, kind)
+            made.append(trial.name)
+            counts = {key: counts[key] + taken[key] for key in counts}
+    except Wrong as error:
+        raise InputError(origin, "", None, str(error)) from None
+    finally:
+        if fresh and not made and campaign.folder.exists():
+            shutil.rmtree(campaign.folder)
+    return {"campaign": name, "imported": made, "there": found, **counts}
+
+
+def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) -> None:
+    about = {"from": origin.name, "format": kind, "when": now()}
+    info = {"name": campaign.name, "simulated": trial.simulated, IMPORTED: about}
+    text = f"# Imported: there is no protocol.\nimported: {json_text(kind).strip()}\n"
+    campaign.update(info, text, text.replace("protocol", "rig file"))
+
+
+def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> dict[str, int]:
+    writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
+    try:
+        first_us, last_us = _fill(writer, trial)
+        counts = writer.counts
+        told = {
+            "events": counts["events/t"],
+            "frames": counts["frames/t"],
+            "poses": 0,
+            "pulses": 0,
+        }
+        record = _record(campaign, trial, kind, told, (last_us - first_us) / 1e6)
+        writer.commit(record, {"imported": now(), "from": trial.source})
+    except Wrong as error:
+        writer.discard()
+        raise Wrong(f"{trial.source}: holds {error}") from None
+    except BaseException:
+        writer.discard()
+        raise
+    return {"events": told["events"], "frames": told["frames"]}
+
+
+def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[int, int]:
+    """All streams into the trial; the times of the first and the last event, us."""
+    first_us = last_us = None
+    for chunk in trial.events():
+        if not len(chunk):
+            continue
+        if last_us is not None and int(chunk.t_us[0]) < last_us:
+            raise Wrong("events whose times run backwards")
+        first_us = int(chunk.t_us[0]) if first_us is None else first_us
+        last_us = int(chunk.t_us[-1])
+        writer.add_events(chunk)
+    if trial.triggers is not None:
+        t_ns = trial.triggers.t_us * 1000
+        writer.add_triggers(t_ns, trial.triggers.kind)
+        writer.add_event_pulses(PulseChunk(t_ns[trial.triggers.kind == RISING]))
+    for frames in trial.frames() if trial.frames is not None else ():
+        height, width = frames.images.shape[1:]
+        if (width, height) != trial.frame_px:
+            raise Wrong(f"a frame of {width} x {height} among others of {trial.frame_px}")
+        writer.add_frames(frames)
+    return first_us or 0, last_us or 0
+
+
+def _record(
+    campaign: Campaign, trial: ForeignTrial, kind: str, counts: Json, seconds: float
+) -> Json:
+    clock = {"grade": "unknown", "map": IDENTITY.to_json(), "uncertainty_ns": None}
+    clocks: Json = {"reference": "event camera", "events": clock}
+    if trial.frames is not None:
+        clocks["frames"] = clock
+    return {
+        "format": RECORD_FORMAT,
+        "trial": trial.name,
+        "campaign": campaign.name,
+        "experiment": "imported",
+        "role": "imported",
+        "block": 0,
+        "repetition": trial.repetition,
+        "attempt": 0,
+        "condition": trial.condition,
+        "simulated": trial.simulated,
+        "recorded_s": seconds,
+        "counts": counts,
+        "clocks": clocks,
+        "quality": {"passed": True, "gates": {}},
+        "steps": [],
+        "geometry": {
+            "event_px": list(trial.event_px) if trial.event_px else None,
+            "frame_px": list(trial.frame_px) if trial.frame_px else None,
+        },
+        IMPORTED: {
+            "format": kind,
+            "from": trial.source,
+            "epoch": trial.epoch,
+            "unknown": list(trial.unknown),
+            **trial.about,
+        },
+    }

@@ -1,0 +1,281 @@
+"""The review page in a real browser: what a person does is kept, and nobody else gets in."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import urlsplit
+from urllib.request import urlopen
+
+import pytest
+
+from storage import review
+from tests.conftest import ROOT
+from tests.flows.reviewable import DOUBTFUL, NAME, Reviewable, label
+
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+TRIALS = 864
+PATIENCE_MS = 10_000
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = pytest.mark.skipif(
+    not (Path(CHROMIUM).exists() and shutil.which(CHROMIUM)),
+    reason=f"no browser at {CHROMIUM} (Debian's package chromium)",
+)
+expect = sync_api.expect
+
+
+@dataclass
+class Served:
+    """A server of its own process over the 864 trials, and a browser."""
+
+    made: Reviewable
+    told: dict[str, Any]
+    process: subprocess.Popen[str]
+    browser: Any
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Ends with Ctrl-C, which must end it in good order."""
+    made = Reviewable(tmp_path_factory.mktemp("review") / "store")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "flows", "review", str(made.store.folder), "--json", "--who=anna"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+        env={**os.environ, "PYTHONWARNINGS": "default"},
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+        with sync_api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+            sync_api.expect.set_options(timeout=PATIENCE_MS)
+            yield Served(made, told, process, browser)
+            browser.close()
+    finally:
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 130, err
+    assert out == ""
+    assert "Traceback" not in err
+
+
+@dataclass
+class Tab:
+    """One tab, and what its console said amiss."""
+
+    page: Any
+    amiss: list[str]
+
+    def row(self, trial: str) -> Any:
+        return self.page.locator(".slick-row", has=self.page.get_by_text(trial, exact=True))
+
+    def decision(self, trial: str) -> Any:
+        return self.row(trial).locator(".slick-cell").nth(2)
+
+    def heading(self) -> Any:
+        return self.page.locator("h1")
+
+    def chosen(self) -> Any:
+        return self.page.locator("p.id").first
+
+    def press(self, key: str) -> None:
+        self.page.keyboard.press(key)
+
+    def find(self, text: str) -> None:
+        """Only trials whose id holds this."""
+        box = self.page.locator(".by-id input")
+        box.fill(text)
+        box.press("Enter")
+        box.press("Escape")
+
+    def at(self, time_s: float) -> float:
+        """Where a time stands in the plot of displacements, pixels from the window's left."""
+        found = self.page.evaluate(
+            """() => { for (const view of Bokeh.index.query((v) => v.model.type == "Figure")) {
+              const m = view.model, r = view.el.getBoundingClientRect();
+              if (m.left.length && m.left[0].axis_label == "displacement (px)")
+                return [r.x + view.frame.bbox.x, view.frame.bbox.width, m.x_range.start,
+                        m.x_range.end, r.y + view.frame.bbox.y, view.frame.bbox.height]; } }"""
+        )
+        left, width, start, end, self.top, self.high = found
+        return float(left + (time_s - start) / (end - start) * width)
+
+    def drag(self, from_s: float, to_s: float) -> None:
+        """Drag what stands at a time to another."""
+        mouse, begin, end = self.page.mouse, self.at(from_s), self.at(to_s)
+        height = self.top + 0.3 * self.high
+        mouse.move(begin, height)
+        mouse.down()
+        mouse.move((begin + end) / 2, height, steps=3)
+        mouse.move(end, height, steps=3)
+        mouse.up()
+
+
+@pytest.fixture
+def tab(served: Served) -> Iterator[Tab]:
+    """A fresh tab; nothing in it may go wrong."""
+    yield from opened(served)
+
+
+def opened(served: Served) -> Iterator[Tab]:
+    page = served.browser.new_page(viewport={"width": 1400, "height": 960})
+    page.set_default_timeout(PATIENCE_MS)
+    amiss: list[str] = []
+    page.on("console", lambda m: amiss.append(m.text) if m.type in {"error", "warning"} else None)
+    page.on("pageerror", lambda error: amiss.append(str(error)))
+    page.on("response", lambda r: amiss.append(f"{r.status} {r.url}") if r.status >= 400 else None)
+    page.on(
+        "request",
+        lambda r: None if r.url.startswith("http://127.0.0.1:") else amiss.append(r.url),
+    )
+    page.goto(served.told["url"])
+    found = Tab(page, amiss)
+    expect(found.chosen()).to_contain_text("1 of ")
+    yield found
+    page.close()
+    assert amiss == []
+
+
+def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> None:
+    assert served.told["trials"] == served.told["to_decide"] == TRIALS
+    doubtful = served.made.ids[DOUBTFUL]
+    expect(tab.page.get_by_text(f"{TRIALS} trials, {TRIALS} to decide")).to_be_visible()
+    expect(tab.chosen()).to_have_text(f"{NAME} / {doubtful} · 1 of {TRIALS}")
+    expect(tab.page.locator("li.doubt").first).to_contain_text("marker 3 could not be followed")
+    # only what is seen stands in the page, however long the list
+    assert 5 < tab.page.locator(".slick-row").count() < 60
+    tab.press("n")
+    expect(tab.chosen()).to_have_text(f"{NAME} / {served.made.ids[0]} · 2 of {TRIALS}")
+    tab.press("ArrowDown")
+    expect(tab.chosen()).to_have_text(f"{NAME} / {served.made.ids[1]} · 3 of {TRIALS}")
+    tab.press("p")
+    expect(tab.chosen()).to_have_text(f"{NAME} / {served.made.ids[0]} · 2 of {TRIALS}")
+    tab.page.locator(".doubtful-first input").uncheck()
+    expect(tab.chosen()).to_contain_text(served.made.ids[0])
+    tab.page.locator(".by-decision select").select_option("doubtful")
+    expect(tab.page.get_by_text("1 trials, 1 to decide")).to_be_visible()
+    tab.page.locator(".by-decision select").select_option("all")
+    tab.find(served.made.ids[-1])
+    expect(tab.row(served.made.ids[-1])).to_be_visible()
+    expect(tab.page.locator(".slick-row")).to_have_count(1)
+
+
+def test_the_frame_under_the_cursor_is_shown(tab: Tab) -> None:
+    tab.press("n")
+    expect(tab.heading()).to_contain_text("simulated")
+    caption = tab.page.get_by_text(re.compile(r"^frame \d+ at"))
+    for time_s, frame in ((0.1051, 10), (0.4951, 49)):
+        tab.page.mouse.move(tab.at(time_s), tab.top + 0.5 * tab.high)
+        expect(caption).to_have_text(f"frame {frame} at {0.005 + frame / 100:.3f} s")
+    tab.press("ArrowLeft")
+    expect(caption).to_have_text("frame 48 at 0.485 s")
+
+
+def test_a_dragged_onset_and_a_rejection_are_kept(served: Served, tab: Tab) -> None:
+    one, two = served.made.ids[10:12]
+    known = label()
+    tab.find("")
+    for trial in (one, two):
+        tab.find(trial)
+        tab.row(trial).click()
+        expect(tab.chosen()).to_contain_text(trial)
+        if trial == one:
+            tab.drag(known["incipient_ns"] / 1e9, 0.25)
+            moved = tab.page.locator("tr", has=tab.page.get_by_text("incipient", exact=True))
+            expect(moved.locator("td").nth(1)).to_have_text(re.compile(r"0\.2[45]\d\d s"))
+            told = moved.locator("td").nth(1).inner_text()
+            tab.press("s")
+            expect(tab.decision(trial)).to_have_text("adjusted")
+        else:
+            tab.page.get_by_role("button", name="Reject").click()
+            expect(tab.page.get_by_text("Not kept: a rejection needs a reason")).to_be_visible()
+            tab.press("r")
+            tab.page.keyboard.type("<img src=x onerror=\"document.title='taken'\">")
+            tab.page.get_by_role("button", name="Reject").click()
+            expect(tab.decision(trial)).to_have_text("rejected")
+    tab.page.reload()
+    expect(tab.chosen()).to_contain_text("1 of ")
+    for trial, state in ((one, "adjusted"), (two, "rejected")):
+        tab.find(trial)
+        expect(tab.decision(trial)).to_have_text(state)
+        tab.row(trial).click()
+        expect(tab.heading()).to_contain_text(f"{state} by anna")
+        history = tab.page.locator("table.past tr").nth(1)
+        if trial == one:
+            line = tab.page.locator("tr", has=tab.page.get_by_text("incipient", exact=True))
+            expect(line.locator("td").nth(1)).to_have_text(told)
+        else:
+            expect(history.locator("td").last).to_contain_text("<img src=x")
+    assert tab.page.title() == "SlipLab review"
+
+    made = review.last(served.made.store, NAME, one)
+    assert made is not None
+    assert (made.verdict, made.who, made.label) == ("adjust", "anna", served.made.keys[one])
+    assert (made.old.incipient_ns, made.old.gross_ns) == (known["incipient_ns"], known["gross_ns"])
+    assert made.new.incipient_ns == round(float(told.removesuffix(" s")) * 1e9)
+    assert made.new.gross_ns == known["gross_ns"]  # not moved: to the nanosecond
+    made = review.last(served.made.store, NAME, two)
+    assert made is not None
+    assert (made.verdict, made.new) == ("reject", review.Onsets())
+
+
+def test_two_reviewers_of_one_trial_do_not_undo_each_other(served: Served, tab: Tab) -> None:
+    trial = served.made.ids[20]
+    tab.find(trial)
+    tab.row(trial).click()
+    expect(tab.chosen()).to_contain_text(trial)
+    # another program, between this reviewer's look and this reviewer's key
+    known = label()
+    onsets = review.Onsets(known["incipient_ns"], known["gross_ns"])
+    review.decide(
+        served.made.store, NAME, trial, "reject", label=served.made.keys[trial], old=onsets,
+        new=review.Onsets(), seen=0, who="bert", why="blurred",
+    )  # fmt: skip
+    tab.press("a")
+    # either the page knew already, and this is a second decision, or it says so
+    expect(tab.page.locator("table.past")).to_contain_text("bert")
+    expect(tab.page.locator("table.past")).to_contain_text("blurred")
+    kept = review.history(served.made.store, NAME, trial)
+    assert (kept[0].verdict, kept[0].who) == ("reject", "bert")
+    assert all(item.number == place + 1 for place, item in enumerate(kept))
+
+
+def test_nobody_else_gets_in(served: Served) -> None:
+    parts = urlsplit(served.told["url"])
+    assert parts.hostname == "127.0.0.1"
+    assert len(parts.path) > 30
+    assert parts.port is not None
+    root = f"http://{parts.netloc}"
+    for path in ("/", "/review", parts.path[:-1]):
+        with pytest.raises(HTTPError) as error:
+            urlopen(root + path, timeout=10)
+        assert error.value.code == 404
+        error.value.close()
+    ask = (
+        f"GET {parts.path}/ws HTTP/1.1\r\nHost: {parts.netloc}\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nOrigin: http://evil.example\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: bokeh, x\r\n\r\n"
+    )
+    with socket.create_connection((parts.hostname, parts.port), timeout=10) as line:
+        line.sendall(ask.encode())
+        assert line.recv(100).decode().split()[1] == "403"
+    inside = socket.gethostbyname(socket.gethostname())
+    if not inside.startswith("127."):
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((inside, parts.port), timeout=5)

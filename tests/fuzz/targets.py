@@ -1,0 +1,291 @@
+"""What is damaged and who reads it: each target has files to begin with, and the real readers."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.conftest import ROOT
+
+SCHEDULE = b"""\
+schedule: 1
+rig: mock
+nights:
+  - {days: [mon, tue, wed, thu, fri], from: "19:00", to: "07:00"}
+weekends: {from: "sat 08:00", to: "mon 06:00"}
+deployments:
+  - {name: pilot, flow: collect, protocol: protocols/pilot.yaml, store: data/pilot, trials: 20}
+"""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of file.
+
+    Attributes:
+        kind: how it may be damaged (`tests.fuzz.mutate.mutate`).
+        seeds: whole files by name.
+        read: puts the damaged file where it belongs in a folder, and reads all of it.
+        weight: how often it is chosen.
+    """
+
+    name: str
+    kind: str
+    seeds: dict[str, bytes]
+    read: Callable[[Path, str, bytes], None]
+    weight: int = 1
+
+
+def _written(box: Path, name: str, data: bytes) -> Path:
+    path = box / name
+    path.write_bytes(data)
+    return path
+
+
+def read_protocol(box: Path, name: str, data: bytes) -> None:
+    """A protocol, expanded, with all that `sliplab plan` tells of it."""
+    from flows.plan_view import as_json
+    from protocols.plan import load_plan
+
+    plan = load_plan(_written(box, "protocol.yaml", data))
+    json.dumps(as_json(plan, None, None), allow_nan=False)
+    plan.warnings()
+
+
+def read_rig(box: Path, name: str, data: bytes) -> None:
+    """A rig file, with what it extends."""
+    from rigs.rig_file import load_rig_file, same_rig
+
+    for other in (ROOT / "rigs").glob("*.yaml"):
+        if not (box / other.name).exists():
+            shutil.copy(other, box / other.name)
+    rig, text = load_rig_file(_written(box, "rig-under-test.yaml", data))
+    rig.skin.layout_mm()
+    same_rig(text, text + "\n")
+
+
+def read_yaml(box: Path, name: str, data: bytes) -> None:
+    """Any other YAML: at the least the loader stands."""
+    from protocols.yaml_file import parse_yaml, read_text
+
+    path = _written(box, "schedule.yaml", data)
+    parse_yaml(read_text(path, "schedule"), path)
+
+
+def read_store(box: Path, name: str, data: bytes) -> None:
+    """A store with one damaged file, through everything that looks into stores.
+
+    Half of the files get a checksum that fits, so that what is behind the checksums meets them.
+    """
+    from storage.whole import sha256
+
+    store = box / "store"
+    if not store.exists():
+        shutil.copytree(box.parent / "small-store", store)
+    path = store / name
+    kept = path.read_bytes()
+    sums = path.parent / "checksums.json"
+    kept_sums = sums.read_bytes() if sums.exists() else None
+    path.write_bytes(data)
+    try:
+        if kept_sums is not None and len(data) % 2 and path.name != "checksums.json":
+            said = json.loads(kept_sums)
+            if path.name in said:
+                said[path.name] = {"sha256": sha256(path), "bytes": len(data)}
+                sums.write_text(json.dumps(said))
+        look_through(store, with_trials="/trials/" in name)
+    finally:
+        path.write_bytes(kept)
+        if kept_sums is not None:
+            sums.write_bytes(kept_sums)
+
+
+def look_through(folder: Path, with_trials: bool = True) -> None:
+    """Everything that reads a store without devices; one fault does not hide the others."""
+    from protocols.errors import InputError
+    from storage.catalogue import catalogue
+    from storage.control import open_requests, paused
+    from storage.decisions import skipped
+    from storage.errors import StoreError
+    from storage.store import Store
+    from storage.verify import verify
+
+    store = Store.open(folder)
+    if with_trials:
+        json.dumps([vars(item) for item in verify(store)], allow_nan=False)
+        json.loads(catalogue(store, []).to_json(orient="records"))
+    open_requests(store)
+    paused(store)
+    found: StoreError | InputError | None = None
+    for campaign in store.campaigns():
+        looks: list[Callable[[], Any]] = [
+            lambda campaign=campaign: campaign.info,
+            lambda campaign=campaign: skipped(campaign),
+            campaign.quarantined,
+            campaign.failed_attempts,
+            campaign.attempts,
+            campaign.damaged,
+        ]
+        looks += [
+            lambda recording=recording: read_recording(recording)
+            for recording in (campaign.recordings() if with_trials else ())
+        ]
+        for look in looks:
+            try:
+                look()
+            except (StoreError, InputError) as error:
+                found = error
+    if found is not None:
+        raise found
+
+
+def read_recording(recording: Any) -> None:
+    """All streams of a trial, and its clocks."""
+    json.dumps(recording.record)
+    if "events" in recording.clocks:
+        recording.clock("events")
+    _ = recording.motion_phase, recording.simulated, recording.frame_source
+    recording.simulation_truth()
+    recording.checksum  # noqa: B018
+    with recording.open() as reader:
+        reader.events()
+        reader.events(0, 10_000_000)
+        reader.poses()
+        reader.counts()
+    recording.frame_times()
+
+
+def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
+    """A pickle of the lab's kind."""
+    from storage.exchange.pickles import parse_pickle
+
+    parse_pickle(data, name)
+
+
+def read_foreign(box: Path, name: str, data: bytes) -> None:
+    """A file of another program, found by its name and read to its end."""
+    from protocols.errors import InputError
+    from storage.exchange.find import kind_of, trials_in
+    from storage.exchange.foreign import Wrong
+
+    folder = box / "foreign"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    if name.endswith(".json"):
+        (folder / "t.aedat4").write_bytes((box.parent / "t.aedat4").read_bytes())
+    path = _written(folder, name, data)
+    where = folder if name.endswith(".json") else path
+    try:
+        for trial in trials_in(where, kind_of(where)):
+            sum(len(chunk) for chunk in trial.events())
+            sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
+            json.dumps([trial.about, trial.condition], allow_nan=False)
+    except Wrong as error:
+        raise InputError(path, "", None, str(error)) from None
+
+
+def make_foreign(folder: Path) -> dict[str, bytes]:
+    """One small file of each kind, by name."""
+    from storage.exchange.hand_out import hand_out
+    from storage.store import Store
+    from tests.storage.exchange.files import lab_hdf5
+
+    recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
+    lab_hdf5(folder / "lab.h5")
+    found = {"lab.h5": (folder / "lab.h5").read_bytes()}
+    for kind in ("dsec", "aedat4"):  # whose manifest stays
+        out = folder / f"box-made-{kind}"
+        hand_out([recording], out, kind, "c")
+        for path in out.iterdir():
+            plain = {".json": "sliplab-export.json"}.get(path.suffix, f"t{path.suffix}")
+            data = path.read_bytes()
+            found[plain] = data.replace(b"a,r=1.aedat4", b"t.aedat4")
+    (folder / "t.aedat4").write_bytes(found["t.aedat4"])
+    return found
+
+
+def pickle_seeds() -> dict[str, bytes]:
+    """Small ones in all protocols."""
+    lists = np.empty((4, 3), object)
+    for index in np.ndindex(4, 3):
+        lists[index] = [float(i) + 0.25 for i in range(sum(index))]
+    values = {
+        "lists": lists,
+        "times": [1700000000.25 + i for i in range(20)],
+        "array": np.arange(20.0).reshape(4, 5),
+        "mixed": {"a": [1, 2.5, "x", None, True], "b": (1, (2, 3)), "c": np.float32(2), "d": b"x"},
+    }  # fmt: skip
+    return {
+        f"{name}-{protocol}": pickle.dumps(value, protocol)
+        for name, value in values.items()
+        for protocol in range(pickle.HIGHEST_PROTOCOL + 1)
+    }
+
+
+def make_small_store(folder: Path) -> None:
+    """A store with a bit of everything that may stand in one."""
+    from storage import control, decisions
+    from tests.storage.trials import campaign, commit
+
+    made = campaign(folder)
+    protocol = "protocol: 1\ncollection: {factors: {depth: {unit: mm, values: [2.4, 2.8]}}}\n"
+    made.update({"name": "c", "simulated": True}, protocol, "rig: 1\ndevices: [a, b]\n")
+    steps = [{"index": 0, "phase": "slide", "start_ns": 10, "end_ns": 500}]
+    commit(made, "a,r=1", steps=steps)
+    by = {"who": "somebody", "when": "2026-01-01T00:00:00Z", "why": "because"}
+    decisions.skip(made, ["c,r=1"], by)
+    made.quarantine(commit(made, "d,r=1"), "gate sync_uncertainty")
+    made.add_bench_record({"operator": "somebody", "temperature": 21.5})
+    store_of = made.folder.parents[1]
+    from storage.store import Store
+
+    opened = Store.open(store_of)
+    control.answer(opened, control.ask(opened, "pause", who="a"), {"did": "paused"})
+    control.ask(opened, "again", who="a", campaign="c", trials=("a,r=1",))
+
+
+def targets(small_store: Path, foreign: dict[str, bytes]) -> list[Target]:
+    """All of them; `small_store` and `foreign` were made by the functions above."""
+    manifest = {name: data for name, data in foreign.items() if name.endswith(".json")}
+    files = {
+        path.relative_to(small_store).as_posix(): path.read_bytes()
+        for path in sorted(small_store.rglob("*"))
+        if path.suffix in {".json", ".yaml"}
+    }
+    small = sorted((ROOT / "protocols").glob("pilot*.yaml"))
+    rigs = sorted((ROOT / "rigs").glob("*.yaml"))
+    return [
+        Target("protocol", "yaml", {p.name: p.read_bytes() for p in small}, read_protocol, 4),
+        Target("rig", "yaml", {p.name: p.read_bytes() for p in rigs}, read_rig, 3),
+        Target("schedule", "yaml", {"schedule.yaml": SCHEDULE}, read_yaml, 1),
+        Target(
+            "record",
+            "json",
+            {name: data for name, data in files.items() if name.endswith(".json")},
+            read_store,
+            4,
+        ),
+        Target(
+            "campaign yaml",
+            "yaml",
+            {name: data for name, data in files.items() if name.endswith(".yaml")},
+            read_store,
+            1,
+        ),
+        Target("manifest", "json", manifest, read_foreign, 1),
+        Target(
+            "foreign",
+            "bytes",
+            {name: data for name, data in foreign.items() if name not in manifest},
+            read_foreign,
+            6,
+        ),
+        Target("pickle", "bytes", pickle_seeds(), read_foreign_pickle, 8),
+    ]

@@ -1,0 +1,20 @@
+"""A short `python -m tests.fuzz`, in processes of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+from tests.conftest import ROOT
+
+
+def test_a_short_fuzz_test() -> None:
+    command = [sys.executable, "-m", "tests.fuzz", "--files", "1500", "--seed", "3", "--jobs", "1"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+    )
+    found = json.loads(done.stdout)
+    assert found["wrong"] == []
+    assert done.returncode == 0
+    assert sum(sum(counts.values()) for counts in found["outcomes"].values()) == 1500

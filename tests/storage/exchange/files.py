@@ -1,0 +1,36 @@
+"""Small files as other programs write them, with known content."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from storage.streams import EventChunk
+
+
+def lab_hdf5(path: Path) -> EventChunk:
+    """The lab's layout: float seconds, polarities as -1 and 1; returns what is in it."""
+    rng = np.random.default_rng(3)
+    t_us = np.sort(rng.integers(0, 2_000_000, 50)).astype(np.int64)
+    x, y, p = rng.integers(0, 640, 50), rng.integers(0, 480, 50), rng.integers(0, 2, 50)
+    with h5py.File(path, "w") as file:
+        file["events/ts"], file["events/xs"] = t_us / 1e6, x
+        file["events/ys"], file["events/ps"] = y, 2 * p - 1
+    return EventChunk(x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8), t_us)
+
+
+def lab_pickles(folder: Path, stem: str, size: tuple[int, int], *, by_columns: bool) -> None:
+    """Two pickles of columns x rows with some times, ms, in some pixels."""
+    width, height = size
+    for polarity, places in (
+        ("on", {(3, 5): [10.0, 12.5], (width - 1, height - 1): [11]}),
+        ("off", {(3, 5): [11.25], (0, 0): [0.125]}),
+    ):
+        cells = np.frompyfunc(lambda _: [], 1, 1)(np.zeros((width, height)))
+        for (x, y), times in places.items():
+            cells[x, y] = times
+        cells = cells if by_columns else np.ascontiguousarray(cells.T)
+        (folder / f"{stem}_events_{polarity}.pickle").write_bytes(pickle.dumps(cells))
