@@ -19,8 +19,6 @@ from scipy.spatial import cKDTree
 Frame = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
-MIN_CONTRAST = 40.0
-
 
 @dataclass(frozen=True)
 class Blobs:
@@ -67,7 +65,7 @@ def find_blobs(
     frame = checked_frame(frame)
     level = otsu_threshold(frame) if threshold is None else threshold
     binary = cv2.threshold(frame, level, 1, cv2.THRESH_BINARY)[1]
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(binary, connectivity=4, ltype=cv2.CV_16U)
     found: list[tuple[float, float, float, float]] = []
     for label in range(1, len(stats)):
         left, top, width, height, area = (int(v) for v in stats[label])

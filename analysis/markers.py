@@ -1,46 +1,74 @@
-"""The white papilla tops in the outside video: one track each, to a few hundredths of a pixel.
+"""The white papilla tops in the outside video: one track each, to a few thousandths of a pixel.
 
-The paper thresholds every frame and finds its blobs; at 100 frames a second over hours of video
-that is the slowest step of the labelling, and the blobs have no names. Here the first frame is
-searched so, the blobs get their names from the skin's layout, and from then on each marker is
-followed inside a small disc around where it must be. A marker that cannot be measured well is lost,
-not guessed: half-hidden discs shift by more than the 2 pixels that count as slip.
+The paper thresholds every frame and finds its blobs (`analysis.reference_tracks`); at 100 frames a
+second over hours of video that is the slowest step of the labelling, and the blobs have no names.
+Here the first frame is searched so, the blobs get their names from the skin's layout, and from then
+on each marker is followed inside a small box around where it must be. Each place comes with its
+standard deviation and a quality. A marker that cannot be measured well is lost, not guessed:
+half-hidden discs shift by more than the 2 pixels that count as slip.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
-import numba
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from analysis.blobs import (
-    MIN_CONTRAST,
-    Floats,
-    Frame,
-    checked_frame,
-    find_blobs,
-    match_layout,
+from analysis.blobs import Blobs, Floats, Frame, checked_frame, find_blobs, match_layout
+from analysis.marker_kernels import (
+    AREA,
+    BRIGHT,
+    DARK,
+    LEAST_CONTRAST,
+    LOST,
+    QUALITY,
+    SIGMA,
+    WHOLE,
+    follow,
 )
 
-_LOST, _WHOLE, _PARTIAL = 0, 1, 2
+AREA_TOLERANCE = 0.06
+"""A marker whose area differs by more than this share from what it was is lost."""
+_COARSE_PX = 50.0
+"""With markers so far apart the first search looks at every other pixel."""
+_EAGER_FRAMES = 20
+_PATIENT_EVERY = 4
+"""A marker lost for more than 20 frames is looked for in every fourth."""
 
 
-@dataclass(frozen=True)
-class MarkerTracks:
-    """One track a marker.
+class Measured(NamedTuple):
+    """The markers in one frame.
 
     Attributes:
-        xy: (n, m, 2) float64, pixels, NaN where the marker was lost or partly out of the frame.
-        ok: (n, m) bool, False where it is NaN.
+        xy: (m, 2) float64 pixels, NaN where lost or cut by the picture's edge.
+        ok: (m,) bool, False where it is NaN.
+        sigma: (m,) float64, standard deviation of a coordinate, px; NaN where not ok.
+        quality: (m,) float64, 0 (lost) to 1 (as whole, as white and as evenly lit as it can be).
     """
 
     xy: Floats
     ok: NDArray[np.bool_]
+    sigma: Floats
+    quality: Floats
+
+
+@dataclass(frozen=True)
+class MarkerTracks:
+    """One track a marker: the columns of `Measured` over n frames."""
+
+    xy: Floats
+    """(n, m, 2)."""
+    ok: NDArray[np.bool_]
+    """(n, m)."""
+    sigma: Floats
+    """(n, m)."""
+    quality: Floats
+    """(n, m)."""
 
 
 class MarkerTracker:
@@ -48,17 +76,21 @@ class MarkerTracker:
 
     Args:
         layout_px: (m, 2) nominal marker positions in pixels, relative to the centre marker.
-        threshold: grey level that parts marker and background; by default taken from the first
-            frame, a quarter of the way up.
+        threshold: grey level that parts marker and background where blobs are looked for; Otsu's
+            by default.
         area_tolerance: a marker whose area differs by more than this share from its area in the
-            first frame is lost (hidden, blurred, or merged with something bright).
+            frames before is lost (hidden, or merged with something bright).
 
     Raises:
         ValueError: the layout is not (m, 2), or two of its markers coincide.
     """
 
     def __init__(
-        self, layout_px: Floats, *, threshold: int | None = None, area_tolerance: float = 0.15
+        self,
+        layout_px: Floats,
+        *,
+        threshold: int | None = None,
+        area_tolerance: float = AREA_TOLERANCE,
     ) -> None:
         layout = np.array(layout_px, np.float64)
         if layout.ndim != 2 or layout.shape[1] != 2 or len(layout) == 0:
@@ -66,93 +98,132 @@ class MarkerTracker:
         self._spacing = float(pdist(layout).min()) if len(layout) > 1 else 100.0
         if not self._spacing > 8:
             raise ValueError(f"layout_px has markers {self._spacing:.1f} px apart: too near")
-        self._layout = layout
-        self._fixed_threshold = threshold
-        self._tolerance = area_tolerance
+        self._layout, self._threshold, self._tolerance = layout, threshold, area_tolerance
         m = len(layout)
-        self._found = False
-        self._threshold = 0
+        self._everywhere = np.ones(m, np.bool_)
+        self._everywhere.flags.writeable = False
+        self._whole = 0
+        self._all_followed = False
         self._xy = np.full((m, 2), np.nan)
         self._velocity = np.zeros((m, 2))
         self._area = np.zeros(m)
-        self._state = np.zeros(m, np.int64)
-        self._radius = 0.0
-        self._margin = 0.0
+        self._state = np.full(m, LOST, np.int64)
+        self._measured = np.zeros((m, 5))
+        self._missed = np.zeros(m, np.int64)
+        self._radius = self._margin = 0.0
 
     @property
     def radius_px(self) -> float:
         """The markers' median radius; 0 before they were found."""
         return self._radius
 
-    def update(self, frame: Frame) -> tuple[Floats, NDArray[np.bool_]]:
+    def update(self, frame: Frame) -> Measured:
         """The markers in the next frame.
-
-        Returns:
-            (m, 2) float64 pixels, NaN where lost, and (m,) bool.
 
         Raises:
             TypeError: the frame is not 2-D uint8.
         """
         frame = checked_frame(frame)
-        if not self._found:
+        if self._radius == 0.0:
             self._find(frame)
         else:
             self._follow(frame)
-        ok = self._state == _WHOLE
-        return np.where(ok[:, None], self._xy, np.nan), ok
+        if self._whole == len(self._xy):
+            found = self._measured.copy()
+            return Measured(self._xy.copy(), self._everywhere, found[:, SIGMA], found[:, QUALITY])
+        ok = self._state == WHOLE
+        return Measured(
+            np.where(ok[:, None], self._xy, np.nan),
+            ok,
+            np.where(ok, self._measured[:, SIGMA], np.nan),
+            np.where(ok, self._measured[:, QUALITY], 0.0),
+        )
 
     def _find(self, frame: Frame) -> None:
         """Search the whole frame; the layout names the blobs."""
-        level = self._fixed_threshold
-        # the papillae's radius is 2.0 mm at a spacing of 5.6 mm: 0.36 of it
-        limits = (np.pi * (0.15 * self._spacing) ** 2, np.pi * (0.5 * self._spacing) ** 2)
-        blobs = find_blobs(frame, level, *limits)
-        shift, index = match_layout(blobs.xy, self._layout, 0.35 * self._spacing)
+        coarse = self._spacing >= _COARSE_PX and min(frame.shape) > 64
+        blobs, shift, index = self._search(frame, 2 if coarse else 1)
+        if coarse and (index < 0).any():
+            blobs, shift, index = self._search(frame, 1)
         seen = index >= 0
         if seen.sum() * 2 < len(index):
             return
         centres = np.round(blobs.xy[index[seen]]).astype(np.int64)
         bright = float(np.median(frame[centres[:, 1], centres[:, 0]]))
-        dark = float(np.median(frame))
-        if bright - dark < MIN_CONTRAST:
+        dark = float(np.median(frame[::8, ::8]))
+        if bright - dark < LEAST_CONTRAST:
             return
-        # low on the flank: cutting at half the height bends the edges' weight by 0.015 px
-        self._threshold = round(dark + (bright - dark) / 4) if level is None else level
         area = float(np.median(blobs.area[index[seen]]))
         self._radius = float(np.sqrt(area / np.pi))
         self._margin = max(3.0, 0.12 * self._radius)
         self._xy = np.where(seen[:, None], blobs.xy[index], self._layout + shift)
-        self._area = np.full(len(index), area)
-        self._state[:] = np.where(seen, _WHOLE, _LOST)
-        self._found = True
+        self._area[:] = area
+        self._measured[:, DARK], self._measured[:, BRIGHT] = dark, bright
+        self._state[:] = np.where(seen, WHOLE, LOST)
         # measured as in every later frame, so that the first is no step
-        self._measure(frame, self._xy.copy(), np.inf)
-        whole = self._state == _WHOLE
-        self._area[whole] = self._measured[whole]
-        self._velocity[:] = 0.0
+        self._look(frame, seen, 0.5)
+        whole = self._state == WHOLE
+        usual = float(np.median(self._measured[whole, AREA])) if whole.any() else area
+        self._area = np.where(whole, self._measured[:, AREA], usual)
+        self._look(frame, seen, self._tolerance)
+
+    def _search(self, frame: Frame, shrink: int) -> tuple[Blobs, Floats, NDArray[np.int64]]:
+        """Blobs of the frame, the layout's shift, and which blob each marker is.
+
+        Places to half a pixel do: they are measured afterwards.
+        """
+        part = frame
+        if shrink > 1:
+            size = frame.shape[1] // shrink, frame.shape[0] // shrink
+            cut = frame[: size[1] * shrink, : size[0] * shrink]
+            part = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+        # the papillae's radius is 2.0 mm at a spacing of 5.6 mm: 0.36 of it
+        apart = self._spacing / shrink
+        limits = (np.pi * (0.15 * apart) ** 2, np.pi * (0.5 * apart) ** 2)
+        small = find_blobs(part, self._threshold, *limits)
+        places = small.xy * shrink + (shrink - 1) / 2
+        blobs = Blobs(places, small.area * shrink**2, small.roundness)
+        shift, index = match_layout(blobs.xy, self._layout, 0.35 * self._spacing)
+        return blobs, shift, index
 
     def _follow(self, frame: Frame) -> None:
         before = self._xy.copy()
-        known = self._state != _LOST
-        self._measure(frame, self._xy + self._velocity, self._tolerance)
-        seen = self._state != _LOST
-        if (self._state == _WHOLE).sum() * 2 < len(seen) and self._find_again(frame):
+        known = None if self._all_followed else self._state != LOST
+        self._xy += self._velocity
+        self._all_followed = not self._look(frame, self._everywhere, self._tolerance)
+        if self._all_followed:
+            if known is None:
+                np.subtract(self._xy, before, out=self._velocity)
+            else:
+                self._velocity[:] = self._common(before, known)
+                self._missed[:] = 0
             return
+        known = self._everywhere if known is None else known
+        if (self._state == WHOLE).sum() * 2 < len(known) and self._find_again(frame):
+            return
+        seen = self._state != LOST
         both = known & seen
-        steps = self._xy - before
-        common = np.median(steps[both], axis=0) if both.any() else np.zeros(2)
-        for i in np.flatnonzero(~seen):
-            self._xy[i] = before[i] + common
+        common = self._common(before, both)
+        self._xy[~seen] = before[~seen] + common
+        self._missed = np.where(seen, 0, self._missed + 1)
+        late = self._missed > _EAGER_FRAMES
+        for i in np.flatnonzero(~seen & ~(late & (self._missed % _PATIENT_EVERY > 0))):
             self._recover(frame, int(i))
-        self._velocity = np.where(both[:, None], steps, common)
+        self._velocity = np.where(both[:, None], self._xy - before, common)
 
-    def _measure(self, frame: Frame, predicted: Floats, tolerance: float) -> None:
-        self._measured = np.zeros(len(predicted))
-        _follow_all(
-            frame, predicted, self._radius, self._margin, self._threshold, self._area, tolerance,
+    def _common(self, before: Floats, of: NDArray[np.bool_]) -> Floats:
+        """The step that most markers took."""
+        if not of.any():
+            return np.zeros(2)
+        result: Floats = np.median((self._xy - before)[of], axis=0)
+        return result
+
+    def _look(self, frame: Frame, wanted: NDArray[np.bool_], tolerance: float) -> int:
+        lost, self._whole = follow(
+            frame, self._xy, wanted, self._radius, self._margin, self._area, tolerance,
             self._state, self._measured,
         )  # fmt: skip
-        self._xy = predicted
+        return int(lost)
 
     def _recover(self, frame: Frame, i: int) -> None:
         """Look for a lost marker around where the others' motion has carried it."""
@@ -163,35 +234,36 @@ class MarkerTracker:
         if part.shape[0] < 8 or part.shape[1] < 8:
             return
         area = self._area[i]
-        blobs = find_blobs(
-            part, self._threshold, area * (1 - self._tolerance), area * (1 + self._tolerance)
-        )
+        blobs = find_blobs(part, self._threshold, 0.85 * area, 1.15 * area)
         places = blobs.xy + np.array([left, top])
-        taken = self._xy[self._state != _LOST]
+        taken = self._xy[self._state != LOST]
         if len(taken):
             apart = np.hypot(*np.moveaxis(places[:, None] - taken[None], -1, 0))
             places = places[(apart > self._radius).all(axis=1)]
         distance = np.hypot(*(places - self._xy[i]).T)
         # less than half the way to a neighbour's place: it cannot be the neighbour
         if len(distance) and distance.min() < 0.45 * self._spacing:
+            expected = self._xy[i].copy()
             self._xy[i] = places[int(distance.argmin())]
-            inside = _inside(self._xy[i], frame.shape, self._radius)
-            self._state[i] = _WHOLE if inside else _PARTIAL
+            only = np.zeros(len(self._xy), np.bool_)
+            only[i] = True
+            if self._look(frame, only, self._tolerance):
+                self._xy[i] = expected
 
     def _find_again(self, frame: Frame) -> bool:
         """Most are lost (the camera was covered, the sensor jumped): search the whole frame."""
         area = float(np.median(self._area))
-        limits = (area * (1 - self._tolerance), area * (1 + self._tolerance))
-        blobs = find_blobs(frame, self._threshold, *limits)
+        blobs = find_blobs(frame, self._threshold, 0.85 * area, 1.15 * area)
         _, index = match_layout(blobs.xy, self._xy, 0.35 * self._spacing)
         seen = index >= 0
         if seen.sum() * 4 < 3 * len(seen):
             return False
         shift = np.median(blobs.xy[index[seen]] - self._xy[seen], axis=0)
-        self._measure(
-            frame, np.where(seen[:, None], blobs.xy[index], self._xy + shift), self._tolerance
-        )
+        self._xy = np.where(seen[:, None], blobs.xy[index], self._xy + shift)
+        self._state[:] = np.where(seen, WHOLE, LOST)
+        self._look(frame, self._everywhere, self._tolerance)
         self._velocity[:] = 0.0
+        self._missed[:] = 0
         return True
 
 
@@ -203,126 +275,14 @@ def track(
     Frames before the markers are first found are NaN.
     """
     tracker = MarkerTracker(layout_px, threshold=threshold)
-    rows = [tracker.update(frame) for frame in frames]
-    return stack_tracks(rows, len(layout_px))
+    return stack_tracks([tracker.update(frame) for frame in frames], len(layout_px))
 
 
-def stack_tracks(rows: list[tuple[Floats, NDArray[np.bool_]]], markers: int) -> MarkerTracks:
+def stack_tracks(rows: list[Measured], markers: int) -> MarkerTracks:
     """The results of `MarkerTracker.update` as one `MarkerTracks`."""
     if not rows:
-        return MarkerTracks(np.empty((0, markers, 2)), np.empty((0, markers), np.bool_))
-    return MarkerTracks(np.stack([xy for xy, _ in rows]), np.stack([ok for _, ok in rows]))
-
-
-def _inside(xy: Floats, shape: tuple[int, ...], radius: float) -> bool:
-    reach = radius + 1
-    return bool(reach <= xy[0] <= shape[1] - 1 - reach and reach <= xy[1] <= shape[0] - 1 - reach)
-
-
-@numba.njit(cache=True, nogil=True)
-def _disc_sums(frame: Any, cx: int, cy: int, halves: Any, cuts: Any, threshold: int) -> Any:
-    """Pixel count, weight and weighted sums of x and y above the threshold in a disc.
-
-    A cut (x0, y0, dx, dy) takes away what lies beyond (x0, y0) in the direction (dx, dy).
-    """
-    height, width = frame.shape
-    reach = halves.size - 1
-    count, total, sum_x, sum_y = 0, 0, 0, 0
-    for i in range(max(0, cy - reach), min(height, cy + reach + 1)):
-        half = halves[abs(i - cy)]
-        left, right = max(0, cx - half), min(width, cx + half + 1)
-        for x0, y0, dx, dy in cuts:
-            beyond = (i - y0) * dy
-            if abs(dx) < 1e-9:
-                right = left if beyond > 0 else right
-            elif dx > 0:
-                right = min(right, int(np.floor(x0 - beyond / dx)) + 1)
-            else:
-                left = max(left, int(np.ceil(x0 - beyond / dx)))
-        row = frame[i, left : max(left, right)]
-        row_n, row_w, row_x = 0, 0, 0
-        for j in range(row.size):
-            excess = row[j] - threshold
-            w = excess if excess > 0 else 0
-            row_w += w
-            row_x += w * j
-            row_n += w > 0
-        count += row_n
-        total += row_w
-        sum_x += row_x + row_w * left
-        sum_y += row_w * i
-    return count, total, sum_x, sum_y
-
-
-@numba.njit(cache=True, nogil=True)
-def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cuts: Any) -> Any:
-    """The lines half-way to those neighbours of marker k that may look into its disc."""
-    n = 0
-    for other in range(xy.shape[0]):
-        dx, dy = xy[other, 0] - x, xy[other, 1] - y
-        apart = np.hypot(dx, dy)
-        if other != k and known[other] and reach < apart < 2 * reach:
-            cuts[n] = (x + dx / 2, y + dy / 2, dx / apart, dy / apart)
-            n += 1
-    return cuts[:n]
-
-
-@numba.njit(cache=True, nogil=True)
-def _verdict(
-    x: float, y: float, count: int, radius: float, width: int, height: int, area: float,
-    tolerance: float,
-) -> int:  # fmt: skip
-    inside = radius + 1 <= x <= width - 2 - radius and radius + 1 <= y <= height - 2 - radius
-    if not inside:
-        return _PARTIAL
-    return _WHOLE if abs(count - area) <= tolerance * area else _LOST
-
-
-@numba.njit(cache=True, nogil=True)
-def _follow_all(
-    frame: Any, xy: Any, radius: float, margin: float, threshold: int, area: Any, tolerance: float,
-    state: Any, measured: Any,
-) -> None:  # fmt: skip
-    """Move every marker of `xy` from its prediction to its centroid, and say how it fared."""
-    height, width = frame.shape
-    reach = int(np.ceil(radius + margin))
-    halves = np.empty(reach + 1, np.int64)
-    for i in range(reach + 1):
-        halves[i] = int(np.sqrt(max(0.0, (radius + margin) ** 2 - i * i)))
-    predicted = xy.copy()
-    known = state != _LOST
-    cuts = np.empty((xy.shape[0], 4))
-    # again when something moved far: the cuts stood where the neighbours no longer are
-    for _ in range(3):
-        farthest = 0.0
-        for k in range(xy.shape[0]):
-            x, y = xy[k, 0], xy[k, 1]
-            state[k] = _LOST
-            # the disc is moved on until the whole marker lies inside it
-            for _ in range(8):
-                if not (-reach < x < width + reach and -reach < y < height + reach):
-                    break
-                cx, cy = int(np.round(x)), int(np.round(y))
-                near = _near_cuts(xy, k, x, y, known, radius + margin, cuts)
-                count, total, sum_x, sum_y = _disc_sums(frame, cx, cy, halves, near, threshold)
-                if count < 0.3 * area[k]:
-                    break
-                x, y = sum_x / total, sum_y / total
-                if (x - cx) ** 2 + (y - cy) ** 2 <= (margin - 1) ** 2:
-                    state[k] = _verdict(x, y, count, radius, width, height, area[k], tolerance)
-                    measured[k] = count
-                    break
-            if state[k] != _LOST:
-                farthest = max(farthest, np.hypot(x - xy[k, 0], y - xy[k, 1]))
-                xy[k, 0], xy[k, 1] = x, y
-        if farthest < 1.5:
-            break
-    # two on one blob: it belongs to the one that had less far to go
-    for a in range(xy.shape[0]):
-        for b in range(a):
-            if state[a] != _LOST and state[b] != _LOST:
-                apart = (xy[a, 0] - xy[b, 0]) ** 2 + (xy[a, 1] - xy[b, 1]) ** 2
-                if apart < radius * radius:
-                    way_a = np.hypot(xy[a, 0] - predicted[a, 0], xy[a, 1] - predicted[a, 1])
-                    way_b = np.hypot(xy[b, 0] - predicted[b, 0], xy[b, 1] - predicted[b, 1])
-                    state[a if way_a > way_b else b] = _LOST
+        nothing = np.empty((0, markers))
+        return MarkerTracks(
+            np.empty((0, markers, 2)), np.empty((0, markers), np.bool_), nothing, nothing.copy()
+        )
+    return MarkerTracks(*(np.stack(column) for column in zip(*rows, strict=True)))

@@ -37,12 +37,12 @@ class Onsets:
     per_marker_ns: NDArray[np.int64]
 
 
-def displacements(
+def offsets(
     xy: NDArray[np.float64],
     reference_frames: slice | NDArray[np.bool_],
     plate_xy: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """How far each marker is from its reference position, pixels.
+    """How far each marker is from its reference position, as vectors, pixels.
 
     The reference position is the mean over the reference frames in which the marker was seen. With
     a plate both are taken relative to the plate's own marker, so that what remains is the motion of
@@ -54,8 +54,8 @@ def displacements(
         plate_xy: (n, 2) position of the plate's marker, pixels, NaN where it is unknown.
 
     Returns:
-        (n, m) float64, NaN where the marker or the plate is unknown in that frame, or in all of the
-        reference frames.
+        (n, m, 2) float64, NaN where the marker or the plate is unknown in that frame, or in all of
+        the reference frames.
 
     Raises:
         ValueError: shapes that do not fit, or no reference frame.
@@ -80,7 +80,16 @@ def displacements(
     total = np.where(seen[:, :, None], reference - first, 0.0).sum(axis=0)
     at_rest = first + total / np.maximum(count, 1)[:, None]
     at_rest[count == 0] = np.nan
-    moved = xy - at_rest
+    return xy - at_rest
+
+
+def displacements(
+    xy: NDArray[np.float64],
+    reference_frames: slice | NDArray[np.bool_],
+    plate_xy: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Lengths of `offsets`, (n, m), with the same arguments and errors."""
+    moved = offsets(xy, reference_frames, plate_xy)
     return np.hypot(moved[:, :, 0], moved[:, :, 1])
 
 
@@ -131,72 +140,3 @@ def paper_onsets(
         first_marker=int(in_first.argmax()),
         per_marker_ns=np.where(slipped, frame_ns[frame], NO_ONSET).astype(np.int64),
     )
-
-
-MAX_UNSEEN_NS = 30_000_000
-"""A marker may be out of sight for this long without making its onset unknown: one window."""
-
-
-@dataclass(frozen=True)
-class Doubts:
-    """Why an onset of a trial is not known, in words; None where it is.
-
-    Attributes:
-        incipient: a marker was out of sight when it may have slipped first.
-        gross: the centre marker was out of sight when it may have slipped.
-    """
-
-    incipient: str | None
-    gross: str | None
-
-
-def doubts(
-    frame_ns: NDArray[np.int64],
-    displacement: NDArray[np.float64],
-    centre: int,
-    settings: Labelling,
-    not_before_ns: int,
-) -> Doubts:
-    """Whether markers that were hidden, torn off or never seen could have changed the onsets.
-
-    A marker that is out of sight and comes back where it was has not slipped; one that comes back
-    displaced, or not at all, slipped at some time in between. An onset is in doubt when such a
-    time begins more than `MAX_UNSEEN_NS` before the onset that the seen markers give.
-
-    Args:
-        frame_ns, displacement, centre, settings: as for `paper_onsets`, with the same errors.
-        not_before_ns: start of the motion; a marker never seen at rest is unseen from here on.
-    """
-    onsets = paper_onsets(frame_ns, displacement, centre, settings, not_before_ns)
-    if not len(frame_ns):
-        return Doubts(None, None)
-    last_ns = int(frame_ns[-1])
-    incipient = last_ns if onsets.incipient_ns is None else onsets.incipient_ns
-    found: list[tuple[int, int]] = []
-    gross = None
-    for marker in range(displacement.shape[1]):
-        slipped = int(onsets.per_marker_ns[marker])
-        until = last_ns if slipped == NO_ONSET else slipped
-        at_rest = np.isfinite(displacement[:, marker])
-        if slipped != NO_ONSET:
-            at_rest &= frame_ns < slipped
-        seen = max(int(frame_ns[at_rest][-1]), not_before_ns) if at_rest.any() else not_before_ns
-        if marker == centre and until - seen > MAX_UNSEEN_NS:
-            gross = (
-                f"the centre marker could not be followed from {_s(seen - not_before_ns)} "
-                f"to {_s(until - not_before_ns)} after the motion began"
-            )
-        if min(until, incipient) - seen > MAX_UNSEEN_NS:
-            found.append((seen, marker))
-    if not found:
-        return Doubts(None, gross)
-    seen, marker = min(found)
-    reason = (
-        f"marker {marker} could not be followed from {_s(seen - not_before_ns)} after the motion "
-        "began, and may have slipped first"
-    )
-    return Doubts(reason, gross)
-
-
-def _s(ns: int) -> str:
-    return f"{ns / 1e9:.2f} s"

@@ -11,17 +11,26 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.blobs import Floats, Frame, checked_frame
-from analysis.markers import MarkerTracker, MarkerTracks, stack_tracks
+from analysis.markers import MarkerTracker, MarkerTracks, Measured, stack_tracks
+from analysis.plate_kernels import cells, refine_square
 
 MAX_BRIDGED = 5
 """Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm
 from the straight line, and that grows with the square of the gap."""
+
+_BENT_PX = 1.5
+"""Corners that move more than this apart from each other are not those of a stiff square."""
+_LIKE = 0.7
+"""Correlation of a marker's cells with what they were."""
+_DETECTED_SIGMA_PX = 0.1
+"""Of a centre from a detector's corners alone (a plate in fast fall is a blur)."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,8 @@ class PlateTrack:
     xy: Floats
     corners: Floats
     ok: NDArray[np.bool_]
+    sigma: Floats
+    """(n,) standard deviation of a coordinate of the centre, px; NaN where that is."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +59,34 @@ class VideoTracks:
     plate: PlateTrack | None
 
 
+class PlatePose(NamedTuple):
+    """The plate's marker in one frame.
+
+    Attributes:
+        seen: whether it was.
+        corners: (4, 2) float64 pixels, clockwise from the marker's own top left; NaN when unseen.
+        sigma: standard deviation of a coordinate of their mean, px; NaN when unseen.
+    """
+
+    seen: bool
+    corners: Floats
+    sigma: float
+
+    @property
+    def centre(self) -> Floats:
+        """(2,) pixels, the corners' mean."""
+        result: Floats = self.corners.mean(axis=0)
+        return result
+
+
+UNSEEN = PlatePose(False, np.full((4, 2), np.nan), np.nan)
+
+
 class PlateTracker:
     """Follows one ArUco marker (dictionary 4x4_50) from frame to frame.
+
+    Its four sides are followed where they must be, and its cells looked at, so that nothing else is
+    taken for it. Only where that fails does a detector look around there, and then everywhere.
 
     Args:
         marker_id: the plate's marker; by default the largest one in the first frame that has one.
@@ -57,6 +94,8 @@ class PlateTracker:
 
     def __init__(self, marker_id: int | None = None) -> None:
         self.marker_id = marker_id
+        self.detections = 0
+        """How often a detector looked."""
         settings = cv2.aruco.DetectorParameters()
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         # a window of up to 0.4 of a cell: larger ones see the next edge, smaller ones more noise
@@ -69,32 +108,62 @@ class PlateTracker:
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         self._detector = cv2.aruco.ArucoDetector(dictionary, settings)
         self._last: Floats | None = None
-        self._velocity = np.zeros(2)
+        self._velocity, self._gain = np.zeros(2), np.zeros(2)
+        self._cells: Floats | None = None
+        self._here = False
 
-    def update(self, frame: Frame) -> tuple[bool, Floats, Floats]:
+    def update(self, frame: Frame) -> PlatePose:
         """The marker in the next frame.
-
-        Returns:
-            whether it was seen, its centre (2,) and its corners (4, 2) in pixels; NaN when unseen.
 
         Raises:
             TypeError: the frame is not 2-D uint8.
         """
         frame = checked_frame(frame)
-        corners = None if self._last is None else self._look_near(frame, self._last)
-        if corners is None:
-            corners = self._look(frame)
-        if corners is None:
-            self._velocity = np.zeros(2)
-            return False, np.full(2, np.nan), np.full((4, 2), np.nan)
-        centre: Floats = corners.mean(axis=0)
-        if self._last is not None:
-            self._velocity = centre - self._last.mean(axis=0)
-        self._last = corners
-        return True, centre, corners
+        pose = self._follow(frame)
+        if pose is None:
+            pose = self._detect(frame)
+        if not pose.seen:
+            self._velocity, self._gain = np.zeros(2), np.zeros(2)
+        elif self._last is not None:
+            step = pose.centre - self._last.mean(axis=0)
+            # a plate in free fall gains as much in every frame
+            self._gain = step - self._velocity if self._here else np.zeros(2)
+            self._velocity = step
+        if pose.seen:
+            self._last = pose.corners
+        self._here = pose.seen
+        return pose
+
+    def _follow(self, frame: Frame) -> PlatePose | None:
+        """Its sides where they must be; None where they are not, or it is not sure to be it."""
+        if self._last is None or self._cells is None or not self._here:
+            return None
+        guess = self._last + self._velocity + self._gain
+        corners, sigma = refine_square(frame, guess, 3)
+        if not np.isfinite(sigma):
+            return None
+        moved = corners - self._last
+        if np.abs(moved - moved.mean(axis=0)).max() > _BENT_PX:
+            return None
+        seen = cells(frame, corners)
+        if not np.isfinite(seen).all() or _alike(seen, self._cells) < _LIKE:
+            return None
+        return PlatePose(True, corners, float(sigma))
+
+    def _detect(self, frame: Frame) -> PlatePose:
+        self.detections += 1
+        found = None if self._last is None else self._look_near(frame, self._last)
+        found = self._look(frame) if found is None else found
+        if found is None:
+            return UNSEEN
+        corners, sigma = refine_square(frame, found, 3)
+        if np.isfinite(sigma) and np.abs(corners - found).max() < _BENT_PX:
+            self._cells = cells(frame, corners)
+            return PlatePose(True, corners, float(sigma))
+        return PlatePose(True, found, _DETECTED_SIGMA_PX)
 
     def _look_near(self, frame: Frame, last: Floats) -> Floats | None:
-        box = last + self._velocity
+        box = last + self._velocity + self._gain
         low, high = box.min(axis=0), box.max(axis=0)
         # quiet zone, and what a falling plate may gain on its last velocity
         reach = max(16.0, 0.4 * float((high - low).max()))
@@ -148,8 +217,8 @@ def track_video(
     """
     markers = MarkerTracker(layout_px, threshold=threshold)
     plate = PlateTracker(marker_id) if with_plate else None
-    rows: list[tuple[Floats, NDArray[np.bool_]]] = []
-    poses: list[tuple[bool, Floats, Floats]] = []
+    rows: list[Measured] = []
+    poses: list[PlatePose] = []
     for frame in frames:
         rows.append(markers.update(frame))
         if plate is not None:
@@ -159,23 +228,46 @@ def track_video(
     )
 
 
-def bridge(poses: list[tuple[bool, Floats, Floats]], max_bridged: int = MAX_BRIDGED) -> PlateTrack:
+def bridge(poses: list[PlatePose], max_bridged: int = MAX_BRIDGED) -> PlateTrack:
     """The results of `PlateTracker.update` as one track, short gaps filled by straight lines.
+
+    A bridged place's standard deviation grows by what a plate that begins to fall in the gap
+    departs from the line.
 
     Args:
         poses: one result a frame; the frames equally spaced.
         max_bridged: gaps of more frames than this stay NaN.
     """
     if not poses:
-        return PlateTrack(np.empty((0, 2)), np.empty((0, 4, 2)), np.empty(0, np.bool_))
-    ok = np.array([seen for seen, _, _ in poses], np.bool_)
+        nothing = np.empty(0)
+        return PlateTrack(np.empty((0, 2)), np.empty((0, 4, 2)), np.empty(0, np.bool_), nothing)
+    ok = np.array([pose.seen for pose in poses], np.bool_)
     # the centre is the corners' mean, bridged or not
-    columns = np.stack([corners for _, _, corners in poses]).reshape(len(poses), 8)
+    columns = np.stack([pose.corners for pose in poses]).reshape(len(poses), 8)
+    sigma = np.array([pose.sigma for pose in poses])
     seen = np.flatnonzero(ok)
-    for before, after in pairwise(seen):
+    for before, after in pairwise(seen.tolist()):
         if 1 < after - before <= max_bridged + 1:
             gap = np.arange(before + 1, after)
             share = ((gap - before) / (after - before))[:, None]
             columns[gap] = columns[before] * (1 - share) + columns[after] * share
+            bow = _bow(columns, before, after)
+            sigma[gap] = max(sigma[before], sigma[after]) + bow
     corners = columns.reshape(-1, 4, 2)
-    return PlateTrack(corners.mean(axis=1), corners, ok)
+    return PlateTrack(corners.mean(axis=1), corners, ok, sigma)
+
+
+def _bow(columns: Floats, before: int, after: int) -> float:
+    """How far a way across a gap may leave its chord: by the change of velocity across it, px."""
+    if before < 1 or after + 1 >= len(columns):
+        return _DETECTED_SIGMA_PX
+    change = (columns[after + 1] - columns[after]) - (columns[before] - columns[before - 1])
+    if not np.isfinite(change).all():
+        return _DETECTED_SIGMA_PX
+    return float(np.abs(change.reshape(4, 2).mean(axis=0)).max()) * (after - before) / 8
+
+
+def _alike(one: Floats, other: Floats) -> float:
+    """Correlation of two sets of grey levels."""
+    a, b = one - one.mean(), other - other.mean()
+    return float(a @ b / (np.sqrt((a @ a) * (b @ b)) + 1e-9))

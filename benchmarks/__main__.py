@@ -14,7 +14,10 @@ from typing import Any
 
 from benchmarks.measure import RUNS, SEED, Figures, machine, versions
 
-NAMES = ("storage", "scene", "clocks", "labels", "network", "orchestration", "acquisition", "scale")
+NAMES = (
+    "storage", "scene", "clocks", "labels", "labels_truth", "network", "orchestration",
+    "acquisition", "scale",
+)  # fmt: skip
 RESULTS = Path(__file__).with_name("RESULTS.md")
 LIMIT_S = 900
 Result = dict[str, Any]

@@ -18,7 +18,7 @@ from analysis.latency import TrialLatency, score_trial, summarise_latency, summa
 from flows import counting
 from flows.campaigns import Collected, training_campaigns
 from flows.counting import COUNTS, count_spikes
-from flows.label import STEP as LABELS
+from flows.label_errors import label_errors, rules_compared
 from flows.orchestration import Parcel, run
 from flows.reviewed import Labels
 from flows.timing import timed
@@ -121,7 +121,8 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "windows": _score_windows(job, train, test),
         "trials": rows,
         "experiments": _summaries(rows),
-        "label_error_ms": _label_errors(job),
+        "label_error_ms": label_errors(job.store, job.campaigns),
+        "label_rules_ms": rules_compared(job.store, job.campaigns),
         "reviewed": job.labels.states(job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
     }
@@ -198,32 +199,6 @@ def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "lead_ms": summarise_lead(scored),
         }
     return result
-
-
-def _label_errors(job: Job) -> dict[str, Any]:
-    """Automatic labels against the simulation's truth, over every simulated trial; ms."""
-    errors: dict[str, list[float]] = {"incipient": [], "gross": []}
-    for item in job.campaigns:
-        labels = Derived.of(job.store, LABELS, item.name)
-        for trial, recording in item.trials:
-            truth = recording.simulation_truth()
-            if truth is None:
-                continue
-            label = labels.read(trial.id)
-            for kind, values in errors.items():
-                found, true = label[f"{kind}_ns"], truth[f"{kind}_ns"]
-                if found is not None and true is not None:
-                    values.append((found - true) / 1e6)
-    summary: dict[str, Any] = {}
-    for kind, values in errors.items():
-        there = np.asarray(values)
-        summary[kind] = {
-            "n": len(values),
-            "median": float(np.median(there)) if len(there) else None,
-            "median_abs": float(np.median(np.abs(there))) if len(there) else None,
-            "max_abs": float(np.max(np.abs(there))) if len(there) else None,
-        }
-    return summary
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)

@@ -219,39 +219,6 @@ def source_text(summary: dict[str, Any]) -> str:
     return " or ".join(words[name] for name, count in summary["labels"]["source"].items() if count)
 
 
-def labels(summary: dict[str, Any]) -> Section | None:
-    """Labels against the simulation's truth; None where there is none."""
-    errors = summary["labels"]["error_ms"]
-    if not errors["incipient"]["n"]:
-        return None
-    rows = [
-        [
-            f"{kind} onset",
-            str(values["n"]),
-            number(values["median"], 2),
-            number(values["median_abs"], 2),
-            number(values["max_abs"], 2),
-        ]
-        for kind, values in ((kind, errors[kind]) for kind in ("incipient", "gross"))
-    ]
-    return Section(
-        "How exact the labels are",
-        [
-            "The mock rig knows when each papilla truly crossed the threshold. Labels are read "
-            f"from {source_text(summary)} alone; this is their distance from that truth. Nothing "
-            "else reads it."
-        ],
-        (),
-        [
-            Table(
-                ["label", "trials", "median (ms)", "median distance (ms)", "largest (ms)"],
-                rows,
-                "Label minus simulation truth; one frame is 10 ms.",
-            )
-        ],
-    )
-
-
 def provenance(summary: dict[str, Any]) -> Section:
     """Hashes, wall times and versions."""
     timing = [[name, number(value, 1)] for name, value in summary["timing_s"].items()]

@@ -10,7 +10,7 @@ from analysis import dataset, figures
 from analysis.report import Figure, Number, Section, Table, number, percent
 from analysis.training import Fitted
 from analysis.windows import first_pixel
-from flows import clock_words, results
+from flows import clock_words, label_section, results
 from flows.campaigns import Collected
 from flows.label import STEP as LABELS
 from protocols.factors import Level
@@ -66,7 +66,7 @@ def make_sections(
         results.outputs(store, evaluation, example, simulated),
         results.latency(evaluation, summary, simulated),
         results.lead(evaluation, summary, simulated),
-        results.labels(summary),
+        label_section.section(summary),
         clock_words.section(store, summary),
         results.provenance(summary),
     ]

@@ -47,6 +47,7 @@ def make_summary(
         "disturbance": experiments["disturbance"],
         "labels": {
             "error_ms": evaluation["label_error_ms"],
+            "rules_ms": evaluation["label_rules_ms"],
             "source": _sources(campaigns),
             "reviewed": evaluation.get("reviewed"),
         },

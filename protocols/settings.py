@@ -16,7 +16,8 @@ from protocols.yaml_file import KeyedError, StrictModel
 class Labelling(StrictModel):
     """Ground truth from the outside video."""
 
-    rule: Literal["paper"] = "paper"
+    rule: Literal["paper", "change_point"] = "paper"
+    """Which onsets rule downstream; both are kept (docs/labels.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
     reference_ms: float = Field(default=200.0, gt=0)

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.onsets import MAX_UNSEEN_NS, doubts, paper_onsets
+from analysis.doubts import MAX_UNSEEN_NS, doubts, uncertain
+from analysis.onsets import paper_onsets
 from protocols.settings import Labelling
 
 FRAME_NS = 10_000_000
@@ -91,3 +92,22 @@ def test_an_onset_is_right_within_three_frames_or_in_doubt(
     if found.gross is None:
         assert onsets.gross_ns is not None
         assert abs(onsets.gross_ns - 90 * FRAME_NS) <= MAX_UNSEEN_NS
+
+
+def test_places_that_are_not_known_leave_an_onset_open() -> None:
+    frame_ns = np.arange(100) * FRAME_NS
+    starts = np.array([60, 30, 40, 50])
+    distance = 0.2 * np.maximum(0.0, np.arange(100)[:, None] - starts)
+    onsets = paper_onsets(frame_ns, distance, 0, RULE, START)
+
+    def doubted(marker: int, px: float) -> tuple[bool, bool]:
+        sigma = np.full(distance.shape, 0.005)
+        sigma[:, marker] = px
+        found = uncertain(frame_ns, distance, sigma, onsets, 0, 2.0, START)
+        return found.incipient is not None, found.gross is not None
+
+    assert doubted(0, 0.005) == (False, False)
+    assert doubted(0, 0.1) == (False, False)  # 3 sigma are a frame and a half either way
+    assert doubted(0, 0.25) == (False, True)
+    assert doubted(1, 0.25) == (True, False)
+    assert doubted(3, 0.25) == (False, False)  # the first slip had been seen long before

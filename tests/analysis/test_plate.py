@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.blobs import find_blobs
 from analysis.markers import track
-from analysis.plate import PlateTracker, bridge, track_plate, track_video
+from analysis.plate import UNSEEN, PlatePose, PlateTracker, bridge, track_plate, track_video
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
@@ -112,10 +112,10 @@ def test_short_gaps_are_bridged_and_flagged() -> None:
 
 
 def test_a_bridge_is_straight() -> None:
-    def pose(at: float) -> tuple[bool, Floats, Floats]:
-        return True, np.array([at, 0.0]), corners_of(np.array([at, 0.0]))
+    def pose(at: float) -> PlatePose:
+        return PlatePose(True, corners_of(np.array([at, 0.0])), 0.01)
 
-    lost = (False, np.full(2, np.nan), np.full((4, 2), np.nan))
+    lost = UNSEEN
     track_ = bridge([pose(0.0), lost, lost, lost, pose(8.0)])
     np.testing.assert_allclose(track_.xy[:, 0], [0, 2, 4, 6, 8], atol=1e-12)
     np.testing.assert_allclose(track_.corners[2], corners_of(np.array([4.0, 0.0])), atol=1e-12)
@@ -169,10 +169,10 @@ def test_no_part_of_the_plate_is_taken_for_a_papilla(marker_id: int) -> None:
 
 
 def test_nothing_and_the_wrong_thing() -> None:
-    ok, centre, corners = PlateTracker().update(dark())
-    assert not ok
-    assert np.isnan(centre).all()
-    assert np.isnan(corners).all()
+    pose = PlateTracker().update(dark())
+    assert not pose.seen
+    assert np.isnan(pose.centre).all()
+    assert np.isnan(pose.corners).all()
     assert track_plate([]).xy.shape == (0, 2)
     with pytest.raises(TypeError, match="uint8"):
         PlateTracker().update(np.zeros(SHAPE))  # type: ignore[arg-type]
@@ -189,7 +189,7 @@ def test_a_quiet_zone_on_a_dark_ground_is_not_the_marker() -> None:
         card[module:-module, module:-module] = marker
         frame = np.full((512, 512), 25, np.uint8)
         frame[20 : 20 + 8 * module, 350 : 350 + 8 * module] = np.where(card > 127, 200, 25)
-        ok, centre, _ = PlateTracker().update(frame)
-        assert ok
+        pose = PlateTracker().update(frame)
+        assert pose.seen
         expected = np.array([350, 20]) + (8 * module - 1) / 2
-        assert np.abs(centre - expected).max() < 0.5
+        assert np.abs(pose.centre - expected).max() < 0.5

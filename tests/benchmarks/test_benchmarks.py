@@ -52,6 +52,7 @@ PROMISED = {
     },
     "labels": {
         "x_blob_detector", "x_best_opencv", "centroid_diff_px", "decode_track_x_realtime",
+        "aruco_x_realtime",
     },
 }  # fmt: skip
 

@@ -1,0 +1,98 @@
+"""The camera was knocked: what all markers have in common is not theirs.
+
+While papillae are stuck their markers stand still on a plate that stands still, so the median of
+what they have moved is the camera's own motion, and it is taken out. Once all but the last have
+slipped nothing shows where the camera points; a sudden step that all take together is still told
+from slip, anything slower is not, and labels are doubted where that happens. Trials with a sliding
+plate are measured from the plate's own marker and need none of this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+LEAST_PX = 0.15
+"""A common shift of many that stand still; below it there is none, and the rule stays literal."""
+KNOCK_PX = 0.4
+"""A common step from one frame to the next that no slip makes."""
+ANCHORS, MANY = 5, 10
+"""Markers at rest that show where the camera points, and so many that they cannot all have slipped
+together by chance."""
+_APART_PX = 0.3
+_GONE_FRAMES = 3
+_KEEP = 0.8
+_UNANCHORED_PX = 0.15
+
+
+@dataclass(frozen=True)
+class CameraShift:
+    """How the camera moved.
+
+    Attributes:
+        px: (n, 2) common shift, 0 where there is none.
+        unsure: (n,) bool, True where it moved and too little stood still to say by how much.
+    """
+
+    px: Floats
+    unsure: NDArray[np.bool_]
+    sigma: Floats
+    """(n,) what taking it out adds to a coordinate's standard deviation, px."""
+
+    @property
+    def largest_px(self) -> float:
+        """Over the trial."""
+        return float(np.hypot(*self.px.T).max(initial=0.0))
+
+
+def camera_shift(away: Floats) -> CameraShift:
+    """The common shift of markers.
+
+    Args:
+        away: (n, m, 2) offsets from where they stood at rest, px, NaN where unknown.
+    """
+    n, m, _ = away.shape
+    shift, unsure, sigma = np.zeros((n, 2)), np.zeros(n, np.bool_), np.full(n, _UNANCHORED_PX)
+    stuck, gone = np.ones(m, np.bool_), np.zeros(m, np.int64)
+    velocity, before = np.zeros((m, 2)), np.full((m, 2), np.nan)
+    now, drifted = np.zeros(2), False
+    for f in range(n):
+        seen = np.isfinite(away[f, :, 0])
+        hold = stuck & seen
+        anchored = False
+        if hold.sum() >= ANCHORS:
+            middle = np.median(away[f, hold], axis=0)
+            near = np.hypot(*(away[f, hold] - middle).T) < _APART_PX
+            anchored = near.sum() >= max(ANCHORS, 0.5 * hold.sum())
+            if anchored:
+                now = np.median(away[f, hold][near], axis=0)
+                sigma[f] = np.sqrt(np.mean((away[f, hold][near] - now) ** 2))
+                drifted |= bool(near.sum() >= MANY and np.hypot(*now) > LEAST_PX)
+        if not anchored and seen.any():
+            # innovations: of what stood still its place, of what slides its step
+            new = np.where(stuck[:, None], away[f] - now, away[f] - before - velocity - now)
+            known = seen & np.isfinite(new[:, 0])
+            step = np.median(new[known], axis=0) if known.sum() >= ANCHORS else np.zeros(2)
+            if np.hypot(*step) > KNOCK_PX:
+                now = now + step
+                unsure[f] = True
+        shift[f] = now
+        place = away[f] - now
+        gone = np.where(seen & (np.hypot(*place.T) > 2 * _APART_PX), gone + 1, 0)
+        stuck &= gone < _GONE_FRAMES
+        moved = np.where(np.isfinite(before), place - before, 0.0)
+        velocity = np.where(seen[:, None], _KEEP * velocity + (1 - _KEEP) * moved, velocity)
+        before = np.where(seen[:, None], place, before)
+    knocked = np.hypot(*np.diff(shift, axis=0, prepend=0.0).T).max(initial=0.0) > KNOCK_PX
+    if not (drifted or knocked):
+        return no_shift(n)
+    return CameraShift(shift, unsure, sigma)
+
+
+def no_shift(n: int) -> CameraShift:
+    """Of a camera that stood still for n frames."""
+    return CameraShift(np.zeros((n, 2)), np.zeros(n, np.bool_), np.zeros(n))
