@@ -23,7 +23,7 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
     assert readers == {
         "flows/session.py",
         "storage/recording.py",
-        "flows/evaluate.py",
+        "flows/label_errors.py",
         "flows/view_streams.py",  # drawn beside the label, and called simulated
     }
 
