@@ -14,6 +14,7 @@ from pathlib import Path
 
 from benchmarks.measure import Figures, alternate, spread
 from storage.catalogue import catalogue, query
+from storage.clockmap import ClockMap
 from storage.files import sha256
 from storage.store import Store
 from storage.writer import CHECKSUMS, DATA, FRAMES, RECORD
@@ -78,8 +79,13 @@ def _record(number: int) -> dict[str, object]:
         "attempt": 0,
         "simulated": True,
         "recorded_s": 1.5 + number / 7,
-        "counts": {"events": number % 1000, "frames": 100},
-        "clocks": {"events": {"uncertainty_ns": 1000.0 + number % 13}},
+        "counts": {"events": number % 1000, "frames": 100, "poses": 250, "pulses": 75},
+        "clocks": {
+            "events": {
+                "uncertainty_ns": 1000.0 + number % 13,
+                "map": ClockMap.line(0, number).to_json(),
+            }
+        },
         "quality": {"passed": True},
         "condition": {
             "depth": f"{2 + number % 20 / 10:.1f} mm",
