@@ -25,6 +25,8 @@ from storage.streams import Json
 if TYPE_CHECKING:
     from flows.cluster import Cluster
 
+FEW = 3
+"""Trials for which starting processes (about two seconds each) gains nothing."""
 Make = Callable[[Recording, Any], Any]
 """Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
 module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
@@ -144,9 +146,9 @@ def each_trial(
     Args:
         done: called with the number of an item of `work` and what came of it.
         processes: without a cluster, use all cores; False where `make` does that by itself, or
-            takes less time than starting processes.
+            takes less time than starting processes, which is never done for a `FEW`.
     """
-    if cluster is None and not processes:
+    if cluster is None and (not processes or len(work) <= FEW):
         for number, item in enumerate(work):
             done(number, make(item.recording, item.settings))
         return

@@ -50,7 +50,9 @@ class Listing:
     @staticmethod
     def of(campaign: Campaign) -> Listing:
         """What is there now."""
-        found: list[tuple[str, int, int]] = []
+        names: list[str] = []
+        inodes: list[int] = []
+        changed: list[int] = []
         with suppress(FileNotFoundError, NotADirectoryError):
             handle = os.open(campaign.folder / "trials", os.O_RDONLY | os.O_DIRECTORY)
             try:
@@ -58,12 +60,14 @@ class Listing:
                     for entry in entries:
                         if entry.is_dir(follow_symlinks=False):
                             told = entry.stat(follow_symlinks=False)
-                            found.append((entry.name, told.st_ino, told.st_ctime_ns))
+                            names.append(entry.name)
+                            inodes.append(told.st_ino)
+                            changed.append(told.st_ctime_ns)
             finally:
                 os.close(handle)
-        found.sort()
-        keys = np.array([each[1:] for each in found], np.int64).reshape(-1, 2)
-        return Listing([each[0] for each in found], keys, _stamp(sync_folder(campaign)))
+        order = sorted(range(len(names)), key=names.__getitem__)
+        keys = np.array([inodes, changed], np.int64).T[order].reshape(-1, 2)
+        return Listing([names[k] for k in order], keys, _stamp(sync_folder(campaign)))
 
     def settled(self, now_ns: int) -> I64:
         """The keys, with zeros for what changed just now."""

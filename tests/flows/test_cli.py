@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from flows.__main__ import main
 from storage.files import read_json
 from storage.store import Store
 from storage.verify import verify
@@ -35,6 +37,24 @@ def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess
     )  # fmt: skip
 
 
+def here(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The same in this process, which has loaded everything and has a server already."""
+    words = ["sliplab", *map(str, arguments)]
+    out, said = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", words)
+        patch.chdir(ROOT)
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(said),
+            pytest.raises(SystemExit) as ended,
+        ):
+            main()
+    code = ended.value.code
+    assert isinstance(code, int)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), said.getvalue())
+
+
 @pytest.mark.parametrize(("name", "count"), [("kinematic", 864), ("gravity", 180)])
 def test_plan_as_json(name: str, count: int) -> None:
     done = sliplab("plan", f"protocols/{name}.yaml", "--json", "--rig", "rigs/mock.yaml")
@@ -46,7 +66,7 @@ def test_plan_as_json(name: str, count: int) -> None:
 
 
 def test_plan_as_a_table() -> None:
-    done = sliplab("plan", "protocols/pilot.yaml")
+    done = here("plan", "protocols/pilot.yaml")
     assert done.returncode == 0
     assert "36" in done.stdout
     assert "give --rig to know" in done.stdout
@@ -61,7 +81,7 @@ def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:
         ("collect", path, "--rig", "rigs/mock.yaml", "--store", tmp_path / "s"),
         ("check", path, "--rig", "rigs/mock.yaml", "--store", tmp_path / "s"),
     ):
-        done = sliplab(*command)
+        done = here(*command)
         assert done.returncode == 2
         assert done.stdout == ""
         assert done.stderr.count("\n") == 1
@@ -71,7 +91,7 @@ def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:
 
 
 def test_a_store_that_is_none_is_said() -> None:
-    done = sliplab("label", "docs")
+    done = here("label", "docs")
     assert done.returncode == 1
     assert "is not a store" in done.stderr
 
@@ -81,7 +101,7 @@ def test_a_plan_that_does_not_fit_the_disk_is_refused(tmp_path: Path) -> None:
     assert "bytes_per_frame: 27400" in rig
     path = tmp_path / "rig.yaml"
     path.write_text(rig.replace("bytes_per_frame: 27400", "bytes_per_frame: 1.0e+9"))
-    done = sliplab("collect", "protocols/pilot.yaml", "--rig", path, "--store", tmp_path / "s")
+    done = here("collect", "protocols/pilot.yaml", "--rig", path, "--store", tmp_path / "s")
     assert done.returncode == 2
     assert "in reserve, the disk has" in done.stderr
 
@@ -89,20 +109,20 @@ def test_a_plan_that_does_not_fit_the_disk_is_refused(tmp_path: Path) -> None:
 def test_rigs_that_ship_are_known_by_name() -> None:
     needed = {}
     for name in ("mock", "rehearsal", "rigs/mock.yaml"):
-        done = sliplab("plan", "protocols/pilot.yaml", "--rig", name, "--json")
+        done = here("plan", "protocols/pilot.yaml", "--rig", name, "--json")
         assert done.returncode == 0, done.stderr
         needed[name] = json.loads(done.stdout)["bytes"]
     assert needed["mock"] == needed["rigs/mock.yaml"]
     # tracks instead of a video of 100 frames a second
     assert needed["rehearsal"] < 0.2 * needed["mock"]
-    done = sliplab("plan", "protocols/pilot.yaml", "--rig", "abacus")
+    done = here("plan", "protocols/pilot.yaml", "--rig", "abacus")
     assert done.returncode == 2
     assert "abacus: no such file, nor a rig that ships: irb120, loopback, mock" in done.stderr
 
 
 def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:
     arguments = ("protocols/pilot.yaml", "--rig", "rigs/mock.yaml", "--store", tmp_path / "s")
-    done = sliplab("check", *arguments, "--json")
+    done = here("check", *arguments, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["passed"]
@@ -186,9 +206,9 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
 def test_collect_takes_so_many_trials_and_no_more(tmp_path: Path) -> None:
     arguments = ("protocols/pilot.yaml", "--rig", "rehearsal", "--store", tmp_path / "s")
     for taken, left_out in ((2, 34), (1, 33)):
-        done = sliplab("collect", *arguments, "--trials", taken, "--json")
+        done = here("collect", *arguments, "--trials", taken, "--json")
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)
         assert (found["taken"], found["left_out"]) == (taken, left_out)
     assert (found["committed"], found["missing"]) == (3, 33)
-    assert sliplab("collect", *arguments, "--trials", 0).returncode == 2
+    assert here("collect", *arguments, "--trials", 0).returncode == 2

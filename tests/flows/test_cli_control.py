@@ -23,7 +23,7 @@ from storage.store import Store
 from storage.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.test_cli import SLIPLAB, sliplab, wait_for
+from tests.flows.test_cli import SLIPLAB, here, wait_for
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
@@ -49,7 +49,7 @@ def collecting(protocol: Path, store: Path, log: Path) -> Iterator[subprocess.Po
 
 def asked(*arguments: object) -> dict[str, Any]:
     """What a control command that succeeded says as JSON."""
-    done = sliplab(*arguments, "--json")
+    done = here(*arguments, "--json")
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
@@ -70,7 +70,7 @@ def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
         assert paused["holder"]["pid"] == process.pid
         there = {path.name for path in trials.iterdir()}
         assert not any((trials.parent / "incoming").iterdir())
-        second = sliplab("collect", protocol, "--rig", RIG, "--store", store)
+        second = here("collect", protocol, "--rig", RIG, "--store", store)
         assert second.returncode == 1
         assert f"is paused (pause by anna, {paused['when']} (lunch))" in second.stderr
         first = min(there)
@@ -100,24 +100,24 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     protocol = write(tmp_path / "p.yaml", data)
     store = tmp_path / "store"
     collect = ("collect", protocol, "--rig", RIG, "--store", store)
-    assert sliplab("pause", store).returncode == 1  # no store yet
+    assert here("pause", store).returncode == 1  # no store yet
     one = asked(*collect, "--trials", 1)
     assert (one["committed"], one["causes"]) == (1, [])
     assert asked("stop", store)["holder"] is None
     assert asked("pause", store)["did"] == {"paused": True, "running": False}
-    assert sliplab(*collect).returncode == 1
+    assert here(*collect).returncode == 1
     assert asked("resume", store)["did"] == {"paused": False, "running": False}
     ids = {f"depth=2.4mm,direction={deg}deg,speed=1.6mmps,r=1" for deg in (0, 60, 120)}
     (done,) = (path.name for path in (store / "campaigns" / "tiny" / "trials").iterdir())
     skipped = min(ids - {done})
-    wrong = sliplab("skip", store, skipped.replace("2.4", "2.5"), "--why", "x")
+    wrong = here("skip", store, skipped.replace("2.4", "2.5"), "--why", "x")
     assert wrong.returncode == 2
     assert f"did you mean '{skipped}'" in wrong.stderr
-    assert sliplab("skip", store, skipped).returncode == 2
-    assert sliplab("again", store, skipped, "--why", " ").returncode == 2
+    assert here("skip", store, skipped).returncode == 2
+    assert here("again", store, skipped, "--why", " ").returncode == 2
     did = asked("skip", store, skipped, "--why", "cable in the way", "--who", "anna")["did"]
     assert did["trials"] == {skipped: "set aside"}
-    rest = sliplab(*collect)
+    rest = here(*collect)
     assert rest.returncode == 1  # not every trial was taken
     words = "".join(rest.stdout.split())
     assert "1trialssetaside" in words
@@ -127,7 +127,7 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     assert listed["count"] == 2
     (aside,) = listed["set_aside"]
     assert (aside["trial"], aside["by"], aside["cause"]) == (skipped, "anna", "cable in the way")
-    assert "cable in the way" in " ".join(sliplab("trials", store).stdout.split())
+    assert "cable in the way" in " ".join(here("trials", store).stdout.split())
     asked("again", store, skipped, done, "--why", "new cable")
     whole = asked(*collect)
     assert (whole["committed"], whole["taken"], whole["quarantined"]) == (3, 2, 1)
@@ -150,7 +150,7 @@ def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
     opened = Store.open(store)
     control.ask(opened, "again", campaign="tiny", trials=(first,), why="dust")  # and killed, too
     collect = ("collect", protocol, "--rig", RIG, "--store", store, "--trials", 1)
-    assert sliplab(*collect).returncode == 1
+    assert here(*collect).returncode == 1
     assert asked("resume", store)["did"] == {"paused": False, "running": False}
     assert not (trials / first).exists()
     assert asked(*collect)["taken"] == 1
