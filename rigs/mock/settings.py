@@ -227,9 +227,9 @@ class FrameCamera(StrictModel):
     centroid_noise_px: NonNegative = 0.0045
     """Root mean square error of a tracked papilla's column and row, for the level `tracks`;
     measured on the level `video` with the settings above, along a slide."""
-    plate_noise_px: NonNegative = 0.04
-    """The same of the centre of the plate's marker, along a fall. It is mostly what refining the
-    corners does with fractions of a pixel; where nothing moves it is a tenth of this."""
+    plate_noise_px: NonNegative = 0.02
+    """The same of the centre of the plate's marker, along a fall: what fitting its sides does with
+    fractions of a pixel."""
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 4000
     """From the end of exposure to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 5000.0

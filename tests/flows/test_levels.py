@@ -85,7 +85,7 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         found = label(recording, data)
         assert recording.frame_source == found.source == found.as_json()["source"] == level
         assert found.displacement_px.shape == (len(found.frame_ns), 19)
-        assert found.plate_lost == 0
+        assert found.places.plate_lost == 0
         # the first frame over the threshold: up to a frame late, early by noise only; where a plate
         # hangs, tips creep before they go, and the noise of its marker counts for more
         errors = errors_ms(found, recording)

@@ -26,7 +26,7 @@ def draw(
 
 def corners_of(image: np.ndarray) -> np.ndarray:
     tracker = PlateTracker()
-    seen, _, corners = tracker.update(image)
+    seen, corners, _ = tracker.update(image)
     assert seen
     assert tracker.marker_id == 0
     return corners
