@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import Executor
 from functools import partial
 from html import escape
@@ -46,7 +47,6 @@ class Page:
         self._close_by = False
         self._looking = False
         self._listed: list[Row] | None = None
-        self._quiet = False
         self.plots = TimePlots(self._moved, self._cursor)
         self.frame = FramePlot()
         self.see = Widgets([*trials.items], who)
@@ -55,7 +55,7 @@ class Page:
         doc.add_root(self.see.layout(self.plots.moved, self.plots.rate, self.frame.plot))
         doc.add_periodic_callback(self._look_again, REFRESH_MS)
         doc.on_session_destroyed(lambda _: self.close())
-        doc.js_on_event(DocumentReady, self.see.keyboard, self.plots.drag)
+        doc.js_on_event(DocumentReady, self.see.keyboard, self.see.choosing, self.plots.drag)
         self._fill()
         doc.add_next_tick_callback(lambda: self._step(1))
 
@@ -65,7 +65,8 @@ class Page:
         for item in (see.campaign, see.state, see.text):
             item.on_change("value", lambda attr, old, new: self._fill())
         see.first.on_change("active", lambda attr, old, new: self._fill())
-        see.source.selected.on_change("indices", self._picked)
+        see.source.selected.on_change("indices", lambda attr, old, new: self._mark())
+        see.picked.on_change("value", self._picked)
         see.pressed.on_change("value", self._key)
         for verdict, button in see.buttons.items():
             button.on_click(partial(self._decide, verdict))
@@ -85,14 +86,9 @@ class Page:
             doubtful_first=bool(self.see.first.active),
         )  # fmt: skip
         columns = as_columns(self._rows)
-        self._quiet = True
-        try:
-            if columns != dict(self.see.source.data):
-                self.see.source.data = columns
-            here = self._place()
-            self.see.source.selected.indices = [] if here is None else [here]
-        finally:
-            self._quiet = False
+        if columns != dict(self.see.source.data):
+            self.see.source.data = columns
+        self._mark()
         left = sum(item.state in {"open", "stale"} for item in self._rows)
         self._head()
         self.see.count.text = f"{len(self._rows)} trials, {left} to decide"
@@ -107,9 +103,17 @@ class Page:
         names = [item.name for item in self._rows]
         return names.index(self._wanted) if self._wanted in names else None
 
-    def _picked(self, _: str, __: object, new: list[int]) -> None:
-        if not self._quiet and new and new[0] < len(self._rows):
-            self._choose(self._rows[new[0]])
+    def _mark(self) -> None:
+        """Mark the row of the wanted trial, and no other."""
+        here = self._place()
+        self.see.source.selected.indices = [] if here is None else [here]
+
+    def _picked(self, _: str, __: str, new: str) -> None:
+        """A row that was pressed in the browser, by its name: the list may be another by now."""
+        campaign, trial, _count = json.loads(new)
+        there = {item.name: item for item in self.trials.rows}
+        if (campaign, trial) in there:
+            self._choose(there[campaign, trial])
 
     def _step(self, by: int) -> None:
         """The next row, or the one before."""
@@ -145,10 +149,7 @@ class Page:
     def _choose(self, item: Row) -> None:
         """Read a trial in the background, then show it."""
         self._wanted = item.name
-        here = self._place()
-        self._quiet = True
-        self.see.source.selected.indices = [] if here is None else [here]
-        self._quiet = False
+        self._mark()
         self.aside.do(lambda: load(self.trials.store, self.trials.items[item.campaign], item),
                     self._show)  # fmt: skip
 

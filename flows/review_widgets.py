@@ -53,7 +53,24 @@ window.addEventListener("keydown", (event) => {
   }
 }, true);
 """
-_CELL = "<span title='<%- reasons %>' class='<%- state %>'><%- value %></span>"
+# the trial of the row that was pressed, as it stands there: by the time that the server hears of
+# it, its number in the list may be another trial's
+CHOOSING = """
+if (window.sliplab_rows) return;
+window.sliplab_rows = true;
+let count = 0;
+window.addEventListener("mousedown", (event) => {
+  const row = event.composedPath().find((item) => item.classList?.contains("slick-row"));
+  const cell = row?.querySelector("[data-trial]");
+  if (!cell || event.button !== 0) return;
+  count += 1;
+  picked.value = JSON.stringify([cell.dataset.campaign, cell.dataset.trial, count]);
+}, true);
+"""
+_CELL = (
+    "<span title='<%- reasons %>' class='<%- state %>' data-campaign='<%- campaign %>' "
+    "data-trial='<%- trial %>'><%- value %></span>"
+)
 _TABLE_STYLE = """
 :host { font-family: sans-serif; font-size: 12px; }
 .slick-cell { font-size: 11px; } .slick-cell.selected { background: #cfe3f2; }
@@ -101,6 +118,7 @@ class Widgets:
         self.reason = TextInput(title="reason (needed to reject)", value="", width=300)
         self.go_on = Checkbox(label="then the next", active=True)
         self.pressed = TextInput(value="", visible=False)
+        self.picked = TextInput(value="", visible=False)
         self.buttons: dict[Verdict, Button] = {
             verdict: Button(label=text, button_type=kind, width=110)
             for verdict, text, kind in VERDICTS
@@ -112,6 +130,7 @@ class Widgets:
         self.keyboard = CustomJS(
             args={"pressed": self.pressed, "reason": self.reason}, code=KEYBOARD
         )
+        self.choosing = CustomJS(args={"picked": self.picked}, code=CHOOSING)
 
     def layout(self, moved: Any, rate: Any, frame: Any) -> Any:
         """All of it, around the plots of displacements, event rate and frame."""
@@ -121,6 +140,7 @@ class Widgets:
             self.table,
             Div(text=words.keys(), stylesheets=[words.STYLE], width=430),
             self.pressed,
+            self.picked,
             width=440,
         )
         tools = row(self.no_incipient, self.no_gross, self.back, self.zoom)

@@ -95,12 +95,14 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=40)
     parser.add_argument("--every", type=int, default=1, help="power: states that are gone on from")
     parser.add_argument("--step", type=int, default=64 * 1024, help="full: bytes of a boundary")
-    parser.add_argument("--only", choices=PARTS, help="one part; all by default")
+    parser.add_argument(
+        "--only", choices=PARTS, action="append", help="one part, may be repeated; all by default"
+    )
     parser.add_argument("--video", action="store_true", help="with a video of every trial")
     asked = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     results: dict[str, Any] = {}
-    for part in PARTS if asked.only is None else (asked.only,):
+    for part in asked.only or PARTS:
         print(f"{part} ...", file=sys.stderr, flush=True)
         begun = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="sliplab-crash-") as folder:

@@ -191,7 +191,7 @@ def test_a_stopped_collection_goes_on_to_the_same_data(
         assert "every committed trial is kept" in log.read_text()
     early = {folder.name: folder.stat().st_mtime_ns for folder in trials.iterdir()}
     assert 2 <= len(early) < 6
-    again = sliplab(*command)
+    again = here(*command)
     assert again.returncode == 0, again.stderr
     result = json.loads(again.stdout)
     assert result["committed"] == 6

@@ -46,10 +46,12 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """What the steps make of it without a cluster."""
+    """What the steps make of it without a cluster, and in this process alone."""
     folder = tmp_path_factory.mktemp("here") / "store"
     shutil.copytree(taken, folder)
-    return run_steps(folder, None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trial_work, "FEW", 6)
+        return run_steps(folder, None)
 
 
 @pytest.fixture(scope="module")

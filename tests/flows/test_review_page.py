@@ -10,7 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -176,8 +176,33 @@ def test_all_trials_are_listed_doubtful_ones_first(served: Served, tab: Tab) -> 
     expect(tab.page.locator(".slick-row")).to_have_count(1)
 
 
+def test_a_click_takes_the_row_that_is_seen_while_the_list_changes(
+    served: Served, tab: Tab
+) -> None:
+    def slowly(change: Callable[[], None], trial: str) -> None:
+        """The click comes before the server's answer to the change."""
+        served.process.send_signal(signal.SIGSTOP)
+        try:
+            change()
+            tab.row(trial).click()
+        finally:
+            served.process.send_signal(signal.SIGCONT)
+        expect(tab.chosen()).to_contain_text(trial)
+        expect(tab.page.locator(".slick-row", has=selected)).to_have_count(1)
+        expect(tab.row(trial).locator(selected).first).to_be_visible()
+
+    selected = tab.page.locator(".slick-cell.selected")
+    doubtful, first, other = (served.made.ids[place] for place in (DOUBTFUL, 0, 20))
+    slowly(lambda: tab.find(other), other)  # the only one that is left
+    expect(tab.page.locator(".slick-row")).to_have_count(1)
+    tab.find("")
+    expect(tab.row(doubtful)).to_be_visible()
+    slowly(tab.page.locator(".doubtful-first input").uncheck, first)  # elsewhere in the list
+
+
 def test_the_frame_under_the_cursor_is_shown(tab: Tab) -> None:
     tab.press("n")
+    expect(tab.chosen()).to_contain_text("2 of ")  # a trial that comes later takes the cursor along
     expect(tab.heading()).to_contain_text("simulated")
     caption = tab.page.get_by_text(re.compile(r"^frame \d+ at"))
     for time_s, frame in ((0.1051, 10), (0.4951, 49)):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flows import trial_work
 from flows.campaigns import collected
 from flows.collect import collect
 from flows.evaluate import evaluate
@@ -139,8 +140,10 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> Non
 
 
 def test_the_same_seed_gives_the_same_summary(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
-) -> None:
+    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(trial_work, "FEW", 8)  # here without processes, and still the same
     orders = [make_order(Path(order.plan.file), rig_path, tmp_path / "store") for order in ran[0]]
     study(orders)
     first, second = (read_summary(Store.open(folder)) for folder in (
