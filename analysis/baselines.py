@@ -1,12 +1,14 @@
 """What little effort reaches on the same samples, so that the network's accuracy means something.
 
-Event rate alone tells much about slip. The report prints these three beside the network: the
-commonest class, two thresholds on the number of events, and a logistic regression on it. What the
-network adds is what it has learned from space and time.
+Event rate alone tells much about slip. The report prints three beside the network: the commonest
+class, two thresholds on the number of events, and a logistic regression on it. They take a second
+and are always there. Where the events are tells more: a logistic regression on the events of each
+cell, and what stands in `analysis.baseline_trees` and `analysis.baseline_nets`, take minutes.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,15 +16,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import log_softmax
+from threadpoolctl import threadpool_limits
 
 from analysis.metrics import CLASSES, Labels, accuracy, check_labels
+from analysis.sparse import SparseWindows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Samples = npt.NDArray[Any]
 
 RIDGE = 1e-3
-"""L2 penalty of the logistic regression on standardised weights, per mean log-likelihood."""
+"""L2 penalty of a logistic regression on standardised weights, per mean log-likelihood."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +37,22 @@ class BaselineScore:
         argmax: accuracy in 0..1 by `analysis.metrics.accuracy` (ties are shared); None where
             there are no test samples.
         parameters: what was fitted, as plain data.
+        votes: (n, 3) for each test sample, the highest is its class.
     """
 
     name: str
     argmax: float | None
     parameters: dict[str, Any]
+    votes: npt.NDArray[Any]
 
 
 def evaluate_baselines(
-    train_x: Samples, train_y: Labels, test_x: Samples, test_y: Labels
+    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows, test_y: Labels
 ) -> dict[str, BaselineScore]:
-    """Fit the three baselines on the training samples and score them on the test samples.
+    """Fit the cheap baselines on the training samples and score them on the test samples.
 
     Args:
-        train_x, test_x: event counts, (n, ...); only the total of each sample is used.
+        train_x, test_x: event counts.
         train_y, test_y: classes, integer (n,), 0..2.
 
     Raises:
@@ -58,10 +63,10 @@ def evaluate_baselines(
         raise ValueError("samples and labels differ in number")
     if not len(train_y):
         raise ValueError("no training samples")
-    train_total, test_total = window_totals(train_x), window_totals(test_x)
+    train_total, test_total = (x.totals.astype(np.float64) for x in (train_x, test_x))
     each = np.bincount(train_y, minlength=len(CLASSES))
     low, high, table = fit_rate_thresholds(train_total, train_y)
-    weights, mean, scale = fit_logistic(train_total, train_y)
+    rate = fit_logistic(_of_total(train_total), train_y)
 
     decisions: dict[str, tuple[npt.NDArray[Any], dict[str, Any]]] = {
         "majority": (
@@ -73,20 +78,51 @@ def evaluate_baselines(
             {"thresholds_events": [low, high], "training_samples": table.tolist()},
         ),
         "logistic": (
-            _scores(weights, _features(test_total, mean, scale)),
-            {"weights": weights.tolist(), "mean": mean.tolist(), "scale": scale.tolist()},
+            rate.scores(_of_total(test_total)),
+            {
+                "weights": rate.weights.tolist(),
+                "mean": rate.mean.tolist(),
+                "scale": rate.scale.tolist(),
+            },
         ),
     }
     return {
-        name: BaselineScore(name, accuracy(votes, test_y).argmax, parameters)
+        name: BaselineScore(name, accuracy(votes, test_y).argmax, parameters, votes)
         for name, (votes, parameters) in decisions.items()
     }
 
 
-def window_totals(x: Samples) -> FloatArray:
-    """Events of each sample, float64 (n,), from counts (n, ...)."""
-    x = np.asarray(x)
-    return x.reshape(len(x), -1).sum(axis=1, dtype=np.float64) if len(x) else np.empty(0)
+def logistic_cells(
+    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Logistic regression on the log of 1 + each cell's events: where they are, not when.
+
+    Returns:
+        votes (n, 3) for the test samples, and what was fitted, without the weights.
+    """
+    fitted = fit_logistic(np.log1p(cell_sums(train_x)), check_labels(train_y))
+    features = len(fitted.mean)
+    said = {
+        "ridge": RIDGE,
+        "weights": fitted.weights.size,
+        "multiply_adds": features * len(CLASSES),
+        "iterations": fitted.iterations,
+    }
+    return fitted.scores(np.log1p(cell_sums(test_x))), said
+
+
+def cell_sums(x: SparseWindows) -> IntArray:
+    """Events of each cell over all steps of a sample, int64 (n, channels * rows * columns)."""
+    places = math.prod(x.shape[1:])
+    sample = np.repeat(np.arange(len(x)), np.diff(x.offsets[:: x.shape[0]]))
+    flat = np.bincount(sample * places + x.cell, x.count, minlength=len(x) * places)
+    return flat.astype(np.int64).reshape(len(x), places)
+
+
+def step_sums(x: SparseWindows) -> IntArray:
+    """Events of each step over all cells of a sample, int64 (n, steps)."""
+    running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
+    return np.diff(running[x.offsets]).reshape(len(x), x.shape[0])
 
 
 def fit_rate_thresholds(totals: FloatArray, labels: IntArray) -> tuple[float, float, IntArray]:
@@ -131,20 +167,39 @@ def fit_rate_thresholds(totals: FloatArray, labels: IntArray) -> tuple[float, fl
     return float(edges[i]), float(edges[j]), parts
 
 
-def fit_logistic(totals: FloatArray, labels: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Multinomial logistic regression on the total and its log1p, by L-BFGS from zero.
+@dataclass(frozen=True)
+class Logistic:
+    """A fitted multinomial logistic regression.
+
+    Attributes:
+        weights: (features + 1, 3), the first row is the offset.
+        mean, scale: (features,), by which features are standardised.
+        iterations: that it took.
+    """
+
+    weights: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+    iterations: int
+
+    def scores(self, features: FloatArray) -> FloatArray:
+        """Log-odds (n, 3) up to a constant a row."""
+        return np.asarray(_standard(features, self.mean, self.scale) @ self.weights)
+
+
+def fit_logistic(features: FloatArray, labels: IntArray) -> Logistic:
+    """Multinomial logistic regression on standardised features, by L-BFGS from zero.
 
     Minimises mean cross-entropy + `RIDGE` / 2 times the squared weights (not the offsets); the
     problem is convex and the start fixed, so the result repeats.
 
-    Returns:
-        weights (3, 3) with a row for the offset and one a feature; mean (2,) and scale (2,) of
-        the features over the training samples.
+    Args:
+        features: (n, features).
+        labels: integer (n,), 0..2.
     """
-    raw = _raw_features(totals)
-    mean, spread = raw.mean(axis=0), raw.std(axis=0)
+    mean, spread = features.mean(axis=0), features.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
-    x = _features(totals, mean, scale)
+    x = _standard(features, mean, scale)
     target = np.eye(len(CLASSES))[labels]
     shape = (x.shape[1], len(CLASSES))
     penalty = np.full(shape, RIDGE)
@@ -157,18 +212,15 @@ def fit_logistic(totals: FloatArray, labels: IntArray) -> tuple[FloatArray, Floa
         gradient = x.T @ (np.exp(log_p) - target) / len(x) + penalty * w
         return float(loss), gradient.ravel()
 
-    found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
-    return np.asarray(found.x).reshape(shape), mean, scale
+    # sums over threads come out otherwise on another number of them, and waiting costs the most
+    with threadpool_limits(1):
+        found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
+    return Logistic(np.asarray(found.x).reshape(shape), mean, scale, int(found.nit))
 
 
-def _raw_features(totals: FloatArray) -> FloatArray:
+def _of_total(totals: FloatArray) -> FloatArray:
     return np.stack([totals, np.log1p(totals)], axis=1)
 
 
-def _features(totals: FloatArray, mean: FloatArray, scale: FloatArray) -> FloatArray:
-    scaled = (_raw_features(totals) - mean) / scale
-    return np.concatenate([np.ones((len(totals), 1)), scaled], axis=1)
-
-
-def _scores(weights: FloatArray, features: FloatArray) -> FloatArray:
-    return np.asarray(features @ weights)
+def _standard(features: FloatArray, mean: FloatArray, scale: FloatArray) -> FloatArray:
+    return np.concatenate([np.ones((len(features), 1)), (features - mean) / scale], axis=1)
