@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from analysis import training
 from flows import trial_work
 from flows.campaigns import collected
 from flows.collect import collect
@@ -16,7 +18,9 @@ from flows.evaluate import evaluate
 from flows.orders import Order, make_order
 from flows.report import read_summary, report
 from flows.study import Outcome, study
+from flows.train import train
 from storage.derived import Derived
+from storage.files import write_bytes
 from storage.store import Store
 from tests.flows.conftest import tiny, tiny_gravity, write
 
@@ -157,3 +161,46 @@ def test_the_same_seed_gives_the_same_summary(
 def test_a_collection_that_is_complete_returns_at_once(ran: tuple[list[Order], Outcome]) -> None:
     result = collect(ran[0][0])
     assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)
+
+
+class _Killed(Exception):
+    pass
+
+
+def test_a_training_that_was_killed_goes_on_to_the_same_model(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = next((store_of(ran).folder / "models").glob("*.pt")).read_bytes()
+    shutil.copytree(store_of(ran).folder, tmp_path / "store")
+    store = Store.open(tmp_path / "store")
+    models = store.folder / "models"
+    for left in (*models.glob("*.pt"), *models.glob("*.json")):
+        left.unlink()
+
+    def write_and_die(path: Path, state: bytes) -> None:
+        write_bytes(path, state)
+        raise _Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr("flows.train.write_bytes", write_and_die)
+        with pytest.raises(_Killed):
+            train(store, collected(store))
+    assert len(list(models.glob("*.state"))) == 1
+    assert not list(models.glob("*.pt"))
+
+    epochs: list[int] = []
+    begun = training.fit
+
+    def fit(*given: Any, **named: Any) -> training.Fitted:
+        states: list[bytes] = []
+        named["on_state"] = states.append
+        fitted = begun(*given, **named)
+        epochs.append(len(states))
+        return fitted
+
+    monkeypatch.setattr(training, "fit", fit)
+    assert train(store, collected(store))["done"] == 1
+    assert epochs == [1]  # the second of two; the first was kept
+    assert next(models.glob("*.pt")).read_bytes() == whole
+    assert not list(models.glob("*.state"))
+    assert next(models.glob("*.svg")).read_text().count("epoch") >= 2
