@@ -19,6 +19,7 @@ from flows.cli_common import (
     prepare_store,
 )
 from flows.cli_control import register as register_control
+from flows.cli_detect import register as register_detect
 from flows.cli_exchange import register as register_exchange
 from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
@@ -151,5 +152,6 @@ register_control(app)
 register_serve(app)
 register_exchange(app)
 register_review(app)
+register_detect(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")
