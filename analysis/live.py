@@ -18,12 +18,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from analysis.iaf import fused_counts
+from analysis.live_decision import Decision, Losses
 from analysis.live_rule import StepRule
 from analysis.training import Fitted, restore
 from analysis.windows import bin_events
@@ -39,45 +40,6 @@ BACK_US = 1_000_000
 
 class ClockFellBack(ValueError):
     """The camera's clock is another one than before."""
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What the detector says of one window. Times on the camera's clock, microseconds.
-
-    Attributes:
-        number: of the window, from 0; gaps leave numbers out.
-        counts: output spikes in the order of `analysis.metrics.CLASSES`.
-        smoothed, valid_class, onset: as `analysis.live_rule.Step`.
-        events: events of the window, all over the sensor and of both polarities.
-        last_event_us: the latest of them; None in a window without events.
-        by_event: an event ended the window, and not the clock alone.
-        decided_ns: monotonic clock when the decision was there.
-    """
-
-    number: int
-    start_us: int
-    end_us: int
-    counts: tuple[int, int, int]
-    smoothed: tuple[float, float, float]
-    valid_class: int
-    onset: str | None
-    events: int
-    last_event_us: int | None
-    by_event: bool
-    decided_ns: int = field(compare=False)
-
-
-@dataclass
-class Losses:
-    """What the stream did that a stored one does not."""
-
-    late: int = 0
-    """Events left out: their window had been judged."""
-    disordered: int = 0
-    """Events that came after a younger one, the late ones among them."""
-    gaps: int = 0
-    longest_gap_us: int = 0
 
 
 @dataclass

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from analysis import training
-from analysis.live import Counting, LiveDetector, counting_of
+from analysis.live import ClockFellBack, Counting, LiveDetector, counting_of
 from flows import stopping
 from flows.detect_order import DetectOrder
 from flows.detect_sink import DetectSink, Timed
 from flows.detect_view import DetectView
+from protocols.errors import InputError
 from protocols.hashing import hash_integer
 from rigs.build import build_rig
 from rigs.capabilities import RigError
@@ -47,6 +48,7 @@ def detect(
         build: makes the rig.
 
     Raises:
+        InputError: there is no folder for `out`.
         RigError: a device failed; the arm is stopped.
         StopRequested, KeyboardInterrupt: somebody stopped a motion.
     """
@@ -75,7 +77,7 @@ def detect(
                 interrupted = _listen(order, rig, sink)
             else:
                 reaction = _move(order, rig, sink)
-        except ValueError as error:  # the detector's: what it is given is no stream any more
+        except ClockFellBack as error:
             raise RigError("event camera", str(error)) from None
     return _summary(order, sink, reaction, interrupted)
 
@@ -136,6 +138,8 @@ def _lines(out: Path | None) -> Iterator[Callable[[Timed], None]]:
     if out is None:
         yield lambda timed: None
         return
+    if not out.parent.is_dir():
+        raise InputError("--out", "", out, "must be a file in a folder that is there")
     with disk_explained(out.parent, RigError), out.open("w", encoding="utf-8") as file:
 
         def write(timed: Timed) -> None:

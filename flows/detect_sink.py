@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.live import Decision, LiveDetector
+from analysis.live import LiveDetector
 from analysis.live_clock import FreshestArrival
+from analysis.live_decision import Decision
 from analysis.metrics import CLASSES, INCIPIENT
 from rigs.capabilities import Clock
 from rigs.reacting import SlipSeen

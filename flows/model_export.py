@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis import dataset, metrics, training
+from analysis import metrics, training
 from analysis.activity import activity
 from analysis.dataset import SampleSet
-from analysis.detection import detect
 from analysis.iaf import fused_counts
-from analysis.latency import score_trial, summarise_latency
 from analysis.model_card import SplitResult, card_markdown, model_card
 from analysis.quantised import Quantised, chip_run, compare, quantise, quantised_net
 from analysis.speck import speck_fit
@@ -29,6 +27,7 @@ from analysis.speck_page import speck_markdown
 from analysis.training import Fitted
 from flows import console
 from flows.campaigns import Collected, collected, training_campaigns
+from flows.model_latency import latencies
 from flows.reviewed import Labels
 from flows.train import load_samples, training_settings, wanted_models
 from protocols.errors import InputError
@@ -96,7 +95,6 @@ def export_model(
         file = training_campaigns(campaigns)[0].campaign.protocol_file
         raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
     source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
-    net = training.restore(fitted)
     files: dict[str, bytes | str] = {}
     with console.bar("export", 5) as bar:
         made_from_these = _made_from_these(source)
@@ -107,8 +105,8 @@ def export_model(
         if onnx:
             files[".onnx"], checks = _onnx(source, seen.x, checked)
         bar.advance(1, "onnx")
-        whole = quantise(net)
-        real, chip = _detections(source, net, whole)
+        whole = quantise(training.restore(fitted))
+        real, chip = latencies(campaigns, source.labels, fitted, whole)
         bar.advance(1, "test trials")
         speck = _speck(source, whole, seen, real, chip)
         files |= {
@@ -187,33 +185,6 @@ def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[byte
         ) from None
     except OnnxDiffers as error:
         raise ExportFailed(f"{source.path}: nothing was written: {error}") from None
-
-
-def _detections(source: _Source, net: Any, whole: Quantised) -> tuple[dict[str, Any], ...]:
-    """Latency by experiment over the whole test trials: as trained, and in whole numbers."""
-    chip = quantised_net(source.fitted, whole)
-    found: tuple[dict[str, list[Any]], ...] = ({}, {})
-    for item in source.campaigns:
-        rule = item.settings.detection
-        for _, recording in item.of_split("test"):
-            label = source.labels.read(item, recording)
-            onsets = (label["incipient_ns"], label["gross_ns"])
-            if None in onsets:
-                continue
-            x, end_ns = dataset.trial_windows(recording, source.fitted.windows)
-            for rows, counts in zip(
-                found, (fused_counts(net, x), chip_run(chip, x).counts), strict=True
-            ):
-                said = detect(counts, end_ns, rule)
-                scored = score_trial(said, *onsets, round(rule.false_early_ms * 1e6))
-                rows.setdefault(item.experiment, []).append(scored)
-    return tuple(
-        {
-            experiment: {"trials": len(rows), "latency_ms": summarise_latency(rows)}
-            for experiment, rows in each.items()
-        }
-        for each in found
-    )
 
 
 def _speck(

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analysis.detection import detect
-from analysis.live import ClockFellBack, Decision, LiveDetector
+from analysis.live import ClockFellBack, LiveDetector
 from analysis.live_clock import SPAN_NS, FreshestArrival
+from analysis.live_decision import Decision
 from analysis.live_rule import StepRule
 from analysis.windows import bin_events
 from protocols.settings import Detection, Windows

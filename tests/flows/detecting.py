@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,15 @@ from analysis import model_file
 from analysis.live import Counting
 from analysis.network import SPIKING, build, weights
 from analysis.training import EpochRecord, Fitted
+from flows.detect_order import DetectOrder, make_detect_order
 from protocols.settings import Network, Training, Windows
+from rigs.build import build_rig
+from rigs.rig import Rig
+from rigs.rig_file import RigFile
+from tests.conftest import ROOT
 from tests.flows.live import quick
 
+RIG = ROOT / "rigs" / "rehearsal.yaml"
 MANY = 300
 """Events of a 30 ms window that only a moving sensor gives."""
 
@@ -47,3 +54,23 @@ def slip_when_busy(most: int = MANY) -> Counting:
 def short_slide() -> dict[str, Any]:
     """A slide of 7 mm at 6 mm/s after half a second of hold."""
     return quick()
+
+
+def ordered(model: Path, protocol: Path, **options: Any) -> DetectOrder:
+    """The first trial of a protocol on the simulated rig."""
+    return make_detect_order(RIG, model, protocol=protocol, trial="", **options)
+
+
+def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:
+    """Builds rigs and keeps them to be looked at."""
+
+    def build(file: RigFile) -> Rig:
+        rigs.append(build_rig(file))
+        return rigs[-1]
+
+    return build
+
+
+def stands_clear(rig: Rig) -> bool:
+    """Whether the arm stands still off the plate."""
+    return rig.arm.progress().done and rig.position().depth_mm < 0
