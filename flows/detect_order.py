@@ -162,7 +162,8 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
         press_mm = float("nan")
     if not 0 < press_mm < float("inf"):
         raise InputError("--reflex", "", text, "must be 'stop' or 'press:MM', such as press:0.4")
-    depth = _deepest_mm(program)
+    # a retraction gets shallower all the way, and what presses on is cut off at the limit
+    depth = _shallowest_mm(program)
     if depth + press_mm > deepest + 1e-9:
         whose = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"
         raise InputError(
@@ -170,14 +171,16 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
             "",
             text,
             f"would reach {depth + press_mm:g} mm; {whose} limits.depth is {deepest:g} mm, and "
-            f"the trial presses {depth:g} mm: at most press:{max(0.0, deepest - depth):g}",
+            f"the trial's motion ends at {depth:g} mm: at most press:{deepest - depth:g}",
         )
     speeds = [s.speed_mm_s for s in program.steps if isinstance(s, Move) and s.phase == "press"]
     return Reflex("press", deepest, press_mm, speeds[0], hold_s)
 
 
-def _deepest_mm(program: Program) -> float:
-    return max(step.to.depth_mm for step in program.steps if isinstance(step, Move))
+def _shallowest_mm(program: Program) -> float:
+    """The least depth at which a reflex may have to press on."""
+    moves = (step for step in program.steps if isinstance(step, Move) and step.phase in ACTING)
+    return min(step.to.depth_mm for step in moves)
 
 
 def _detection(found: dict[str, Any], change: dict[str, Any]) -> Detection:

@@ -210,7 +210,9 @@ def test_a_false_alarm_in_the_hold_moves_nothing(model: Path, protocol: Path) ->
     assert result["reflex"]["phase"] == "slide"
 
 
-def test_a_reflex_in_a_retraction(model: Path, tmp_path: Path) -> None:
+def test_a_reflex_in_a_retraction_keeps_the_plate(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}
     order = make_detect_order(
@@ -218,8 +220,29 @@ def test_a_reflex_in_a_retraction(model: Path, tmp_path: Path) -> None:
         hold_s=0.2,
     )  # fmt: skip
     rigs: list[Rig] = []
-    result = detect(order, counting=slip_when_busy(80), build=keeping(rigs))
+    truth: list[dict[str, Any]] = []
+
+    def build(file: RigFile) -> Rig:
+        rig = keeping(rigs)(file)
+        take_step, begun = rig.take_step, [0]
+
+        def looking(index: int, step: Any, *rest: Any) -> Any:
+            assert rig.simulation is not None
+            if step.phase == "retract":
+                begun[0] = rig.arm.now_ns()
+            if step.phase == "release":
+                truth.append(rig.simulation.truth(begun[0]))
+            return take_step(index, step, *rest)
+
+        monkeypatch.setattr(rig, "take_step", looking)
+        return rig
+
+    result = detect(order, counting=slip_when_busy(80), build=build)
     assert result["reflex"]["phase"] == "retract"
+    assert [found["gross_ns"] for found in truth] == [None]  # the plate never fell
+    watched = detect(replace(order, reflex=None), counting=slip_when_busy(80), build=build)
+    assert watched["reflex"] is None
+    assert truth[1]["gross_ns"] is not None
     assert result["reflex"]["stopped_mm"][2] < 3.4
     assert stands_clear(rigs[0])
     plate = rigs[0].plate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from flows.detect import detect
 from flows.detect_order import choose_trial, make_detect_order
@@ -98,6 +100,32 @@ def test_listening_moves_nothing_and_judges_silence(model: Path, tmp_path: Path)
     assert 38 <= result["windows"] == result["quiet_windows"] <= 47
     assert result["latency_ms"]["n"] == 0
     assert rigs[0].position().depth_mm == pytest.approx(-60, abs=0.1)
+
+
+def test_listening_ends_when_somebody_asks(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def counting(x: np.ndarray) -> np.ndarray:
+        asked.append(1)
+        return np.array([[9, 0, 0]])
+
+    monkeypatch.setattr("flows.stopping.requested", lambda: len(asked) > 5)
+    result = detect(make_detect_order(RIG, model, seconds=60), counting=counting)
+    assert result["interrupted"] is True
+    assert result["windows"] < 10
+
+
+def test_a_terminal_shows_bars_state_and_what_is_simulated(
+    model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = io.StringIO()
+    terminal = Console(file=shown, force_terminal=True, width=100, height=30)
+    monkeypatch.setattr("flows.console.messages", terminal)
+    detect(make_detect_order(RIG, model, seconds=0.6), counting=slip_when_busy())
+    text = shown.getvalue()
+    for part in ("simulated listening", "no slip", "9.00", "events/s", "gross"):
+        assert part in text
+    assert "█" in text
 
 
 # -- input -----------------------------------------------------------------------------------
