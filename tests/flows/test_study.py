@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -198,3 +199,6 @@ def test_the_model_goes_out_as_what_it_is(
     with pytest.raises(ExportFailed, match="nothing was written: 4 of 4 windows"):
         export_model(model, fitted, tmp_path / "other", store, checked=4)
     assert not (tmp_path / "other").exists()
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ExportFailed, match=r"sliplab\[onnx\]"):
+        export_model(model, fitted, tmp_path / "other", store, checked=4)
