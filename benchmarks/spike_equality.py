@@ -14,6 +14,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from analysis import model_file
 from analysis.dataset import SampleSet
@@ -25,6 +26,9 @@ PART = 2048
 
 def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int | bool]:
     """How many of the first `most` windows differ."""
+    torch.set_num_threads(
+        1
+    )  # waiting for each other, Sinabs' threads take longer beside other work
     fitted = model_file.load(model)
     net, fast = restore(fitted), engine(fitted)
     compared = differ = with_spikes = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -204,3 +205,50 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
     assert next(models.glob("*.pt")).read_bytes() == whole
     assert not list(models.glob("*.state"))
     assert next(models.glob("*.svg")).read_text().count("epoch") >= 2
+
+
+def test_the_model_goes_out_as_what_it_is(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
+    from analysis import onnx_file
+    from flows.detect_order import load_model
+    from flows.model_export import ExportFailed, export_model
+
+    store = store_of(ran)
+    model = store.folder / "models" / "seed0.pt"
+    fitted = load_model(model)
+    result = export_model(model, fitted, tmp_path / "out", store, checked=16)
+    assert result["simulated"] is True
+    assert result["onnx_windows_equal"] == 16
+    assert result["speck_fits"] is True
+    names = [f"seed0{end}" for end in (".onnx", ".speck.json", ".speck.md", ".speck.npz")]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        [*names, "seed0.card.json", "seed0.card.md"]
+    )
+    card = json.loads((tmp_path / "out" / "seed0.card.json").read_text())
+    assert card["data"]["made_from_these_data"] is True
+    (kinematic, gravity) = card["data"]["campaigns"]
+    assert kinematic["trials"] == {"train": 2, "validation": 2, "test": 2}
+    assert gravity["experiment"] == "gravity"
+    # the same windows and the same network as in the evaluation
+    summary = read_summary(store)
+    assert card["figures"]["test"]["accuracy"] == summary["kinematic"]["accuracy"]
+    assert card["detection"]["kinematic"]["latency_ms"] == summary["kinematic"]["latency_ms"]
+    speck = json.loads((tmp_path / "out" / "seed0.speck.json").read_text())
+    with np.load(tmp_path / "out" / "seed0.speck.npz") as arrays:
+        assert {name: arrays[name].dtype for name in arrays} == dict.fromkeys(
+            ("conv1", "conv2", "fc1", "fc2"), np.int8
+        )
+    assert speck["quantisation"]["change"]["windows"] == card["figures"]["test"]["samples"]
+    for name in (".card.md", ".speck.md"):
+        assert "simulated" in (tmp_path / "out" / f"seed0{name}").read_text()
+
+    counts = onnx_file.onnx_counts
+    monkeypatch.setattr(onnx_file, "onnx_counts", lambda data, x: counts(data, x) + 1)
+    with pytest.raises(ExportFailed, match="nothing was written: 4 of 4 windows"):
+        export_model(model, fitted, tmp_path / "other", store, checked=4)
+    assert not (tmp_path / "other").exists()
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ExportFailed, match=r"sliplab\[onnx\]"):
+        export_model(model, fitted, tmp_path / "other", store, checked=4)
