@@ -96,8 +96,8 @@ def outputs(
     if example is None:
         return None
     item, recording, row = example
-    found = trial_counts(store, item.name, recording.trial_id)
     settings = Detection.model_validate(evaluation["detection"][item.name])
+    found = trial_counts(store, item.name, recording.trial_id, settings)
     detections = detect(found["counts"], found["end_ns"], settings)
     start, _ = dataset.recorded_span(recording)
     svg = figures.outputs(
