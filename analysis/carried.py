@@ -72,15 +72,16 @@ def carried_spikes(net: nn.Sequential, x: npt.NDArray[Any]) -> npt.NDArray[np.ui
     return out
 
 
-def trailing_counts(
-    spikes: npt.NDArray[np.uint8], length: int, stride: int
-) -> npt.NDArray[np.int64]:
-    """Spikes of the last `length` steps, every `stride` steps from the first full window on.
+def trailing_sums(values: npt.NDArray[Any], length: int, stride: int) -> npt.NDArray[np.int64]:
+    """Sums over the last `length` steps, every `stride` steps from the first full window on.
+
+    Args:
+        values: whole numbers (steps, k).
 
     Returns:
-        int64 (n, 3), the windows ``[k * stride, k * stride + length)``.
+        int64 (n, k), of the windows ``[i * stride, i * stride + length)``.
     """
-    sums = np.zeros((len(spikes) + 1, spikes.shape[1]), np.int64)
-    sums[1:] = spikes.cumsum(axis=0, dtype=np.int64)
+    sums = np.zeros((len(values) + 1, values.shape[1]), np.int64)
+    sums[1:] = values.cumsum(axis=0, dtype=np.int64)
     ends = np.arange(length, len(sums), stride)
     return sums[ends] - sums[ends - length]

@@ -109,5 +109,5 @@ def merit(scored: Sequence[TrialLatency]) -> tuple[float, float]:
     if not late:
         return np.inf, np.inf
     ordered = np.sort(np.asarray(late, np.float64))
-    middle, high = np.percentile(ordered, (50, 95), method="inverted_cdf")
-    return float(middle), float(high)
+    # between two values a percentile of infinite ones would be no number
+    return float(np.median(ordered)), float(np.percentile(ordered, 95, method="inverted_cdf"))

@@ -21,7 +21,16 @@ from analysis.detector_choice import (
     outcomes,
     set_levels,
 )
-from analysis.detectors import Detector, Heard, Labelled, Learned, Smoothing, learn
+from analysis.detectors import (
+    Detector,
+    Heard,
+    Labelled,
+    Learned,
+    Levels,
+    Smoothing,
+    decide,
+    learn,
+)
 from analysis.latency import TrialLatency, summarise_latency, summarise_lead
 from protocols.settings import Comparison, Detection, Windows
 
@@ -136,21 +145,31 @@ def _best(
     for key, (validation, _) in judged.items():
         levels = set_levels(validation, allowed, tolerance)
         scored = outcomes(validation, levels, tolerance)
-        ranked.append((*merit(scored), key, levels, scored))
-    # keys differ, so levels and scores are never compared
-    _, _, key, levels, scored = min(ranked, key=lambda entry: entry[:3])
+        ranked.append((*merit(scored), key, levels))
+    # keys differ, so levels are never compared
+    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
     return {
         "choice": key,
         "levels": {name: _plain(value) for name, value in vars(levels).items()},
-        "validation": _summary(scored),
-        "test": _summary(outcomes(judged[key][1], levels, tolerance)),
+        **{
+            name: _summary(trials, outcomes(trials, levels, tolerance), levels)
+            for name, trials in zip(("validation", "test"), judged[key], strict=True)
+        },
     }
 
 
-def _summary(scored: Sequence[TrialLatency]) -> dict[str, Any]:
+def _summary(
+    trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
+) -> dict[str, Any]:
     early = sum(trial.false_early_incipient for trial in scored)
     low, high = interval(early, len(scored))
+    before = []
+    for trial, score in zip(trials, scored, strict=True):
+        found = decide(trial.evidence, levels).incipient_ns
+        if score.false_early_incipient and found is not None:
+            before.append((trial.incipient_ns - found) / 1e6)
     return {
+        "false_early_before_ms": sorted(before),
         "false_early_rate": {"value": early / len(scored), "low": low, "high": high},
         "median_with_missed_ms": _plain(merit(scored)[0]),
         "latency_ms": summarise_latency(scored),

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis import dataset, model_file, training
+from analysis.carried import carried_spikes, trailing_sums
 from analysis.samples import strided_windows
 from flows.trial_work import TrialWork, keep_trials, stale_trials
 from protocols.settings import Windows
@@ -33,9 +34,9 @@ AT_ONCE = 1024
 """Windows that are binned at a time, so that a fine stride does not fill the memory."""
 
 
-def heard_step(stride_ms: int) -> str:
+def heard_step(stride_ms: int, carried: bool = False) -> str:
     """Where results of a stride stand: those of different strides do not displace each other."""
-    return f"{HEARD}_{stride_ms}ms"
+    return f"{HEARD}_{'carried_' if carried else ''}{stride_ms}ms"
 
 
 @dataclass(frozen=True)
@@ -43,27 +44,34 @@ class Wanted:
     """Windows of one trial at one stride.
 
     Attributes:
+        carried: neurons keep their states from each window to the next.
         key: what the result must have been made with.
     """
 
     campaign: str
     recording: Recording
     stride_ms: int
+    carried: bool
     key: str
 
     @property
     def step(self) -> str:
         """Where the result stands."""
-        return heard_step(self.stride_ms)
+        return heard_step(self.stride_ms, self.carried)
 
 
 def want(
-    campaign: str, recording: Recording, model_key: str, windows: Windows, stride_ms: int
+    campaign: str,
+    recording: Recording,
+    model_key: str,
+    windows: Windows,
+    stride_ms: int,
+    carried: bool = False,
 ) -> Wanted:
     """Windows at a stride, with the key of the model that counts them."""
-    inputs = [model_key, recording.checksum, stride_ms]
+    inputs = [model_key, recording.checksum, stride_ms, carried]
     key = make_key(HEARD, VERSION, inputs, windows.model_dump(mode="json"))
-    return Wanted(campaign, recording, stride_ms, key)
+    return Wanted(campaign, recording, stride_ms, carried, key)
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,7 @@ class _Hearing:
     model: bytes
     windows: Windows
     stride_ms: int
+    carried: bool
     threads: int | None
 
 
@@ -93,7 +102,7 @@ def hear_trials(
             [
                 TrialWork(
                     item.recording, item.campaign, item.key,
-                    _Hearing(content, windows, item.stride_ms, threads),
+                    _Hearing(content, windows, item.stride_ms, item.carried, threads),
                 )
                 for item in wanted
                 if item.step == step
@@ -116,6 +125,15 @@ def _hear(
     if hearing.threads is not None:
         training.limit_threads(hearing.threads)
     fitted = _fitted(hearing.model)
+    return {}, _carried(recording, hearing, fitted) if hearing.carried else _reset(
+        recording, hearing, fitted
+    )
+
+
+def _reset(
+    recording: Recording, hearing: _Hearing, fitted: training.Fitted
+) -> dict[str, npt.NDArray[Any]]:
+    """Every window a sample of its own."""
     length_ns = hearing.windows.length_ms * 1_000_000
     starts = strided_windows(
         *dataset.recorded_span(recording), length_ns, hearing.stride_ms * 1_000_000
@@ -125,10 +143,28 @@ def _hear(
         x = dataset.bin_recording(recording, starts[first : first + AT_ONCE], hearing.windows)
         counts.append(training.predict_counts(fitted, x))
         events.append(x.reshape(len(x), -1).sum(axis=1, dtype=np.int64))
-    return {}, {
+    return {
         "counts": np.concatenate(counts),
         "events": np.concatenate(events),
         "end_ns": starts + length_ns,
+    }
+
+
+def _carried(
+    recording: Recording, hearing: _Hearing, fitted: training.Fitted
+) -> dict[str, npt.NDArray[Any]]:
+    """One run through the trial; windows are where one looks back."""
+    windows = hearing.windows
+    x, ends = dataset.trial_windows(recording, windows)
+    spikes = carried_spikes(training.restore(fitted), x)
+    events = x.reshape(len(spikes), -1).sum(axis=1, dtype=np.int64)
+    length, stride = windows.steps, hearing.stride_ms // windows.step_ms
+    counts = trailing_sums(spikes, length, stride)
+    first = int(ends[0]) if len(ends) else 0
+    return {
+        "counts": counts,
+        "events": trailing_sums(events[:, None], length, stride)[:, 0],
+        "end_ns": first + np.arange(len(counts), dtype=np.int64) * hearing.stride_ms * 1_000_000,
     }
 
 

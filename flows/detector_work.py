@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.detector_comparison import Parts
+from analysis.detector_comparison import Parts, compare
 from analysis.detectors import Heard, Labelled
 from analysis.smoothing_choice import Choice, Counted, choose_smoothing
 from flows.campaigns import Collected, training_campaigns
 from flows.detector_trials import Wanted, heard, want
 from flows.reviewed import Labels
-from protocols.settings import Detection
+from protocols.settings import AnalysisSettings, Detection
 from storage.recording import Recording
 from storage.store import Store, StoreError
 
@@ -35,16 +35,22 @@ class DetectorWork:
         choosing: by campaign, the trials that choose its smoothing and margin; empty where the
             protocol says them.
         compared: ``train``, ``validation`` and ``test`` trials of the comparison; None without.
+        carried: the same with states carried; None without.
     """
 
     scored: list[Wanted]
     choosing: dict[str, list[Known]]
     compared: dict[str, list[Known]] | None
+    carried: dict[str, list[Known]] | None
 
     @property
     def wanted(self) -> list[Wanted]:
         """Windows of all of them, each once."""
-        known = [*self.choosing.values(), *(self.compared or {}).values()]
+        known = [
+            *self.choosing.values(),
+            *(self.compared or {}).values(),
+            *(self.carried or {}).values(),
+        ]
         every = [*self.scored, *(trial.wanted for trials in known for trial in trials)]
         unique = {(item.campaign, item.recording.folder.name, item.step): item for item in every}
         return list(unique.values())
@@ -59,7 +65,10 @@ class DetectorWork:
         return [
             [item.key for item in self.scored],
             {name: keys(trials) for name, trials in self.choosing.items()},
-            None if self.compared is None else {n: keys(t) for n, t in self.compared.items()},
+            *(
+                None if parts is None else {name: keys(trials) for name, trials in parts.items()}
+                for parts in (self.compared, self.carried)
+            ),
         ]
 
     def choices(self, store: Store, detection: dict[str, Detection]) -> dict[str, Choice | None]:
@@ -74,16 +83,24 @@ class DetectorWork:
             found[name] = choose_smoothing(counted, settings, settings.choose)
         return found
 
-    def parts(self, store: Store) -> Parts | None:
-        """The trials of the comparison, read; None without one."""
-        if self.compared is None:
+    def compare(
+        self, store: Store, settings: AnalysisSettings, detection: Detection
+    ) -> dict[str, Any] | None:
+        """The comparison as `analysis.detector_comparison` gives it; None without one.
+
+        Args:
+            settings: windows and strides; detection: what the paper's rule is set to.
+        """
+        fine = settings.fine_stride_ms
+        parts = _parts(store, self.compared)
+        if parts is None or fine is None:
             return None
-        return Parts(
-            **{
-                name: [_labelled(store, t) for t in trials]
-                for name, trials in self.compared.items()
-            }
-        )
+        found = compare(parts, settings.windows, detection, fine)
+        carried = _parts(store, self.carried)
+        if found is None or carried is None:
+            return found
+        beside = compare(carried, settings.windows, detection, fine) or {"detectors": []}
+        return {**found, "carried": beside["detectors"]}
 
 
 def detector_work(
@@ -98,10 +115,12 @@ def detector_work(
     settings = used[0].settings
     length = settings.windows.length_ms
 
-    def hear(name: str, recording: Recording, stride_ms: int) -> Wanted:
-        return want(name, recording, model_key, settings.windows, stride_ms)
+    def hear(name: str, recording: Recording, stride_ms: int, carried: bool = False) -> Wanted:
+        return want(name, recording, model_key, settings.windows, stride_ms, carried)
 
-    def known(split: str, stride_ms: int, most: int | None = None) -> list[Known]:
+    def known(
+        split: str, stride_ms: int, most: int | None = None, carried: bool = False
+    ) -> list[Known]:
         found: list[Known] = []
         for item in used:
             for _, recording in item.of_split(split):
@@ -112,7 +131,7 @@ def detector_work(
                     return found
                 found.append(
                     Known(
-                        hear(item.name, recording, stride_ms),
+                        hear(item.name, recording, stride_ms, carried),
                         labels.key(item, recording),
                         label["incipient_ns"],
                         label["gross_ns"],
@@ -134,15 +153,25 @@ def detector_work(
                 )
         if ours.stride_ms is not None:
             scored += [hear(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
-    fine = settings.fine_stride_ms
-    compared = None
-    if fine is not None and settings.detection.compare is not None:
-        compared = {
-            "train": known("train", length, settings.detection.compare.train_trials),
-            "validation": known("validation", fine),
-            "test": known("test", fine),
+    fine, asked = settings.fine_stride_ms, settings.detection.compare
+
+    def compared(carried: bool) -> dict[str, list[Known]] | None:
+        if fine is None or asked is None or (carried and not asked.carried):
+            return None
+        return {
+            "train": known("train", length, asked.train_trials, carried),
+            "validation": known("validation", fine, None, carried),
+            "test": known("test", fine, None, carried),
         }
-    return DetectorWork(scored, choosing, compared)
+
+    return DetectorWork(scored, choosing, compared(False), compared(True))
+
+
+def _parts(store: Store, known: dict[str, list[Known]] | None) -> Parts | None:
+    """The trials of a comparison, read; None without one."""
+    if known is None:
+        return None
+    return Parts(**{name: [_labelled(store, t) for t in trials] for name, trials in known.items()})
 
 
 def _labelled(store: Store, trial: Known) -> Labelled:

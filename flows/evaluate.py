@@ -14,7 +14,6 @@ from analysis import metrics, model_file, training
 from analysis.baselines import evaluate_baselines
 from analysis.dataset import SampleSet
 from analysis.detection import detect
-from analysis.detector_comparison import compare
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
 from analysis.smoothing_choice import settled
 from flows import counting
@@ -126,11 +125,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     settings = training_settings(job.campaigns)
     choices = job.detectors.choices(job.store, job.detection)
     detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
-    parts = job.detectors.parts(job.store)
-    compared = None
-    if parts is not None and settings.fine_stride_ms is not None:
-        ours = detection[training_campaigns(job.campaigns)[0].name]
-        compared = compare(parts, settings.windows, ours, settings.fine_stride_ms)
+    ours = detection[training_campaigns(job.campaigns)[0].name]
     rows = _score_trials(job, detection)
     result = {
         "seed": job.model.seed,
@@ -142,7 +137,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "reviewed": job.labels.states(job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in detection.items()},
         "choices": {n: None if c is None else asdict(c) for n, c in choices.items()},
-        "detectors": compared,
+        "detectors": job.detectors.compare(job.store, settings, ours),
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 

@@ -134,6 +134,8 @@ class Comparison(StrictModel):
     length where that is whole, else the length."""
     train_trials: int = Field(default=200, ge=1)
     """Training trials, of the plan's first ones, that they learn from."""
+    carried: bool = False
+    """Also the network with its neurons' states carried from window to window."""
 
     @field_validator("rates")
     @classmethod
@@ -202,9 +204,11 @@ class AnalysisSettings(StrictModel):
             )
         compare = self.detection.compare
         fine = None if compare is None else compare.stride_ms
-        if fine is not None and length % fine:
+        if fine is not None and (length % fine or fine % self.windows.step_ms):
             raise KeyedError(
-                "analysis.detection.compare.stride_ms", fine, f"must divide length_ms = {length}"
+                "analysis.detection.compare.stride_ms",
+                fine,
+                f"must divide length_ms = {length}, and be whole steps of {self.windows.step_ms}",
             )
         return self
 
@@ -218,5 +222,7 @@ class AnalysisSettings(StrictModel):
         """The finer stride that detectors are compared at; None where they are not."""
         if self.detection.compare is None:
             return None
-        length = self.windows.length_ms
-        return self.detection.compare.stride_ms or (length // 3 if length % 3 == 0 else length)
+        length, step = self.windows.length_ms, self.windows.step_ms
+        third = length // 3
+        whole = length % 3 == 0 and third % step == 0
+        return self.detection.compare.stride_ms or (third if whole else length)
