@@ -91,7 +91,12 @@ class Logistic:
     def log(self, features: Array) -> FloatArray:
         """As `Likelihood.log`."""
         scaled = (np.asarray(features, np.float64) - self.mean) / self.scale
-        return np.asarray(log_softmax(scaled @ self.weights[1:] + self.weights[0], axis=1))
+        # not a matrix product, whose rounding depends on how many windows there are: a detector
+        # must say the same of a window whatever comes after it
+        linear = np.broadcast_to(self.weights[0], (len(scaled), len(self.weights[0]))).copy()
+        for column, weights in zip(scaled.T, self.weights[1:], strict=True):
+            linear += column[:, None] * weights
+        return np.asarray(log_softmax(linear, axis=1))
 
 
 def fit_logistic(features: Array, labels: npt.NDArray[np.integer], classes: int) -> Logistic:

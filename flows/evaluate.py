@@ -125,7 +125,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     settings = training_settings(job.campaigns)
     choices = job.detectors.choices(job.store, job.detection)
     detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
-    ours = detection[training_campaigns(job.campaigns)[0].name]
+    ours = job.detection[training_campaigns(job.campaigns)[0].name]
     rows = _score_trials(job, detection)
     result = {
         "seed": job.model.seed,
