@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from analysis.samples import choose_windows, consecutive_windows
-from analysis.windows import bin_events
+from analysis.sparse import SparseWindows
+from analysis.windows import list_events
 from protocols.settings import Samples, Windows
+from storage.array_file import Arrays, map_arrays, write_arrays
 from storage.recording import Recording
 
 VERSION = 1
@@ -21,13 +24,13 @@ class SampleSet:
     """Samples of some trials.
 
     Attributes:
-        x: uint8 (n, steps, channels, cells, cells), event counts.
+        windows: event counts (n, steps, channels, cells, cells), sparse.
         y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross.
         trial: int64 (n,), index of the trial each sample came from.
         start_ns: int64 (n,), start of each window on its trial's time line.
     """
 
-    x: npt.NDArray[np.uint8]
+    windows: SparseWindows
     y: npt.NDArray[np.int64]
     trial: npt.NDArray[np.int64]
     start_ns: npt.NDArray[np.int64]
@@ -35,32 +38,65 @@ class SampleSet:
     def __len__(self) -> int:
         return len(self.y)
 
+    @property
+    def x(self) -> npt.NDArray[np.uint8]:
+        """The counts, dense: 12 kB a sample of the paper's, made anew at each call."""
+        return self.windows.dense()
+
     @staticmethod
     def join(parts: list[SampleSet], windows: Windows) -> SampleSet:
         """The samples of all parts in order; works for none."""
-        if not parts:
-            shape = (0, windows.steps, windows.channels, windows.cells, windows.cells)
-            none = np.empty(0, np.int64)
-            return SampleSet(np.empty(shape, np.uint8), none, none, none)
+        shape = (windows.steps, windows.channels, windows.cells, windows.cells)
+        none = np.empty(0, np.int64)
         return SampleSet(
-            np.concatenate([part.x for part in parts]),
-            np.concatenate([part.y for part in parts]),
-            np.concatenate([part.trial for part in parts]),
-            np.concatenate([part.start_ns for part in parts]),
+            SparseWindows.join([part.windows for part in parts], shape),
+            np.concatenate([none, *(part.y for part in parts)]),
+            np.concatenate([none, *(part.trial for part in parts)]),
+            np.concatenate([none, *(part.start_ns for part in parts)]),
         )
 
+    def save(self, path: Path) -> None:
+        """Into one file, whole or not at all; `load` maps it into memory."""
+        windows = self.windows
+        arrays: Arrays = {
+            "shape": np.array(windows.shape, np.int64),
+            "offsets": windows.offsets,
+            "cell": windows.cell,
+            "count": windows.count,
+            "y": self.y,
+            "trial": self.trial,
+            "start_ns": self.start_ns,
+        }
+        write_arrays(path, arrays)
 
-def bin_recording(
+    @staticmethod
+    def load(path: Path) -> SampleSet:
+        """What `save` wrote; pages are read when they are used.
+
+        Raises:
+            OSError: there is none, or it cannot be read.
+            ValueError: it is no such file, or cut short.
+        """
+        arrays = map_arrays(path)
+        try:
+            shape = tuple(arrays["shape"].tolist())
+            windows = SparseWindows(shape, arrays["offsets"], arrays["cell"], arrays["count"])
+            return SampleSet(windows, arrays["y"], arrays["trial"], arrays["start_ns"])
+        except KeyError as error:
+            raise ValueError(f"{path}: holds no samples: {error} is missing") from error
+
+
+def cut_windows(
     recording: Recording, starts_ns: npt.NDArray[np.int64], windows: Windows
-) -> npt.NDArray[np.uint8]:
-    """Windows that begin at times of the trial's time line, binned.
+) -> SparseWindows:
+    """Windows that begin at times of the trial's time line.
 
     The starts are mapped to the camera's microseconds; the events stay as they were recorded.
     """
     events = recording.events()
     starts_us = np.asarray(recording.clock("events").to_device(starts_ns)) // 1000
     width, height = recording.record["geometry"]["event_px"]
-    return bin_events(
+    return list_events(
         events.x, events.y, events.p, events.t_us, starts_us, windows, width, height,
         crop_centre_px(recording),
     )  # fmt: skip
@@ -110,7 +146,7 @@ def trial_samples(
     starts = np.concatenate([chosen[key] for key in sorted(chosen)])
     classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])
     return SampleSet(
-        bin_recording(recording, starts, windows),
+        cut_windows(recording, starts, windows),
         classes,
         np.full(len(starts), number, np.int64),
         starts,
@@ -119,8 +155,8 @@ def trial_samples(
 
 def trial_windows(
     recording: Recording, windows: Windows
-) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
+) -> tuple[SparseWindows, npt.NDArray[np.int64]]:
     """All consecutive windows of a recording: samples, and the end of each on the time line, ns."""
     length_ns = windows.length_ms * 1_000_000
     starts = consecutive_windows(*recorded_span(recording), length_ns)
-    return bin_recording(recording, starts, windows), starts + length_ns
+    return cut_windows(recording, starts, windows), starts + length_ns

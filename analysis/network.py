@@ -1,6 +1,6 @@
 """The spiking network, written down in Sinabs: this is what "the network" means.
 
-Everything faster (`analysis.iaf`) is held to the spike counts that this file gives. Sinabs'
+Everything faster (`analysis.spiking`) is held to the spike counts that this file gives. Sinabs'
 defaults are not the paper's neuron: an IAF there may fire many times a step and keeps what is
 above the threshold, while the paper's fires once and is reset. Nothing here touches Sinabs' chip
 back end, because that imports a vendor package which installs things when it is imported.
@@ -157,3 +157,38 @@ def spike_counts(net: nn.Sequential, x: Array, batch: int = 64) -> Counts:
             out[start : start + batch] = counts.numpy().astype(np.int64)
     reset_states(net)
     return out
+
+
+GRID = (2.0**-11, 2.0**-14, 2.0**-14, 2.0**-14)
+"""What the weights of each layer of `WEIGHTED` are multiples of, once trained; see `on_grid`."""
+
+EXACT = 2**24
+"""Whole multiples of a grid below it are exact in float32, and so are their sums."""
+
+
+def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float32]]:
+    """Weights of each layer at the nearest points of its grid.
+
+    On the grid every current is a whole multiple of it. Below `EXACT` multiples, 8192 thresholds
+    in the first layer and 1024 in the others, float32 holds each partial sum exactly: then Sinabs,
+    the event-driven kernels and an exported model give the same spikes to the last one, whatever
+    order they add in, at any batch and on any number of threads. The step is 0.05 % of a threshold
+    in the first layer, whose inputs are counts of up to 255, and 0.006 % in the others.
+    """
+    return [
+        (np.rint(w / np.float32(step)) * np.float32(step)).astype(np.float32)
+        for w, step in zip(values, GRID, strict=True)
+    ]
+
+
+def exact(values: list[npt.NDArray[np.float32]], most: int = 255) -> bool:
+    """Whether weights are on the grid and no current can leave what float32 holds exactly.
+
+    Args:
+        most: events of a cell and step at the most.
+    """
+    limits = [EXACT * step / n for step, n in zip(GRID, (most, 1, 1, 1), strict=True)]
+    return all(
+        np.array_equal(w, rounded) and np.abs(w).reshape(len(w), -1).sum(axis=1).max() < limit
+        for w, rounded, limit in zip(values, on_grid(values), limits, strict=True)
+    )

@@ -1,19 +1,23 @@
 """Fitting the spiking network to windows, choosing an epoch, and keeping the result.
 
-Surrogate gradients through the fused neurons of `analysis.iaf`, cross-entropy on output spike
-counts, Adam. Two traps of spiking networks are dealt with here: a layer that never fires passes
-for a network that says "no slip" (it is named in the warnings), and a result that cannot be
-repeated (everything random comes from one seed, and the same call gives the same bits on any
-number of threads).
+Surrogate gradients through the event-driven network of `analysis.spiking`, cross-entropy on output
+spike counts, Adam. Spikes are those of weights on the grid (`analysis.network.on_grid`), and their
+gradients move the fine weights behind it: the network that is trained, validated, saved and run is
+one, to the last spike. Two traps of spiking networks are dealt with here: a layer that never fires
+passes for a network that says "no slip" (it is named in the warnings), and a result that cannot be
+repeated (everything random comes from one seed; the same call gives the same bits on any number of
+threads, and after a stop at any epoch).
 """
 
 from __future__ import annotations
 
+import io
+import math
+import pickle
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor
-from dataclasses import dataclass, field
-from typing import Any
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -22,13 +26,12 @@ from scipy.special import log_softmax
 from torch import nn
 
 from analysis import metrics
-from analysis.iaf import fused_counts, fused_layers, lone_workers
-from analysis.network import SPIKING, build, check_samples, set_weights, weights
+from analysis.network import SPIKING, WEIGHTED, build, on_grid, set_weights, weights
+from analysis.sparse import SparseWindows
+from analysis.spiking import Engine, Job, Samples, Trainer, WindowCounts, torch_weights
 from protocols.settings import Network, Training, Windows
 
-Array = npt.NDArray[Any]
-
-MICRO_BATCH = 8
+MICRO_BATCH = 4
 """Samples whose gradients are computed at once; they are summed up to ``training.batch``. Small
 enough for the processor's cache, and to give every thread something to do."""
 
@@ -98,15 +101,17 @@ class Fitted:
 
 
 def fit(
-    train_x: Array,
+    train_x: Samples,
     train_y: metrics.Labels,
-    val_x: Array,
+    val_x: Samples,
     val_y: metrics.Labels,
     network: Network,
     windows: Windows,
     training: Training,
     seed: int,
     on_epoch: Callable[[EpochRecord], None] | None = None,
+    on_state: Callable[[bytes], None] | None = None,
+    state: bytes | None = None,
 ) -> Fitted:
     """Train one network and keep its best epoch.
 
@@ -120,70 +125,73 @@ def fit(
     tie, and wrong by strict accuracy.
 
     Args:
-        train_x, val_x: event counts uint8 (n, steps, channels, cells, cells); they stay uint8
-            until a batch is made.
+        train_x, val_x: event counts uint8 (n, steps, channels, cells, cells), or sparse.
         train_y, val_y: classes, integer (n,), 0..2.
         network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
         seed: decides the first weights and the order of the samples.
         on_epoch: called with each record as soon as it is there, in the calling thread.
+        on_state: called after each epoch with all that is needed to go on from there.
+        state: what `on_state` was given last, by a call with the same arguments: training goes on
+            there and ends with the same bits. Records of the epochs before are told again.
 
     Raises:
-        ValueError: no samples, shapes that do not fit, a label that is no class.
+        ValueError: no samples, shapes that do not fit, a label that is no class, a state of
+            another training.
     """
-    net = build(network, windows, seed)
-    train_y = _check(net, train_x, train_y, "training")
-    val_y = _check(net, val_x, val_y, "validation")
-    optimizer = torch.optim.Adam(
-        [p for p in net.parameters() if p.requires_grad], lr=training.learning_rate
-    )
-    rng = np.random.default_rng([seed, 1])
-    history: list[EpochRecord] = []
-    seconds: list[float] = []
-    best, kept = 0, weights(net)
-    with lone_workers() as pool:
-        for epoch in range(1, training.epochs + 1):
+    run = _Run(network, windows, training, seed)
+    train, train_y = _check(run.trained, windows, train_x, train_y, "training")
+    val, val_y = _check(run.trained, windows, val_x, val_y, "validation")
+    if state is not None:
+        run.go_on(state)
+        if on_epoch is not None:
+            for record in run.history:
+                on_epoch(record)
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        while not run.ended:
             started = time.perf_counter()
-            order = rng.permutation(len(train_x))
-            loss, counts, rates = _one_epoch(
-                net, optimizer, train_x, train_y, order, training.batch, pool
-            )
-            val_counts = fused_counts(net, val_x, pool=pool)
+            epoch = len(run.history) + 1
+            order = np.random.default_rng([seed, epoch]).permutation(len(train))
+            loss, counts, rates = run.one_epoch(train, train_y, order, pool)
+            val_counts = Engine(run.trained, windows.cells).counts(val)
             record = _record(epoch, loss, counts, train_y, val_counts, val_y, rates)
-            history.append(record)
-            seconds.append(time.perf_counter() - started)
+            run.keep(record)
+            run.seconds.append(time.perf_counter() - started)
             if on_epoch is not None:
                 on_epoch(record)
-            if best == 0 or record.merit > history[best - 1].merit:
-                best, kept = epoch, weights(net)
-            elif epoch - best >= training.patience:
-                break
+            if on_state is not None:
+                on_state(run.state())
     return Fitted(
-        state_dict=kept,
+        state_dict=run.kept,
         network=network,
         windows=windows,
         training=training,
         seed=seed,
-        history=tuple(history),
-        chosen_epoch=best,
-        warnings=_warnings(history[best - 1]),
-        epoch_seconds=tuple(seconds),
+        history=tuple(run.history),
+        chosen_epoch=run.best,
+        warnings=_warnings(run.history[run.best - 1]),
+        epoch_seconds=tuple(run.seconds),
     )
 
 
 def restore(fitted: Fitted) -> nn.Sequential:
-    """The trained network as Sinabs modules; for `analysis.iaf.fused_counts` on a live stream."""
+    """The trained network as Sinabs modules."""
     net = build(fitted.network, fitted.windows, fitted.seed)
     set_weights(net, fitted.state_dict)
     return net
 
 
-def predict_counts(fitted: Fitted, x: Array) -> npt.NDArray[np.int64]:
+def engine(fitted: Fitted) -> Engine:
+    """What counts spikes of the trained network fast."""
+    return Engine(restore(fitted), fitted.windows.cells)
+
+
+def predict_counts(fitted: Fitted, x: Samples) -> npt.NDArray[np.int64]:
     """Output spikes int64 (n, 3) of samples (n, steps, channels, cells, cells).
 
     Raises:
         ValueError: samples of another shape.
     """
-    return fused_counts(restore(fitted), x)
+    return engine(fitted).counts(x)
 
 
 def limit_threads(count: int) -> None:
@@ -201,49 +209,133 @@ class _Part:
     gradients: tuple[torch.Tensor, ...]
 
 
-def _one_epoch(
-    net: nn.Sequential,
-    optimizer: torch.optim.Optimizer,
-    x: Array,
-    y: metrics.IntArray,
-    order: metrics.IntArray,
-    batch: int,
-    pool: Executor,
-) -> tuple[float, metrics.IntArray, dict[str, float]]:
-    """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates.
+class _Run:
+    """A training between two epochs."""
 
-    Parts of a batch are computed in any order and added up in theirs: the sum has the same bits
-    on any number of threads.
-    """
-    parameters = [p for p in net.parameters() if p.requires_grad]
+    def __init__(self, network: Network, windows: Windows, training: Training, seed: int) -> None:
+        self.training = training
+        self.fine = build(network, windows, seed)
+        self.trained = build(network, windows, seed)
+        """Has the fine weights at their points of the grid."""
+        self.parameters = [getattr(self.fine, name).weight for name in WEIGHTED]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=training.learning_rate)
+        self.trainer = Trainer(self.trained, windows.cells)
+        self.history: list[EpochRecord] = []
+        self.seconds: list[float] = []
+        self.best = 0
+        self.to_grid()
+        self.kept = weights(self.trained)
 
-    def compute(rows: metrics.IntArray) -> _Part:
-        layers = fused_layers(net, torch.from_numpy(x[rows].astype(np.float32)))
-        out = layers[SPIKING[-1]].sum(dim=1)
-        loss = nn.functional.cross_entropy(out, torch.from_numpy(y[rows]), reduction="sum")
-        return _Part(
-            loss=loss.item(),
-            counts=out.detach().numpy().astype(np.int64),
-            rates={name: spikes.detach().mean().item() for name, spikes in layers.items()},
-            gradients=torch.autograd.grad(loss, parameters),
+    def to_grid(self) -> None:
+        """Let the spikes be those of the fine weights as they are now."""
+        values = on_grid(torch_weights(self.fine))
+        self.trainer.take(values)
+        with torch.no_grad():
+            for name, value in zip(WEIGHTED, values, strict=True):
+                getattr(self.trained, name).weight.copy_(torch.from_numpy(value))
+
+    @property
+    def ended(self) -> bool:
+        """Whether all epochs were run, or none of late was better."""
+        done = len(self.history)
+        return done >= self.training.epochs or (
+            self.best > 0 and done - self.best >= self.training.patience
         )
 
-    loss = 0.0
-    counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
-    fired = dict.fromkeys(SPIKING, 0.0)
-    for start in range(0, len(x), batch):
-        chosen = order[start : start + batch]
-        rows = [chosen[k : k + MICRO_BATCH] for k in range(0, len(chosen), MICRO_BATCH)]
-        parts = list(pool.map(compute, rows))
-        for row, part in zip(rows, parts, strict=True):
-            loss += part.loss
-            counts[row] = part.counts
-            for name, rate in part.rates.items():
-                fired[name] += rate * len(row)
-        for parameter, *gradients in zip(parameters, *(p.gradients for p in parts), strict=True):
-            parameter.grad = torch.stack(gradients).sum(dim=0) / len(chosen)
-        optimizer.step()
-    return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
+    def one_epoch(
+        self, x: SparseWindows, y: metrics.IntArray, order: metrics.IntArray, pool: Executor
+    ) -> tuple[float, metrics.IntArray, dict[str, float]]:
+        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates.
+
+        Parts of a batch are computed in any order and added up in theirs: the sum has the same
+        bits on any number of threads.
+        """
+        batch = self.training.batch
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.training, len(self.history))
+
+        def compute(rows: metrics.IntArray) -> _Part:
+            job = Job(self.trainer, x, rows)
+            out = WindowCounts.apply(job, *self.trainer.leaves)  # type: ignore[no-untyped-call]
+            rates = job.rates()
+            loss = nn.functional.cross_entropy(out, torch.from_numpy(y[rows]), reduction="sum")
+            return _Part(
+                loss=loss.item(),
+                counts=out.detach().numpy().astype(np.int64),
+                rates=rates,
+                gradients=torch.autograd.grad(loss, self.trainer.leaves),
+            )
+
+        loss = 0.0
+        counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
+        fired = dict.fromkeys(SPIKING, 0.0)
+        for start in range(0, len(x), batch):
+            chosen = order[start : start + batch]
+            rows = [chosen[k : k + MICRO_BATCH] for k in range(0, len(chosen), MICRO_BATCH)]
+            parts = list(pool.map(compute, rows))
+            for row, part in zip(rows, parts, strict=True):
+                loss += part.loss
+                counts[row] = part.counts
+                for name, rate in part.rates.items():
+                    fired[name] += rate * len(row)
+            sums = [
+                torch.stack(each).sum(dim=0).numpy()
+                for each in zip(*(part.gradients for part in parts), strict=True)
+            ]
+            total = self.trainer.layout.unpack(sums)
+            for parameter, gradient in zip(self.parameters, total, strict=True):
+                parameter.grad = torch.from_numpy(gradient) / len(chosen)
+            self.optimizer.step()
+            self.to_grid()
+        return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
+
+    def keep(self, record: EpochRecord) -> None:
+        """An epoch is over; its weights are kept if it is the best yet."""
+        self.history.append(record)
+        if self.best == 0 or record.merit > self.history[self.best - 1].merit:
+            self.best, self.kept = record.epoch, weights(self.trained)
+
+    def state(self) -> bytes:
+        """Everything that the epochs to come depend on."""
+        buffer = io.BytesIO()
+        content = {
+            "fine": weights(self.fine),
+            "optimizer": self.optimizer.state_dict(),
+            "kept": self.kept,
+            "best": self.best,
+            "history": [asdict(record) for record in self.history],
+            "seconds": self.seconds,
+        }
+        torch.save(content, buffer)
+        return buffer.getvalue()
+
+    def go_on(self, state: bytes) -> None:
+        """Take up what `state` gave.
+
+        Raises:
+            ValueError: it is damaged, or of another network.
+        """
+        try:
+            content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
+            set_weights(self.fine, content["fine"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.kept, self.best = content["kept"], content["best"]
+            self.history = [EpochRecord(**record) for record in content["history"]]
+            self.seconds = content["seconds"]
+        except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise ValueError(f"not a state of this training: {error}") from error
+        self.to_grid()
+
+
+def learning_rate(training: Training, done: int) -> float:
+    """Of the epoch after `done` epochs.
+
+    Constant, or falling from the full rate to nothing along half a cosine over all epochs
+    (Loshchilov and Hutter, 2017, without restarts).
+    """
+    if training.schedule == "constant":
+        return training.learning_rate
+    return training.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / training.epochs))
 
 
 def _record(
@@ -281,11 +373,13 @@ def _warnings(record: EpochRecord) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _check(net: nn.Sequential, x: Array, y: metrics.Labels, what: str) -> metrics.IntArray:
+def _check(
+    net: nn.Sequential, windows: Windows, x: Samples, y: metrics.Labels, what: str
+) -> tuple[SparseWindows, metrics.IntArray]:
     y = metrics.check_labels(y)
     if not len(y) or len(x) != len(y):
         raise ValueError(f"{len(x)} {what} samples and {len(y)} labels; expected as many, not none")
-    check_samples(net, x.shape)
-    if x.dtype != np.uint8:
-        raise ValueError(f"{what} samples are {x.dtype}; expected uint8 counts")
-    return y
+    try:
+        return Engine(net, windows.cells).sparse(x), y
+    except ValueError as error:
+        raise ValueError(f"{what} {error}") from error

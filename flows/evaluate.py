@@ -24,8 +24,9 @@ from flows.detector_work import DetectorWork, detector_work
 from flows.label_errors import label_errors, rules_compared
 from flows.orchestration import Parcel, run
 from flows.reviewed import Labels
+from flows.samples import load_samples
 from flows.timing import timed
-from flows.train import Model, load_samples, training_settings, wanted_models
+from flows.train import Model, training_settings, wanted_models
 from protocols import Trial
 from protocols.settings import Detection
 from storage.derived import Derived, make_key
@@ -145,7 +146,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
 def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
     """The chosen samples of the test trials: the network and the baselines beside it."""
     settings = training_settings(job.campaigns)
-    counts = training.predict_counts(model_file.load(job.model.path), test.x)
+    counts = training.predict_counts(model_file.load(job.model.path), test.windows)
     margin = settings.detection.margin
     by_trial = {
         str(number): asdict(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,19 +16,18 @@ from flows import console
 from flows.campaigns import Collected, training_campaigns
 from flows.orchestration import Parcel, run
 from flows.reviewed import Labels
+from flows.samples import load_samples
 from flows.timing import timed
-from flows.trial_work import TrialWork, each_trial
-from protocols.hashing import hash_integer
-from protocols.settings import AnalysisSettings, Samples, Windows
+from flows.training_progress import progress
+from protocols.settings import AnalysisSettings
 from storage.derived import make_key
-from storage.files import read_json, write_json
-from storage.recording import Recording
+from storage.files import read_json, write_bytes, write_json
 from storage.store import Store, StoreError
 
 if TYPE_CHECKING:
     from flows.cluster import Cluster
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,16 @@ class Model:
     def info_path(self) -> Path:
         """The JSON beside the model file; written last, it decides."""
         return self.path.with_suffix(".json")
+
+    @property
+    def state_path(self) -> Path:
+        """Where its training is kept after each epoch, to go on there after a stop."""
+        return self.path.with_suffix(f".{self.key[:16]}.state")
+
+    @property
+    def curves_path(self) -> Path:
+        """The training curves, drawn anew after each epoch."""
+        return self.path.with_suffix(".svg")
 
     @property
     def fresh(self) -> bool:
@@ -91,78 +101,27 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     return models
 
 
-def load_samples(
-    labels: Labels, campaigns: list[Collected], split: str, cluster: Cluster | None = None
-) -> SampleSet:
-    """The samples of all trials of one split of the kinematic campaigns.
-
-    Without a cluster in this process: a trial takes 10 ms. With one it stands in a flow.
-    """
-    used = training_campaigns(campaigns)
-    windows = used[0].settings.windows
-    work = [
-        TrialWork(
-            recording, item.name, "",
-            _Wanted(
-                labels.read(item, recording), trial.index, windows,
-                item.settings.samples, hash_integer("samples", trial.id),
-            ),
-        )
-        for item in used
-        for trial, recording in item.of_split(split)
-    ]  # fmt: skip
-    parts: dict[int, SampleSet] = {}
-    each_trial(
-        labels.store,
-        f"samples to {split}",
-        work,
-        _samples,
-        parts.__setitem__,
-        cluster,
-        processes=False,
-    )
-    return SampleSet.join([parts[number] for number in range(len(work))], windows)
-
-
-@dataclass(frozen=True)
-class _Wanted:
-    """What a trial's samples depend on besides the trial: see `dataset.trial_samples`."""
-
-    label: dict[str, Any]
-    number: int
-    windows: Windows
-    samples: Samples
-    seed: int
-
-
-def _samples(recording: Recording, wanted: _Wanted) -> SampleSet:
-    return dataset.trial_samples(
-        recording, wanted.label, wanted.number, wanted.windows, wanted.samples, wanted.seed
-    )
-
-
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]]) -> int:
+def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings, bool]]) -> int:
     """Train one network and keep it."""
-    model, train, validation, settings = job.content
-    total = settings.training.epochs
-    with console.bar(f"train seed {model.seed} (epochs)", total) as bar:
+    model, train, validation, settings, simulated = job.content
+    model.path.parent.mkdir(parents=True, exist_ok=True)
+    with progress(model, settings.training.epochs, simulated) as told:
         fitted = training.fit(
-            train.x,
+            train.windows,
             train.y,
-            validation.x,
+            validation.windows,
             validation.y,
             settings.network,
             settings.windows,
             settings.training,
             model.seed,
-            on_epoch=lambda record: bar.advance(
-                1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict"
-            ),
+            on_epoch=told.epoch,
+            on_state=partial(write_bytes, model.state_path),
+            state=begun(model),
         )
     for warning in fitted.warnings:
         console.say(f"warning: {warning}")
-    model.path.parent.mkdir(parents=True, exist_ok=True)
     model_file.save(model.path, fitted)
     info = {
         "key": model.key,
@@ -177,7 +136,17 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings]])
         "warnings": list(fitted.warnings),
     }
     write_json(model.info_path, info)
+    for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
+        left.unlink()
     return model.seed
+
+
+def begun(model: Model) -> bytes | None:
+    """Where a training of this model stopped; None where it never began."""
+    try:
+        return model.state_path.read_bytes()
+    except FileNotFoundError:
+        return None
 
 
 @flow(name="train", validate_parameters=False, persist_result=False)
@@ -187,6 +156,7 @@ def train_flow(
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models, cluster = wanted.content
     settings = training_settings(campaigns)
+    simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
     with timed(labels.store, "train"):
         train = load_samples(labels, campaigns, "train", cluster)
         validation = load_samples(labels, campaigns, "validation", cluster)
@@ -194,7 +164,7 @@ def train_flow(
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
         for model in models:
-            train_one(Parcel((model, train, validation, settings)))
+            train_one(Parcel((model, train, validation, settings, simulated)))
     return len(models)
 
 

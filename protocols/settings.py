@@ -112,6 +112,8 @@ class Training(StrictModel):
     epochs: int = Field(default=12, ge=1, le=10_000)
     batch: int = Field(default=32, ge=1, le=4096)
     learning_rate: float = Field(default=2e-3, gt=0, le=1)
+    schedule: Literal["constant", "cosine"] = "constant"
+    """Of the learning rate over the epochs."""
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[int, ...] = (0,)

@@ -11,8 +11,15 @@ import torch
 
 from analysis import metrics, training
 from analysis.model_file import FORMAT, load, save
-from analysis.network import build, spike_counts, weights
-from analysis.training import EpochRecord, Fitted, fit, predict_counts, restore
+from analysis.network import GRID, build, exact, spike_counts, weights
+from analysis.training import (
+    EpochRecord,
+    Fitted,
+    fit,
+    learning_rate,
+    predict_counts,
+    restore,
+)
 from protocols.settings import Network, Training, Windows
 
 NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
@@ -157,6 +164,52 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
         assert differs.float().mean() < 0.01
 
 
+@pytest.mark.parametrize("stop", [1, 3])
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_a_training_goes_on_to_the_same_bits(stop: int, schedule: str) -> None:
+    """Killed after any epoch, it ends with the weights and records of an undisturbed one."""
+    states: list[bytes] = []
+    settings = TRAINING.model_copy(update={"epochs": 4, "schedule": schedule})
+    rest = (*TRAIN, *VAL, NETWORK, WINDOWS, settings, 0)
+    whole = fit(*rest, on_state=states.append)
+    told: list[EpochRecord] = []
+    again = fit(*rest, on_epoch=told.append, state=states[stop - 1])
+    assert again.history == whole.history == tuple(told)
+    assert again.chosen_epoch == whole.chosen_epoch
+    for name, value in whole.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+    assert fit(*rest, state=states[-1]).history == whole.history  # nothing was left to do
+
+
+@pytest.mark.parametrize("spoilt", [b"", b"nonsense", None])
+def test_a_damaged_state_is_refused(spoilt: bytes | None) -> None:
+    if spoilt is None:  # whole, but of another network
+        states: list[bytes] = []
+        other = Network(conv1_channels=3, conv2_channels=4, hidden=12)
+        few = TRAINING.model_copy(update={"epochs": 1})
+        fit(*TRAIN, *VAL, other, WINDOWS, few, 0, on_state=states.append)
+        spoilt = states[0]
+    with pytest.raises(ValueError, match=r"state of this training|expected"):
+        fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, state=spoilt)
+
+
+def test_the_rate_falls_along_half_a_cosine() -> None:
+    falling = Training(epochs=10, learning_rate=1e-2, schedule="cosine")
+    rates = [learning_rate(falling, done) for done in range(10)]
+    assert rates[0] == 1e-2
+    assert rates[5] == pytest.approx(5e-3)
+    assert 0 < rates[-1] < 3e-4
+    assert rates == sorted(rates, reverse=True)
+    assert {learning_rate(TRAINING, done) for done in range(5)} == {TRAINING.learning_rate}
+
+
+def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
+    values = [value.numpy() for value in fitted.state_dict.values()]
+    for value, step in zip(values, GRID, strict=True):
+        assert not np.any(np.mod(value.astype(np.float64), step))
+    assert exact(values)
+
+
 def test_silent_layers_are_named() -> None:
     network = NETWORK.model_copy(update={"weight_scale": (1e-3, 1.0, 1.0, 1.0)})
     settings = Training(epochs=1, batch=64, learning_rate=1e-9)
@@ -275,7 +328,7 @@ def test_a_missing_file_is_missing(tmp_path: Path) -> None:
 
 def test_wrong_samples_are_named() -> None:
     (x, y), rest = TRAIN, (NETWORK, WINDOWS, TRAINING, 0)
-    with pytest.raises(ValueError, match="training samples are float64; expected uint8"):
+    with pytest.raises(ValueError, match=r"training samples are float64 .*; expected uint8"):
         fit(x.astype(float), y, *VAL, *rest)
     with pytest.raises(ValueError, match="0 validation samples"):
         fit(x, y, x[:0], y[:0], *rest)

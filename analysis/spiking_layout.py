@@ -1,0 +1,252 @@
+"""Where weights and neurons lie for the event-driven kernels; and back to torch's shapes.
+
+The kernels know nothing of convolutions: a layer is a table of what each source reaches
+(`analysis.spiking_kernels`). This file makes the four tables of the network and packs its weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
+U32 = npt.NDArray[np.uint32]
+
+LANES = 8
+"""Planes hold a multiple of so many neurons, because spikes are looked for eight at a time."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Neurons of a layer: a square of channels-last pixels in a border, or a row of neurons.
+
+    Attributes:
+        side: pixels a side without the border.
+        channels: neurons a pixel.
+        pad: pixels of border before the first, along both axes.
+        full: pixels a side with the border.
+    """
+
+    side: int
+    channels: int
+    pad: int
+    full: int
+
+    @property
+    def size(self) -> int:
+        """Neurons with the border, a multiple of `LANES`."""
+        return -(-self.full * self.full * self.channels // LANES) * LANES
+
+    def index(self) -> I64:
+        """Places of the neurons proper, int64 (side, side, channels)."""
+        line = np.arange(self.pad, self.pad + self.side)
+        pixel = line[:, None] * self.full + line
+        return pixel[:, :, None] * self.channels + np.arange(self.channels)
+
+    def rest(self) -> F32:
+        """Potentials before a window: zero, and minus infinity in the border."""
+        values = np.full(self.size, -np.inf, np.float32)
+        values[self.index().ravel()] = 0.0
+        return values
+
+
+@dataclass(frozen=True)
+class Table:
+    """What the sources of a layer reach, and where its weights are packed.
+
+    Attributes:
+        reach: uint32 (sources, 4), see `analysis.spiking_kernels.scatter`.
+        stride_w, stride: from a run to the next among weights and among currents.
+        order: int64, for each packed weight its place in torch's flattened weight; -1 for none.
+        target: the neurons.
+    """
+
+    reach: U32
+    stride_w: int
+    stride: int
+    order: I64
+    target: Plane
+
+    def pack(self, weight: F32) -> F32:
+        """A weight of torch's shape, packed."""
+        flat = np.append(weight.ravel(), np.float32(0.0))
+        return np.ascontiguousarray(flat[self.order])
+
+    def unpack(self, packed: F32, shape: tuple[int, ...]) -> F32:
+        """What was summed up by packed weight, in torch's shape."""
+        return packed[self.back].reshape(shape)
+
+    @cached_property
+    def back(self) -> I64:
+        """For each of torch's weights its place among the packed."""
+        there = np.flatnonzero(self.order >= 0)
+        places = np.empty(there.size, np.int64)
+        places[self.order[there]] = there
+        return places
+
+
+def first_convolution(channels: int, cells: int, c1: int, kernel: int, plane: Plane) -> Table:
+    """From the input's cells (channel, y, x); torch's weight is (c1, channels, kernel, kernel).
+
+    A unit at (y, x) reaches outputs y + kernel // 2 - d by tap d, for each d: in the order of
+    outputs the taps are reversed.
+    """
+    p = kernel // 2
+    taps = np.arange(kernel)[::-1]
+    o = np.arange(c1)[None, None, None, :]
+    i = np.arange(channels)[:, None, None, None]
+    order = ((o * channels + i) * kernel + taps[None, :, None, None]) * kernel
+    order = order + taps[None, None, :, None]
+    reach = np.zeros((channels, cells, cells, 4), np.uint32)
+    line = np.arange(cells) + plane.pad - p
+    reach[..., 0] = (line[:, None] * plane.full + line) * c1
+    reach[..., 1] = i[:, :, :, 0] * kernel * kernel * c1
+    reach[..., 2], reach[..., 3] = kernel, kernel * c1
+    return Table(reach.reshape(-1, 4), kernel * c1, plane.full * c1, order.ravel(), plane)
+
+
+def strided_taps(kernel: int) -> tuple[list[list[int]], list[int]]:
+    """For even and odd positions: the taps that a stride of 2 leaves, and the first output.
+
+    Output o is reached from position y by tap d = y + kernel // 2 - 2 o. Taps are in the order of
+    outputs; the first output is counted from y // 2.
+    """
+    p = kernel // 2
+    taps = [[d for d in reversed(range(kernel)) if (parity + p - d) % 2 == 0] for parity in (0, 1)]
+    return taps, [(parity + p - of[0]) // 2 if of else 0 for parity, of in enumerate(taps)]
+
+
+def strided_plane(cells: int, c2: int, kernel: int) -> Plane:
+    """The neurons of the second convolution, with room for every tap."""
+    taps, first = strided_taps(kernel)
+    side = (cells + 1) // 2
+    pad = max(0, *(-at for at in first))
+    ends = [y // 2 + first[y % 2] + len(taps[y % 2]) for y in range(cells)]
+    return Plane(side, c2, pad, pad + max(side, *ends))
+
+
+def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
+    """From layer 1, stride 2; torch's weight is (c2, c1, kernel, kernel)."""
+    taps, first = strided_taps(kernel)
+    c1, c2 = below.channels, plane.channels
+    most = max(map(len, taps))
+    order = np.full((c1, 2, 2, most, most, c2), -1, np.int64)
+    i, o = np.arange(c1)[:, None], np.arange(c2)[None, :]
+    for py in (0, 1):
+        for px in (0, 1):
+            for a, dy in enumerate(taps[py]):
+                for b, dx in enumerate(taps[px]):
+                    order[:, py, px, a, b] = ((o * c1 + i) * kernel + dy) * kernel + dx
+    reach = np.zeros((below.size, 4), np.uint32)
+    line = np.arange(below.side)
+    parity = line % 2
+    at = line // 2 + np.array(first)[parity] + plane.pad
+    many = np.array([len(of) for of in taps])[parity]
+    index = below.index()
+    reach[index, 0] = ((at[:, None] * plane.full + at) * c2)[:, :, None]
+    block = most * most * c2
+    reach[index, 1] = ((np.arange(c1) * 2 + parity[:, None, None]) * 2 + parity[:, None]) * block
+    reach[index, 2] = many[:, None, None]
+    reach[index, 3] = many[None, :, None] * c2
+    reach[reach[:, 3] == 0, 2] = 0
+    return Table(reach, most * c2, plane.full * c2, order.ravel(), plane)
+
+
+def full_layer(below: Plane, n: int) -> Table:
+    """From all of a layer; torch's weight is (n, channels * side * side), channels first."""
+    plane = Plane(1, n, 0, 1)
+    index = below.index()
+    sources = index.transpose(2, 0, 1).ravel()  # in the order in which torch flattens
+    order = np.full((below.size, n), -1, np.int64)
+    order[sources] = np.arange(n)[None, :] * sources.size + np.arange(sources.size)[:, None]
+    reach = np.zeros((below.size, 4), np.uint32)
+    reach[:, 1] = np.arange(below.size) * n
+    reach[sources, 2], reach[:, 3] = 1, n
+    return Table(reach, n, n, order.ravel(), plane)
+
+
+def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
+    """For the way back through the second convolution: uint32 (pixels, 2).
+
+    A pixel's first neuron in its plane, and where tap (0, 0) falls in the plane below.
+    """
+    line = np.arange(plane.side)
+    here = (line[:, None] + plane.pad) * plane.full + line + plane.pad
+    there = 2 * line + below.pad - kernel // 2
+    under = there[:, None] * below.full + there
+    pixels = np.stack([here * plane.channels, under * below.channels], axis=-1)
+    return pixels.reshape(-1, 2).astype(np.uint32)
+
+
+class Layout:
+    """Tables of a network, by the shapes of its weights and the cells along a sample's side."""
+
+    def __init__(self, shapes: tuple[tuple[int, ...], ...], cells: int) -> None:
+        (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (out, _) = shapes
+        self.shapes = shapes
+        pad = max(k1 // 2, k2 // 2)
+        one = Plane(cells, c1, pad, cells + 2 * pad + 1)
+        two = strided_plane(cells, c2, k2)
+        three = full_layer(two, hidden)
+        self.tables = (
+            first_convolution(channels, cells, c1, k1, one),
+            second_convolution(one, k2, two),
+            three,
+            full_layer(three.target, out),
+        )
+        planes = [table.target for table in self.tables]
+        self.rest = tuple(plane.rest() for plane in planes)
+        self.neurons = tuple(plane.side * plane.side * plane.channels for plane in planes)
+
+    def layers(self, weights: list[F32]) -> tuple[Any, ...]:
+        """What the kernels take for a network's weights in torch's shapes."""
+        return (
+            tuple(table.reach for table in self.tables),
+            tuple(table.pack(w) for table, w in zip(self.tables, weights, strict=True)),
+            tuple(np.uint64(table.stride_w) for table in self.tables),
+            tuple(np.uint64(table.stride) for table in self.tables),
+        )
+
+    def back(self, weights: list[F32]) -> tuple[Any, ...]:
+        """What `analysis.spiking_gradients.backward` takes for them."""
+        c2, _, kernel, _ = self.shapes[1]
+        one, two, three, _ = (table.target for table in self.tables)
+        of3 = self.tables[2].pack(weights[2]).reshape(two.size, -1)
+        of4 = self.tables[3].pack(weights[3]).reshape(three.size, -1)
+        return (
+            strided_back(one, kernel, two),
+            np.ascontiguousarray(weights[1].transpose(0, 2, 3, 1)).reshape(c2, kernel, -1),
+            np.ascontiguousarray(of3.T),
+            np.ascontiguousarray(of4.T),
+        )
+
+    def unpack(self, grads: Sequence[F32]) -> list[F32]:
+        """Gradients by packed weights, in torch's shapes."""
+        return [
+            table.unpack(grad, shape)
+            for table, grad, shape in zip(self.tables, grads, self.shapes, strict=True)
+        ]
+
+    def state(self) -> tuple[F32, ...]:
+        """Potentials of each layer at rest."""
+        return tuple(rest.copy() for rest in self.rest)
+
+    def scratch(self) -> tuple[Any, ...]:
+        """Memory for one thread; see `analysis.spiking_kernels.step`."""
+        sizes = [len(rest) for rest in self.rest]
+        fired = np.zeros(max(sizes), np.uint8)
+        rows = self.tables[0].target.full
+        return (
+            tuple(np.zeros(size, np.float32) for size in sizes),
+            fired,
+            fired.view(np.uint64),
+            tuple(np.zeros(size, np.uint64) for size in sizes),
+            np.zeros(rows, np.uint64),
+            np.zeros(rows, np.uint64),
+        )
