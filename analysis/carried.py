@@ -13,37 +13,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from numba import njit
-from torch import nn
 
 from analysis.metrics import CLASSES
-from analysis.network import SPIKING, check_samples
-
-CHUNK = 32
-"""Windows at a time; results do not depend on it."""
+from analysis.sparse import SparseWindows
+from analysis.spiking import Engine
 
 
-@njit(cache=True, nogil=True)
-def _fire_on(current: Any, threshold: Any, potential: Any, spikes: Any) -> None:
-    """Spikes of currents (steps, features) from `potential` (features,) on, which it leaves."""
-    steps, features = current.shape
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for t in range(steps):
-        for f in range(features):
-            u = potential[f] + current[t, f]
-            fired = u - threshold >= zero
-            spikes[t, f] = one if fired else zero
-            potential[f] = zero if fired else u
-
-
-def carried_spikes(net: nn.Sequential, x: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+def carried_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
     """Output spikes of every step of consecutive windows, states kept from each to the next.
 
     Args:
-        net: from `analysis.network.build` or `analysis.training.restore`; single spikes, reset to
-            zero. Its own neuron states are neither used nor changed.
-        x: event counts (n, steps, channels, cells, cells), windows that follow each other.
+        engine: the network; see `analysis.training.engine`.
+        x: n windows that follow each other.
 
     Returns:
         uint8 (n * steps, 3), 0 or 1.
@@ -51,24 +32,13 @@ def carried_spikes(net: nn.Sequential, x: npt.NDArray[Any]) -> npt.NDArray[np.ui
     Raises:
         ValueError: samples of another shape.
     """
-    check_samples(net, x.shape)
-    steps = x.shape[1]
-    out = np.zeros((len(x) * steps, len(CLASSES)), np.uint8)
-    kept: dict[str, npt.NDArray[np.float32]] = {}
-    with torch.no_grad():
-        for start in range(0, len(x), CHUNK):
-            y = torch.from_numpy(x[start : start + CHUNK].astype(np.float32)).flatten(0, 1)
-            for name, layer in net.named_children():
-                if name not in SPIKING:
-                    y = layer(y)
-                    continue
-                current = y.contiguous().view(len(y), -1)
-                potential = kept.setdefault(name, np.zeros(current.shape[1], np.float32))
-                threshold = np.float32(float(layer.spike_threshold))  # type: ignore[arg-type]
-                spikes = torch.empty_like(current)
-                _fire_on(current.numpy(), threshold, potential, spikes.numpy())
-                y = spikes.view(y.shape)
-            out[start * steps : start * steps + len(y)] = y.numpy().astype(np.uint8)
+    if x.shape != engine.shape:
+        raise ValueError(f"samples have the shape {x.shape}; expected {engine.shape}")
+    planes = x.dense().reshape(-1, *engine.shape[1:])
+    out = np.zeros((len(planes), len(CLASSES)), np.uint8)
+    stream = engine.stream()
+    for step, plane in enumerate(planes):
+        out[step] = stream.push(plane)
     return out
 
 

@@ -42,8 +42,8 @@ def choice_note(settings: dict[str, Any]) -> str:
         return "Smoothing and margin were chosen by validation trials."
     if settings["choose"] == "test":
         return (
-            "Smoothing and margin were chosen by the kinematic test trials themselves, as in the paper: "
-            "what is measured on them flatters."
+            "Smoothing and margin were chosen by the kinematic test trials themselves, as in the "
+            "paper: what is measured on them flatters."
         )
     return ""
 

@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 HEARD = "heard"
 VERSION = 1
 
-AT_ONCE = 1024
-"""Windows that are binned at a time, so that a fine stride does not fill the memory."""
-
 
 def heard_step(stride_ms: int, carried: bool = False) -> str:
     """Where results of a stride stand: those of different strides do not displace each other."""
@@ -138,14 +135,10 @@ def _reset(
     starts = strided_windows(
         *dataset.recorded_span(recording), length_ns, hearing.stride_ms * 1_000_000
     )
-    counts, events = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
-    for first in range(0, len(starts), AT_ONCE):
-        x = dataset.bin_recording(recording, starts[first : first + AT_ONCE], hearing.windows)
-        counts.append(training.predict_counts(fitted, x))
-        events.append(x.reshape(len(x), -1).sum(axis=1, dtype=np.int64))
+    x = dataset.cut_windows(recording, starts, hearing.windows)
     return {
-        "counts": np.concatenate(counts),
-        "events": np.concatenate(events),
+        "counts": training.predict_counts(fitted, x),
+        "events": x.totals,
         "end_ns": starts + length_ns,
     }
 
@@ -156,8 +149,9 @@ def _carried(
     """One run through the trial; windows are where one looks back."""
     windows = hearing.windows
     x, ends = dataset.trial_windows(recording, windows)
-    spikes = carried_spikes(training.restore(fitted), x)
-    events = x.reshape(len(spikes), -1).sum(axis=1, dtype=np.int64)
+    spikes = carried_spikes(training.engine(fitted), x)
+    running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
+    events = np.diff(running[x.offsets])
     length, stride = windows.steps, hearing.stride_ms // windows.step_ms
     counts = trailing_sums(spikes, length, stride)
     first = int(ends[0]) if len(ends) else 0
