@@ -113,7 +113,7 @@ class Reading:
 
     Attributes:
         likelihood: fitted on training trials.
-        events: whether the number of events is among the features, beside the counts.
+        events: whether the number of events is among the features; see `features`.
         weight: factor on log likelihoods. Windows that overlap hold each event several times:
             stride over length counts it once again.
     """
@@ -185,11 +185,16 @@ def first_above(evidence: FloatArray, level: float, start: int = 0) -> int | Non
 
 
 def features(heard: Heard, events: bool) -> FloatArray:
-    """The counts, with the logarithm of one plus the events if wanted; float64 (n, 3 or 4)."""
+    """The counts; if wanted, the logarithm of one plus the events, and all products of two.
+
+    float64 (n, 3), or (n, 14) with events; the counts come first.
+    """
     counts = heard.counts.astype(np.float64)
     if not events:
         return counts
-    return np.concatenate([counts, np.log1p(heard.events)[:, None]], axis=1)
+    each = [*counts.T, np.log1p(heard.events)]
+    products = [one * other for k, one in enumerate(each) for other in each[k:]]
+    return np.stack([*each, *products], axis=1)
 
 
 @dataclass(frozen=True)
@@ -228,7 +233,7 @@ def learn(trials: Sequence[Labelled], length_ns: int, steps: int) -> Learned:
     """
     labels = [trial.states(length_ns) for trial in trials]
     flat = np.concatenate([np.empty(0, np.int64), *labels])
-    both = np.concatenate([np.empty((0, 4)), *(features(t.heard, True) for t in trials)])
+    both = np.concatenate([np.empty((0, 14)), *(features(t.heard, True) for t in trials)])
     counts = both[:, :3]
     classes = len(CLASSES)
     return Learned(
