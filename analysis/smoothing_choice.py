@@ -2,7 +2,9 @@
 
 The paper chose its window by the latency on test trials, and then reported that latency. Here the
 choice is made on validation trials unless somebody asks for the paper's way, and a bound on false
-early detections keeps the quickest setting from being the one that always cries slip.
+early detections keeps the quickest setting from being the one that always cries slip. It holds for
+either onset: one margin serves both, and without a bound on the second the quickest first
+detection was bought with gross slip cried in nine trials of ten.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ class Choice:
         smoothing, margin: the chosen ones.
         split: the trials that chose, ``validation`` or ``test``.
         trials: how many there were.
-        allowed, false_early: trials that could be and were false early.
+        allowed: trials that may be false early, for either onset.
+        false_early, false_early_gross: trials that were.
         median_ms: their median incipient latency, a missed one infinitely late; None if so.
     """
 
@@ -47,6 +50,7 @@ class Choice:
     trials: int
     allowed: int
     false_early: int
+    false_early_gross: int
     median_ms: float | None
 
 
@@ -54,8 +58,8 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
     """The pair of the grid with the lowest median incipient latency within the bound.
 
     Among equals the lower 95th percentile, then fewer false early, then the shorter window, then
-    the wider margin. If no pair keeps the bound, the one with fewest false early is taken: the
-    result says both numbers.
+    the wider margin. If no pair keeps the bound for both onsets, the one that exceeds it least is
+    taken: the result says the numbers.
 
     Args:
         settings: grid, bound and tolerance; its own smoothing and margin are not looked at.
@@ -79,10 +83,12 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
                 for t in trials
             ]
             early = sum(s.false_early_incipient for s in scored)
+            gross = sum(s.false_early_gross for s in scored)
             median, high = merit(scored)
-            rank = (max(early - allowed, 0), median, high, early, smoothing, -margin)
-            found.append((rank, early, median))
-    (*_, smoothing, negative), early, median = min(found)
+            excess = max(early - allowed, 0) + max(gross - allowed, 0)
+            rank = (excess, median, high, early + gross, smoothing, -margin)
+            found.append((rank, early, gross, median))
+    (*_, smoothing, negative), early, gross, median = min(found)
     return Choice(
         smoothing=int(smoothing),
         margin=-negative,
@@ -90,6 +96,7 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
         trials=len(trials),
         allowed=allowed,
         false_early=early,
+        false_early_gross=gross,
         median_ms=median if np.isfinite(median) else None,
     )
 

@@ -125,6 +125,17 @@ def test_the_quickest_pair_within_the_bound_is_chosen() -> None:
     assert settled(ask, None) is ask
 
 
+def test_the_bound_holds_for_gross_slip_too() -> None:
+    # one window of gross slip long before it truly begins: it fools a single window only
+    quiet, slip, stray, gross = (9, 0, 0), (0, 9, 0), (0, 0, 9), (0, 0, 9)
+    rows = [*[quiet] * 8, *[slip] * 8, stray, *[slip] * 8, *[gross] * 6]
+    one = counted(rows, 8)
+    trial = Counted(one.counts, one.end_ns, one.incipient_ns, 25 * 30 * MS)
+    ask = Detection(smoothing_grid=(1, 4), margin_grid=(2.0,), false_early_rate=0.0)
+    choice = choose_smoothing([trial], ask, "validation")
+    assert (choice.smoothing, choice.false_early, choice.false_early_gross) == (4, 0, 0)
+
+
 def test_where_nothing_keeps_the_bound_the_fewest_are_taken_and_said() -> None:
     trials = [counted([(0, 9, 0)] * 20, 15)] * 3
     ask = Detection(smoothing_grid=(1, 4), margin_grid=(1.0,), false_early_rate=0.1)
