@@ -102,8 +102,8 @@ def _tables(entries: list[tuple[dict[str, Any], str]], trials: int) -> list[Tabl
     tables = []
     for allowed, places in rates.items():
         asked = " or ".join(percent(entries[0][0]["rates"][place]["asked"]) for place in places)
-        fewer = ": less than one trial, so none" if not allowed else ""
-        caption = f"{asked} of {trials} validation trials false early: at most {allowed}{fewer}."
+        bound = f"at most {allowed}" if allowed else "less than one trial, so none"
+        caption = f"{asked} of {trials} validation trials false early: {bound}."
         rows = [
             [
                 _WORDS[entry["name"]] + ending,
