@@ -39,8 +39,8 @@ def test_objects_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
     [
         (b"sliplab-arrays-1", b"sliplab-arrays-9"),
         (b'"<i8"', b'"|O8"'),
-        (b"[1000]", b"[9000]"),
-        (b"[1000]", b"[-100]"),
+        (b'[1000]', b'[9000]'),
+        (b'[1000]', b'[-100]'),
         (b'"at"', b'"it"'),
         (b"{", b"["),
     ],
