@@ -134,6 +134,65 @@ def test_another_margin_is_evaluation_and_report_only(
     study(ran[0])  # back to what the other tests know
 
 
+def test_detectors_are_compared_at_equal_rates(ran: tuple[list[Order], Outcome]) -> None:
+    store = store_of(ran)
+    summary = read_summary(store)
+    compared = summary["detectors"]
+    assert compared["trials"] == {"train": 2, "validation": 2, "test": 2}
+    assert compared["strides_ms"] == [10, 30]
+    assert "carried" not in compared
+    for entry in compared["detectors"]:
+        for rate in entry["rates"]:
+            assert rate["allowed"] == 0
+            assert rate["validation"]["latency_ms"]["incipient"]["false_early"] == 0
+    assert summary["choices"] == {"tiny": None, "tiny_gravity": None}
+    text = (store.folder / "report" / "index.html").read_text()
+    assert "0.5 % or 1.0 % or 2.0 % of 2 validation trials" in text
+    assert "less than one trial, so none" in text
+    assert "were chosen by" not in text
+
+
+def test_smoothing_can_be_chosen_and_windows_can_overlap(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+) -> None:
+    store = store_of(ran)
+    kept = {path: path.stat().st_mtime_ns for path in (store.folder / "derived").glob("heard*/*/*")}
+    data: dict[str, Any] = tiny()
+    data["analysis"]["detection"].update(
+        choose="validation", stride_ms=10, smoothing_grid=[1, 12], compare={"carried": True}
+    )
+    gravity = tiny_gravity()
+    gravity["analysis"].setdefault("detection", {})["choose"] = "test"
+    orders = [
+        make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder),
+        make_order(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
+    ]
+    assert [(s["step"], s["done"]) for s in study(orders).steps][2:] == [
+        ("train", 0), ("evaluate", 1), ("report", 1),
+    ]  # fmt: skip
+    # what was heard before is not heard again
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+    summary = read_summary(store)
+    choice = summary["choices"]["tiny"]
+    assert (choice["split"], choice["trials"]) == ("validation", 2)
+    assert summary["choices"]["tiny_gravity"]["split"] == "test"
+    used = summary["detection"]["tiny"]
+    assert (used["smoothing"], used["margin"]) == (choice["smoothing"], choice["margin"])
+    assert len(summary["detectors"]["carried"]) == len(summary["detectors"]["detectors"])
+    text = (store.folder / "report" / "index.html").read_text()
+    assert "Smoothing and margin were chosen by validation trials." in text
+    assert "chosen by the kinematic test trials themselves" in text
+    assert "smoothing and margin chosen on test trials" in text
+    assert "states carried" in text
+    # an option is what counts, whatever the protocols would choose
+    campaigns = collected(store)
+    assert evaluate(store, campaigns, smoothing=2)["done"] == 1
+    found = Derived.of(store, "evaluation").read("evaluation")
+    assert found["choices"] == {"tiny": None, "tiny_gravity": None}
+    assert found["detection"]["tiny"]["smoothing"] == 2
+    study(ran[0])  # back to what the other tests know
+
+
 def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> None:
     store = store_of(ran)
     campaigns = collected(store)
