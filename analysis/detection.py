@@ -17,21 +17,30 @@ from protocols.settings import Detection
 
 
 @dataclass(frozen=True)
-class Detections:
-    """What the detector said about one trial.
+class Found:
+    """The onsets that a detector found in one trial.
 
     Attributes:
         incipient_ns: estimated incipient onset, nanoseconds on the time line of the windows, or
             None if it was never detected.
         gross_ns: estimated gross onset, the first valid one after the incipient detection; None
             if there was none, or no incipient detection before it.
+    """
+
+    incipient_ns: int | None
+    gross_ns: int | None
+
+
+@dataclass(frozen=True)
+class Detections(Found):
+    """What the paper's rule said about one trial, and what it saw.
+
+    Attributes:
         smoothed: float64 (n, 3), trailing mean counts. The first ``smoothing - 1`` rows are means
             over the windows there are, for plots; they are never valid.
         valid_class: int8 (n,), the detected class of each window; -1 where none is valid.
     """
 
-    incipient_ns: int | None
-    gross_ns: int | None
     smoothed: npt.NDArray[np.float64]
     valid_class: npt.NDArray[np.int8]
 
@@ -39,7 +48,10 @@ class Detections:
 def detect(
     counts: npt.NDArray[np.integer], end_ns: npt.NDArray[np.int64], settings: Detection
 ) -> Detections:
-    """Detect both onsets in the consecutive windows of one trial.
+    """Detect both onsets in the windows of one trial.
+
+    Windows may overlap: `smoothing` of them, `stride` apart, then span
+    ``length + (smoothing - 1) * stride``.
 
     A detection needs a full sliding window, so none comes before window ``smoothing - 1``. It is
     dated by the END of its newest window: before that moment the evidence was not all there.
@@ -63,13 +75,8 @@ def detect(
     if (end_ns[1:] <= end_ns[:-1]).any():
         raise ValueError("window ends do not increase")
 
-    n, width = len(counts), settings.smoothing
-    sums = np.zeros((n + 1, len(CLASSES)), np.int64)
-    sums[1:] = counts.astype(np.int64).cumsum(axis=0)
-    start = np.maximum(np.arange(1, n + 1) - width, 0)
-    trailing = sums[1:] - sums[start]
-    held = np.arange(1, n + 1) - start
-
+    width = settings.smoothing
+    trailing, held = _trailing(counts, width)
     valid = winners(trailing, settings.margin * width)
     valid[: width - 1] = -1
 
@@ -81,6 +88,37 @@ def detect(
         smoothed=trailing / held[:, None],
         valid_class=valid,
     )
+
+
+def lead_of(
+    counts: npt.NDArray[np.integer], smoothing: int, wanted: int
+) -> npt.NDArray[np.float64]:
+    """How far the mean count of a class leads every other, float64 (n,); negative where it trails.
+
+    -inf where the sliding window is not full. `detect` finds a class where this is above 0 and at
+    least the margin.
+
+    Args:
+        counts: raw output spikes, integer (n, 3), windows in the order of time.
+        smoothing: windows over which counts are averaged.
+        wanted: the class.
+    """
+    trailing, _ = _trailing(counts, smoothing)
+    rivals = np.delete(trailing, wanted, axis=1).max(axis=1, initial=0)
+    lead: npt.NDArray[np.float64] = (trailing[:, wanted] - rivals) / smoothing
+    lead[: smoothing - 1] = -np.inf
+    return lead
+
+
+def _trailing(
+    counts: npt.NDArray[np.integer], width: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Sums over the last `width` windows (n, 3), and over how many windows there were (n,)."""
+    n = len(counts)
+    sums = np.zeros((n + 1, len(CLASSES)), np.int64)
+    sums[1:] = counts.astype(np.int64).cumsum(axis=0)
+    start = np.maximum(np.arange(1, n + 1) - width, 0)
+    return sums[1:] - sums[start], np.arange(1, n + 1) - start
 
 
 def _first(mask: npt.NDArray[np.bool_], start: int) -> int | None:

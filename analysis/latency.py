@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.detection import Detections
+from analysis.detection import Found
 
 Summary = dict[str, float | int | None]
 
@@ -45,7 +45,7 @@ class TrialLatency:
 
 
 def score_trial(
-    detections: Detections, incipient_ns: int, gross_ns: int, false_early_ns: int
+    detections: Found, incipient_ns: int, gross_ns: int, false_early_ns: int
 ) -> TrialLatency:
     """Judge one trial.
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import pickle
+import sys
 import zipfile
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -32,8 +34,19 @@ def save(path: Path, fitted: Fitted) -> None:
         "warnings": list(fitted.warnings),
     }
     buffer = io.BytesIO()  # torch writes a file's name into it; a buffer has none
-    torch.save(content, buffer)
+    torch.save(_canonical(content), buffer)
     write_bytes(path, buffer.getvalue())
+
+
+def _canonical(value: Any) -> Any:
+    """The same content with one object a text: a pickle tells equal texts from the same one."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    if isinstance(value, dict):
+        return {_canonical(key): _canonical(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_canonical(item) for item in value]
+    return value
 
 
 def load(path: Path) -> Fitted:

@@ -28,6 +28,23 @@ def consecutive_windows(start_ns: int, end_ns: int, window_ns: int) -> NDArray[n
     return _run(start_ns, max(0, end_ns - start_ns) // window_ns, window_ns)
 
 
+def strided_windows(
+    start_ns: int, end_ns: int, window_ns: int, stride_ns: int
+) -> NDArray[np.int64]:
+    """Starts of all whole windows in [start, end), one every stride; shorter ones overlap.
+
+    Returns:
+        (n,) int64, ns; empty when not even one fits.
+
+    Raises:
+        ValueError: window or stride is not positive.
+    """
+    if window_ns <= 0 or stride_ns <= 0:
+        raise ValueError(f"window_ns = {window_ns}, stride_ns = {stride_ns}: must be positive")
+    room = end_ns - start_ns - window_ns
+    return _run(start_ns, 0 if room < 0 else room // stride_ns + 1, stride_ns)
+
+
 def choose_windows(
     start_ns: int,
     end_ns: int,

@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.measure import RUNS, SEED, Figures, machine, versions
 
 NAMES = (
-    "storage", "scene", "clocks", "labels", "labels_truth", "network", "orchestration",
+    "storage", "scene", "clocks", "labels", "labels_truth", "network", "live", "orchestration",
     "acquisition", "scale",
 )  # fmt: skip
 RESULTS = Path(__file__).with_name("RESULTS.md")

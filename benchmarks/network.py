@@ -47,7 +47,7 @@ def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures
     events = slide_events()
     x = _samples(events, windows, settings)
     y = np.arange(windows, dtype=np.int64) % 3
-    net = _gridded(settings, SEED)
+    net = gridded(settings, SEED)
     rivals: dict[str, tuple[Any, Forward]] = {"sinabs": (net, _sinabs(net))}
     for name, make in installed().items():
         rival = Rival(make, settings, SEED)
@@ -60,7 +60,8 @@ def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures
     }
 
 
-def _gridded(settings: Windows, seed: int) -> nn.Sequential:
+def gridded(settings: Windows, seed: int) -> nn.Sequential:
+    """A fresh network with its weights on the grid."""
     net = build(Network(), settings, seed)
     with torch.no_grad():
         for name, value in zip(WEIGHTED, on_grid(torch_weights(net)), strict=True):
@@ -213,7 +214,7 @@ def _inference(
         figures |= ratio(f"infer_batched_x_{name}", best, taken["ours_all"])
     mismatches = compared = 0
     for seed in range(SEED, SEED + 4):
-        other = _gridded(settings, seed)
+        other = gridded(settings, seed)
         expected = spike_counts(other, x)
         found = Engine(other, settings.cells).counts(x)
         mismatches += int((found != expected).any(axis=1).sum())

@@ -19,7 +19,9 @@ from flows.cli_common import (
     prepare_store,
 )
 from flows.cli_control import register as register_control
+from flows.cli_detect import register as register_detect
 from flows.cli_exchange import register as register_exchange
+from flows.cli_models import register as register_models
 from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
 from flows.cli_serve import register as register_serve
@@ -151,5 +153,7 @@ register_control(app)
 register_serve(app)
 register_exchange(app)
 register_review(app)
+register_detect(app)
+register_models(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

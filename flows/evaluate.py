@@ -15,9 +15,12 @@ from analysis.baselines import evaluate_baselines
 from analysis.dataset import SampleSet
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from analysis.smoothing_choice import settled
 from flows import counting
 from flows.campaigns import Collected, training_campaigns
 from flows.counting import COUNTS, count_spikes
+from flows.detector_trials import hear_trials, heard_step
+from flows.detector_work import DetectorWork, detector_work
 from flows.label_errors import label_errors, rules_compared
 from flows.orchestration import Parcel, run
 from flows.reviewed import Labels
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
     from flows.cluster import Cluster
 
 STEP = "evaluation"
-VERSION = 1
+VERSION = 2
 NAME = "evaluation"
 
 
@@ -50,6 +53,7 @@ class Job:
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
+    detectors: DetectorWork
     key: str
     cluster: Cluster | None = None
 
@@ -80,7 +84,7 @@ def make_job(
     """Find what is to be evaluated, and by what detection settings.
 
     Args:
-        margin, smoothing: instead of the protocols' own.
+        margin, smoothing: instead of the protocols' own, and of what these would choose.
         cluster: what counts spikes and makes samples, instead of this machine.
         reviewed: people's decisions are applied to the labels.
     """
@@ -88,8 +92,10 @@ def make_job(
     models = wanted_models(store, campaigns, reviewed)
     model = choose_model(models)
     windows = training_settings(campaigns).windows.model_dump(mode="json")
-    change = {"margin": margin, "smoothing": smoothing}
+    change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
     change = {name: value for name, value in change.items() if value is not None}
+    if change:
+        change["choose"] = "protocol"
     detection, trials, inputs = {}, [], []
     for item in campaigns:
         detection[item.name] = Detection.model_validate(
@@ -105,18 +111,23 @@ def make_job(
             trials.append((item, trial, recording, counts))
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
+    detectors = detector_work(labels, campaigns, detection, model.key)
     # what people decided on trials beside the test trials is counted in the result
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
-    key = make_key(STEP, VERSION, [model.key, inputs, *of_review], used)
-    return Job(store, campaigns, labels, model, detection, trials, key, cluster)
+    key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)
+    return Job(store, campaigns, labels, model, detection, trials, detectors, key, cluster)
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
 def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
     job, train, test = wanted.content
-    rows = _score_trials(job)
+    settings = training_settings(job.campaigns)
+    choices = job.detectors.choices(job.store, job.detection)
+    detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
+    ours = job.detection[training_campaigns(job.campaigns)[0].name]
+    rows = _score_trials(job, detection)
     result = {
         "seed": job.model.seed,
         "windows": _score_windows(job, train, test),
@@ -125,7 +136,9 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "label_error_ms": label_errors(job.store, job.campaigns),
         "label_rules_ms": rules_compared(job.store, job.campaigns),
         "reviewed": job.labels.states(job.campaigns),
-        "detection": {n: d.model_dump(mode="json") for n, d in job.detection.items()},
+        "detection": {n: d.model_dump(mode="json") for n, d in detection.items()},
+        "choices": {n: None if c is None else asdict(c) for n, c in choices.items()},
+        "detectors": job.detectors.compare(job.store, settings, ours),
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 
@@ -150,13 +163,13 @@ def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any
     }
 
 
-def _score_trials(job: Job) -> list[dict[str, Any]]:
+def _score_trials(job: Job, detection: dict[str, Detection]) -> list[dict[str, Any]]:
     """One row a trial: onsets, detections, latency."""
     rows = []
     for item, trial, recording, _ in job.trials:
         label = job.labels.read(item, recording)
-        found = trial_counts(job.store, item.name, trial.id)
-        settings = job.detection[item.name]
+        settings = detection[item.name]
+        found = trial_counts(job.store, item.name, trial.id, settings)
         detections = detect(found["counts"], found["end_ns"], settings)
         row: dict[str, Any] = {
             "campaign": item.name,
@@ -182,9 +195,12 @@ def _score_trials(job: Job) -> list[dict[str, Any]]:
     return rows
 
 
-def trial_counts(store: Store, campaign: str, trial_id: str) -> dict[str, npt.NDArray[Any]]:
-    """Spike counts int64 (n, 3) and window ends int64 ns (n,) of a scored trial."""
-    return Derived.of(store, COUNTS, campaign).arrays(trial_id)
+def trial_counts(
+    store: Store, campaign: str, trial_id: str, settings: Detection
+) -> dict[str, npt.NDArray[Any]]:
+    """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
+    step = COUNTS if settings.stride_ms is None else heard_step(settings.stride_ms)
+    return Derived.of(store, step, campaign).arrays(trial_id)
 
 
 def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -214,6 +230,8 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
             [(item.name, recording, key) for item, _, recording, key in job.trials],
             job.cluster,
         )
+        windows = training_settings(job.campaigns).windows
+        hear_trials(job.store, job.model.path, windows, job.detectors.wanted, job.cluster)
         train, test = (
             load_samples(job.labels, job.campaigns, split, job.cluster)
             for split in ("train", "test")

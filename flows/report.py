@@ -20,7 +20,7 @@ from storage.files import read_json, write_json, write_text
 from storage.store import Store, StoreError
 
 STEP = "report"
-VERSION = 3
+VERSION = 4
 
 
 def report_folder(store: Store) -> Path:

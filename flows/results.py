@@ -14,6 +14,7 @@ from analysis.report import Figure, Section, Table, number, percent
 from analysis.training import Fitted
 from flows import clock_words
 from flows.campaigns import Collected
+from flows.detector_section import choice_note
 from flows.evaluate import trial_counts
 from protocols.settings import Detection
 from storage.recording import Recording
@@ -96,8 +97,8 @@ def outputs(
     if example is None:
         return None
     item, recording, row = example
-    found = trial_counts(store, item.name, recording.trial_id)
     settings = Detection.model_validate(evaluation["detection"][item.name])
+    found = trial_counts(store, item.name, recording.trial_id, settings)
     detections = detect(found["counts"], found["end_ns"], settings)
     start, _ = dataset.recorded_span(recording)
     svg = figures.outputs(
@@ -113,7 +114,8 @@ def outputs(
         [
             f"Output spikes are averaged over {settings.smoothing} windows; a class is believed "
             f"when it leads every other by {settings.margin:g} spikes. A detection is dated by "
-            "the end of its newest window."
+            "the end of its newest window.",
+            *_choice(evaluation, item.name),
         ],
         [
             Figure(
@@ -141,7 +143,8 @@ def latency(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool
         "Detection latency, kinematic test trials",
         [
             "Detection minus true onset. A detection more than 30 ms before the true onset is a "
-            "false early detection: it is counted, and it has no latency."
+            "false early detection: it is counted, and it has no latency.",
+            *_choice(evaluation, *{row["campaign"] for row in rows}),
         ],
         [
             Figure(
@@ -179,7 +182,15 @@ def lead(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -
         [
             "True gross onset minus detected incipient onset, for plates that slip by their own "
             "weight. A false early detection is no lead; a detection after gross slip began "
-            "stands left of zero."
+            "stands left of zero.",
+            *_choice(
+                evaluation,
+                *{
+                    row["campaign"]
+                    for row in evaluation["trials"]
+                    if row["experiment"] in experiments
+                },
+            ),
         ],
         [
             Figure(
@@ -192,6 +203,12 @@ def lead(evaluation: dict[str, Any], summary: dict[str, Any], simulated: bool) -
         ],
         [Table(["experiment", *_names(), "detected first"], table, _statistics_caption(summary))],
     )
+
+
+def _choice(evaluation: dict[str, Any], *campaigns: str) -> list[str]:
+    """How smoothing and margin came about, once for each way."""
+    notes = {choice_note(evaluation["detection"][name]) for name in campaigns}
+    return sorted(notes - {""})
 
 
 def _names() -> list[str]:

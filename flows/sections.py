@@ -10,7 +10,7 @@ from analysis import dataset, figures
 from analysis.report import Figure, Number, Section, Table, number, percent
 from analysis.training import Fitted
 from analysis.windows import first_pixel
-from flows import clock_words, label_section, results
+from flows import clock_words, detector_section, label_section, results
 from flows.campaigns import Collected
 from flows.label import STEP as LABELS
 from protocols.factors import Level
@@ -36,16 +36,22 @@ def headline(summary: dict[str, Any]) -> list[Number]:
             "incipient latency",
             number(latency["median"], 0, "ms"),
             f"median of {latency['n']}; {latency['missed']} missed, "
-            f"{latency['false_early']} false early; {clock_words.short_note(summary)}",
+            f"{latency['false_early']} false early; {clock_words.short_note(summary)}"
+            f"{_chosen_on_test(summary)}",
         ),
         Number(
             "gravity lead",
             number(lead["median"], 0, "ms"),
             f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}; "
-            f"{clock_words.short_note(summary)}",
+            f"{clock_words.short_note(summary)}{_chosen_on_test(summary)}",
         ),
         Number("clock uncertainty", uncertain, f"worst trial, {device}"),
     ]
+
+
+def _chosen_on_test(summary: dict[str, Any]) -> str:
+    chosen = any(item["choose"] == "test" for item in summary["detection"].values())
+    return "; smoothing and margin chosen on test trials" if chosen else ""
 
 
 def make_sections(
@@ -66,6 +72,7 @@ def make_sections(
         results.outputs(store, evaluation, example, simulated),
         results.latency(evaluation, summary, simulated),
         results.lead(evaluation, summary, simulated),
+        detector_section.section(evaluation, simulated),
         label_section.section(summary),
         clock_words.section(store, summary),
         results.provenance(summary),

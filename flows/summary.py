@@ -52,6 +52,8 @@ def make_summary(
             "reviewed": evaluation.get("reviewed"),
         },
         "detection": evaluation["detection"],
+        "choices": evaluation["choices"],
+        "detectors": evaluation["detectors"],
         "sync": _sync(campaigns),
         "quality": _quality(campaigns),
         "planned": {item.name: _planned(item) for item in campaigns},

@@ -126,8 +126,29 @@ class Training(StrictModel):
         return seeds
 
 
+class Comparison(StrictModel):
+    """Other detectors beside the paper's rule, at equal rates of false early detections."""
+
+    rates: tuple[float, ...] = (0.005, 0.01, 0.02)
+    """False early detections allowed, as shares of the validation trials."""
+    stride_ms: int | None = Field(default=None, ge=1, le=1000)
+    """The finer of two strides that they are compared at; by default a third of the window's
+    length where that is whole, else the length."""
+    train_trials: int = Field(default=200, ge=1)
+    """Training trials, of the plan's first ones, that they learn from."""
+    carried: bool = False
+    """Also the network with its neurons' states carried from window to window."""
+
+    @field_validator("rates")
+    @classmethod
+    def _shares(cls, rates: tuple[float, ...]) -> tuple[float, ...]:
+        if not rates or list(rates) != sorted(set(rates)) or not 0 <= rates[0] <= rates[-1] < 1:
+            raise ValueError("must be ascending shares from 0 to below 1, at least one")
+        return rates
+
+
 class Detection(StrictModel):
-    """From spike counts of consecutive windows to two estimated onsets."""
+    """From spike counts of windows to two estimated onsets."""
 
     smoothing: int = Field(default=4, ge=1, le=1000)
     """Windows over which spike counts are averaged."""
@@ -135,6 +156,33 @@ class Detection(StrictModel):
     """The winner must exceed every other class by at least this many mean spikes."""
     false_early_ms: float = Field(default=30.0, ge=0)
     """A detection earlier than the true onset by more than this is false."""
+    stride_ms: int | None = Field(default=None, ge=1, le=1000)
+    """From one window's begin to the next one's; by default a window's length, so that they
+    follow each other. Shorter ones overlap, and `smoothing` of them then span less time."""
+    choose: Literal["protocol", "validation", "test"] = "protocol"
+    """Where smoothing and margin come from: this file; the grid below, by validation trials; or
+    by the test trials themselves, as in the paper, which flatters the result."""
+    smoothing_grid: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
+    margin_grid: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+    """What `choose` tries: every smoothing with every margin."""
+    false_early_rate: float = Field(default=0.02, ge=0, lt=1)
+    """Share of trials that a choice may leave false early."""
+    compare: Comparison | None = Comparison()
+    """Other detectors beside this rule (docs/detection.md); null leaves them out."""
+
+    @field_validator("smoothing_grid", "margin_grid")
+    @classmethod
+    def _grid(cls, values: tuple[float, ...]) -> tuple[float, ...]:
+        if not values or list(values) != sorted(set(values)) or values[0] < 0:
+            raise ValueError("must ascend, hold at least one value and none below 0")
+        return values
+
+    @field_validator("smoothing_grid")
+    @classmethod
+    def _windows(cls, values: tuple[int, ...]) -> tuple[int, ...]:
+        if values[0] < 1:
+            raise ValueError("must be whole numbers from 1")
+        return values
 
 
 class AnalysisSettings(StrictModel):
@@ -147,3 +195,36 @@ class AnalysisSettings(StrictModel):
     network: Network = Network()
     training: Training = Training()
     detection: Detection = Detection()
+
+    @model_validator(mode="after")
+    def _strides(self) -> AnalysisSettings:
+        length = self.windows.length_ms
+        stride = self.detection.stride_ms
+        if stride is not None and stride > length:
+            raise KeyedError(
+                "analysis.detection.stride_ms", stride, f"must not exceed length_ms = {length}"
+            )
+        compare = self.detection.compare
+        fine = None if compare is None else compare.stride_ms
+        if fine is not None and (length % fine or fine % self.windows.step_ms):
+            raise KeyedError(
+                "analysis.detection.compare.stride_ms",
+                fine,
+                f"must divide length_ms = {length}, and be whole steps of {self.windows.step_ms}",
+            )
+        return self
+
+    @property
+    def stride_ms(self) -> int:
+        """From one window's begin to the next one's in detection."""
+        return self.detection.stride_ms or self.windows.length_ms
+
+    @property
+    def fine_stride_ms(self) -> int | None:
+        """The finer stride that detectors are compared at; None where they are not."""
+        if self.detection.compare is None:
+            return None
+        length, step = self.windows.length_ms, self.windows.step_ms
+        third = length // 3
+        whole = length % 3 == 0 and third % step == 0
+        return self.detection.compare.stride_ms or (third if whole else length)

@@ -160,21 +160,21 @@ class Rig:
         with self.safely(program.home):
             if frame_px is not None:
                 self.frames.set_region(*frame_px)
-            self._home(program.home, seed)
+            self.begin_trial(program.home, seed)
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
             steps, ways = [], []
             at, recording, reference = program.home, False, 0
             for index, step in enumerate(program.steps):
                 if step.recorded and not recording:
-                    self._start_streams(seed, rate_hz, frame_px is not None)
+                    self.start_streams(seed, rate_hz, frame_px is not None)
                     recording = True
                 if recording and not step.recorded:
-                    self._stop_streams(sink, frame_px is not None)
+                    self.stop_streams(sink, frame_px is not None)
                     recording = False
                 if step.phase in {"slide", "retract"}:
                     reference = self.arm.now_ns()
-                times = self._step(index, step, at, sink if recording else None)
+                times = self.take_step(index, step, at, sink if recording else None)
                 steps.append((times, step.recorded))
                 began, at = at, step_seconds(step, at)[1]
                 if step.recorded:
@@ -212,7 +212,7 @@ class Rig:
         self.frame = self.frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
         with self.safely(start):
-            self._home(start, seed)
+            self.begin_trial(start, seed)
             self.events.start()
             self.wait(QUIET_S)
             zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
@@ -226,9 +226,9 @@ class Rig:
         if self.simulation is not None:
             self.simulation.begin_trial(0)
         try:
-            self._start_streams(0, rate_hz, False)
+            self.start_streams(0, rate_hz, False)
             self.wait(seconds, sink)
-            self._stop_streams(sink, False)
+            self.stop_streams(sink, False)
         finally:
             self.sync.stop()
             self.events.stop()
@@ -256,7 +256,13 @@ class Rig:
         size = self.events.width, self.events.height
         return count_central(self.events.read(), size, self.centre_px)
 
-    def _step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
+    def take_step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
+        """Carry out one step of a program from `at`, where the arm stands; inside `safely`.
+
+        Raises:
+            StopRequested, ArmFault: as `move`.
+            RigError: the step moves a plate that this rig does not have.
+        """
         start = self.arm.now_ns()
         if isinstance(step, Move):
             start, end = self.move(step, at, sink)
@@ -308,7 +314,8 @@ class Rig:
             if self.should_stop():
                 raise StopRequested
 
-    def _start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
+    def start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
+        """Begin to stream; what came before is dropped. Raises RigError."""
         self.arm.read_poses()
         self.arm.read_pulses()
         self.events.start()
@@ -320,7 +327,7 @@ class Rig:
             # the box must stamp every exposure, the first one too
             self.frames.start()
 
-    def _stop_streams(self, sink: Sink, with_frames: bool) -> None:
+    def stop_streams(self, sink: Sink, with_frames: bool) -> None:
         """Stop the pulses, and read what the cameras still hold before and after they stop.
 
         Events that come later than `tail_s` after the motion tell nothing; a pulse or a frame does.
@@ -349,7 +356,7 @@ class Rig:
         if self.timing.frames == "device time stamps":
             sink.add_frame_camera_reads(self.frames.read_clock())
 
-    def _home(self, home: Position, seed: int) -> None:
+    def begin_trial(self, home: Position, seed: int) -> None:
         """To where a motion begins; only then is a simulated trial's randomness drawn."""
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:

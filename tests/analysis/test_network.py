@@ -170,7 +170,7 @@ def test_the_chip_vendors_package_is_never_imported() -> None:
     """It would try to install things when it is imported."""
     code = (
         "import sys\n"
-        "import analysis.training\n"
+        "import analysis.live, analysis.onnx_file, analysis.quantised, analysis.training\n"
         "from analysis.network import build\n"
         "from protocols.settings import Network, Windows\n"
         "build(Network(), Windows(), 0)\n"

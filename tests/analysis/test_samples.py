@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.samples import GROSS, INCIPIENT, NO_SLIP, choose_windows, consecutive_windows
+from analysis.samples import (
+    GROSS,
+    INCIPIENT,
+    NO_SLIP,
+    choose_windows,
+    consecutive_windows,
+    strided_windows,
+)
 
 MS = 1_000_000
 WINDOW = 30 * MS
@@ -110,3 +117,18 @@ def test_consecutive_windows() -> None:
         consecutive_windows(0, 90, 0)
     with pytest.raises(ValueError, match="per_class"):
         choose_windows(0, 90, 30, 60, 10, 0, 0)
+
+
+@given(st.integers(0, 2**62), st.integers(-5, 300), st.integers(1, 60), st.integers(1, 60))
+def test_strided_windows_are_all_that_fit(start: int, span: int, window: int, stride: int) -> None:
+    found = strided_windows(start, start + span, window, stride)
+    expected = [k for k in range(0, max(span, 0) + 1, stride) if k + window <= span]
+    assert (found - start).tolist() == expected
+    same = strided_windows(start, start + span, window, window)
+    assert same.tolist() == consecutive_windows(start, start + span, window).tolist()
+
+
+@pytest.mark.parametrize(("window", "stride"), [(0, 10), (10, 0), (10, -1)])
+def test_no_window_and_no_stride(window: int, stride: int) -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        strided_windows(0, 90, window, stride)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from analysis import training
 from flows import trial_work
 from flows.campaigns import collected
 from flows.collect import collect
@@ -16,7 +19,9 @@ from flows.evaluate import evaluate
 from flows.orders import Order, make_order
 from flows.report import read_summary, report
 from flows.study import Outcome, study
+from flows.train import train
 from storage.derived import Derived
+from storage.files import write_bytes
 from storage.store import Store
 from tests.flows.conftest import tiny, tiny_gravity, write
 
@@ -129,6 +134,65 @@ def test_another_margin_is_evaluation_and_report_only(
     study(ran[0])  # back to what the other tests know
 
 
+def test_detectors_are_compared_at_equal_rates(ran: tuple[list[Order], Outcome]) -> None:
+    store = store_of(ran)
+    summary = read_summary(store)
+    compared = summary["detectors"]
+    assert compared["trials"] == {"train": 2, "validation": 2, "test": 2}
+    assert compared["strides_ms"] == [10, 30]
+    assert "carried" not in compared
+    for entry in compared["detectors"]:
+        for rate in entry["rates"]:
+            assert rate["allowed"] == 0
+            assert rate["validation"]["latency_ms"]["incipient"]["false_early"] == 0
+    assert summary["choices"] == {"tiny": None, "tiny_gravity": None}
+    text = (store.folder / "report" / "index.html").read_text()
+    assert "0.5 % or 1.0 % or 2.0 % of 2 validation trials" in text
+    assert "less than one trial, so none" in text
+    assert "were chosen by" not in text
+
+
+def test_smoothing_can_be_chosen_and_windows_can_overlap(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+) -> None:
+    store = store_of(ran)
+    kept = {path: path.stat().st_mtime_ns for path in (store.folder / "derived").glob("heard*/*/*")}
+    data: dict[str, Any] = tiny()
+    data["analysis"]["detection"].update(
+        choose="validation", stride_ms=10, smoothing_grid=[1, 12], compare={"carried": True}
+    )
+    gravity = tiny_gravity()
+    gravity["analysis"].setdefault("detection", {})["choose"] = "test"
+    orders = [
+        make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder),
+        make_order(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
+    ]
+    assert [(s["step"], s["done"]) for s in study(orders).steps][2:] == [
+        ("train", 0), ("evaluate", 1), ("report", 1),
+    ]  # fmt: skip
+    # what was heard before is not heard again
+    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+    summary = read_summary(store)
+    choice = summary["choices"]["tiny"]
+    assert (choice["split"], choice["trials"]) == ("validation", 2)
+    assert summary["choices"]["tiny_gravity"]["split"] == "test"
+    used = summary["detection"]["tiny"]
+    assert (used["smoothing"], used["margin"]) == (choice["smoothing"], choice["margin"])
+    assert len(summary["detectors"]["carried"]) == len(summary["detectors"]["detectors"])
+    text = (store.folder / "report" / "index.html").read_text()
+    assert "Smoothing and margin were chosen by validation trials." in text
+    assert "chosen by the kinematic test trials themselves" in text
+    assert "smoothing and margin chosen on test trials" in text
+    assert "states carried" in text
+    # an option is what counts, whatever the protocols would choose
+    campaigns = collected(store)
+    assert evaluate(store, campaigns, smoothing=2)["done"] == 1
+    found = Derived.of(store, "evaluation").read("evaluation")
+    assert found["choices"] == {"tiny": None, "tiny_gravity": None}
+    assert found["detection"]["tiny"]["smoothing"] == 2
+    study(ran[0])  # back to what the other tests know
+
+
 def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> None:
     store = store_of(ran)
     campaigns = collected(store)
@@ -157,3 +221,93 @@ def test_the_same_seed_gives_the_same_summary(
 def test_a_collection_that_is_complete_returns_at_once(ran: tuple[list[Order], Outcome]) -> None:
     result = collect(ran[0][0])
     assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)
+
+
+class _Killed(Exception):
+    pass
+
+
+def test_a_training_that_was_killed_goes_on_to_the_same_model(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = next((store_of(ran).folder / "models").glob("*.pt")).read_bytes()
+    shutil.copytree(store_of(ran).folder, tmp_path / "store")
+    store = Store.open(tmp_path / "store")
+    models = store.folder / "models"
+    for left in (*models.glob("*.pt"), *models.glob("*.json")):
+        left.unlink()
+
+    def write_and_die(path: Path, state: bytes) -> None:
+        write_bytes(path, state)
+        raise _Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr("flows.train.write_bytes", write_and_die)
+        with pytest.raises(_Killed):
+            train(store, collected(store))
+    assert len(list(models.glob("*.state"))) == 1
+    assert not list(models.glob("*.pt"))
+
+    epochs: list[int] = []
+    begun = training.fit
+
+    def fit(*given: Any, **named: Any) -> training.Fitted:
+        states: list[bytes] = []
+        named["on_state"] = states.append
+        fitted = begun(*given, **named)
+        epochs.append(len(states))
+        return fitted
+
+    monkeypatch.setattr(training, "fit", fit)
+    assert train(store, collected(store))["done"] == 1
+    assert epochs == [1]  # the second of two; the first was kept
+    assert next(models.glob("*.pt")).read_bytes() == whole
+    assert not list(models.glob("*.state"))
+    assert next(models.glob("*.svg")).read_text().count("epoch") >= 2
+
+
+def test_the_model_goes_out_as_what_it_is(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
+    from analysis import onnx_file
+    from flows.detect_order import load_model
+    from flows.model_export import ExportFailed, export_model
+
+    store = store_of(ran)
+    model = store.folder / "models" / "seed0.pt"
+    fitted = load_model(model)
+    result = export_model(model, fitted, tmp_path / "out", store, checked=16)
+    assert result["simulated"] is True
+    assert result["onnx_windows_equal"] == 16
+    assert result["speck_fits"] is True
+    names = [f"seed0{end}" for end in (".onnx", ".speck.json", ".speck.md", ".speck.npz")]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        [*names, "seed0.card.json", "seed0.card.md"]
+    )
+    card = json.loads((tmp_path / "out" / "seed0.card.json").read_text())
+    assert card["data"]["made_from_these_data"] is True
+    (kinematic, gravity) = card["data"]["campaigns"]
+    assert kinematic["trials"] == {"train": 2, "validation": 2, "test": 2}
+    assert gravity["experiment"] == "gravity"
+    # the same windows and the same network as in the evaluation
+    summary = read_summary(store)
+    assert card["figures"]["test"]["accuracy"] == summary["kinematic"]["accuracy"]
+    assert card["detection"]["kinematic"]["latency_ms"] == summary["kinematic"]["latency_ms"]
+    speck = json.loads((tmp_path / "out" / "seed0.speck.json").read_text())
+    with np.load(tmp_path / "out" / "seed0.speck.npz") as arrays:
+        assert {name: arrays[name].dtype for name in arrays} == dict.fromkeys(
+            ("conv1", "conv2", "fc1", "fc2"), np.int8
+        )
+    assert speck["quantisation"]["change"]["windows"] == card["figures"]["test"]["samples"]
+    for name in (".card.md", ".speck.md"):
+        assert "simulated" in (tmp_path / "out" / f"seed0{name}").read_text()
+
+    counts = onnx_file.onnx_counts
+    monkeypatch.setattr(onnx_file, "onnx_counts", lambda data, x: counts(data, x) + 1)
+    with pytest.raises(ExportFailed, match="nothing was written: 4 of 4 windows"):
+        export_model(model, fitted, tmp_path / "other", store, checked=4)
+    assert not (tmp_path / "other").exists()
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ExportFailed, match=r"sliplab\[onnx\]"):
+        export_model(model, fitted, tmp_path / "other", store, checked=4)

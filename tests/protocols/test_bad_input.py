@@ -166,6 +166,36 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "analysis.split.test_levels.depth",
         "is no level",
     ),
+    "windows further apart than they are long": (
+        _set("analysis", "detection", "stride_ms", to=31),
+        "analysis.detection.stride_ms",
+        "must not exceed length_ms = 30",
+    ),
+    "a stride that the window is no multiple of": (
+        _set("analysis", "detection", "compare", to={"stride_ms": 20}),
+        "analysis.detection.compare.stride_ms",
+        "must divide length_ms = 30",
+    ),
+    "a choice that nobody makes": (
+        _set("analysis", "detection", "choose", to="train"),
+        "analysis.detection.choose",
+        "validation",
+    ),
+    "a grid out of order": (
+        _set("analysis", "detection", "smoothing_grid", to=[4, 1]),
+        "analysis.detection.smoothing_grid",
+        "must ascend",
+    ),
+    "a window of nothing": (
+        _set("analysis", "detection", "smoothing_grid", to=[0, 1]),
+        "analysis.detection.smoothing_grid",
+        "from 1",
+    ),
+    "rates that are no shares": (
+        _set("analysis", "detection", "compare", to={"rates": [0.01, 1.0]}),
+        "analysis.detection.compare.rates",
+        "ascending shares",
+    ),
     "shares that do not add up": (
         _set("analysis", "split", "train", to=0.9),
         "analysis.split",

@@ -1,0 +1,65 @@
+"""Are the fast network's spike counts Sinabs' own on as many windows as one likes?
+
+    python -m benchmarks.spike_equality STORE MODEL 100000
+
+takes the samples that `sliplab train` keeps in the store, counts the output spikes of each by
+Sinabs' layers and by the event-driven network, and prints how many differ as one line of JSON.
+Exit 1 where one does. tests/analysis/test_spiking.py does the same on few windows and on extremes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from analysis import model_file
+from analysis.dataset import SampleSet
+from analysis.network import exact, spike_counts
+from analysis.training import engine, restore
+
+PART = 2048
+
+
+def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int | bool]:
+    """How many of the first `most` windows differ."""
+    torch.set_num_threads(
+        1
+    )  # waiting for each other, Sinabs' threads take longer beside other work
+    fitted = model_file.load(model)
+    net, fast = restore(fitted), engine(fitted)
+    compared = differ = with_spikes = 0
+    for part in samples:
+        for start in range(0, len(part), PART):
+            rows = np.arange(start, min(start + PART, len(part), start + most - compared))
+            windows = part.windows.take(rows)
+            expected = spike_counts(net, windows.dense())
+            differ += int((fast.counts(windows) != expected).any(axis=1).sum())
+            with_spikes += int(expected.any(axis=1).sum())
+            compared += len(rows)
+            print(f"{compared} windows, {differ} differ", file=sys.stderr)
+            if compared >= most:
+                break
+    weights = [value.numpy() for value in fitted.state_dict.values()]
+    return {
+        "windows": compared,
+        "with_spikes": with_spikes,
+        "differ": differ,
+        "exact_by_arithmetic": exact(weights),
+    }
+
+
+def main() -> int:
+    """The command line."""
+    store, model, most = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+    paths = sorted((store / "derived" / "samples").glob("*.arrays"))
+    found = compare([SampleSet.load(path) for path in paths], model, most)
+    print(json.dumps(found))
+    return int(found["differ"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
