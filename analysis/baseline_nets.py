@@ -178,7 +178,7 @@ def _one_epoch(
             net(_dense(train.windows.take(rows))), torch.from_numpy(train.y[rows])
         )
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         optimizer.step()
 
 
@@ -213,7 +213,12 @@ def multiply_adds(net: nn.Module, shape: Shape) -> int:
         gates = 3 * layer.hidden_size
         total += given[0].shape[1] * gates * (layer.input_size + layer.hidden_size)
 
-    hooks = {nn.Conv2d: convolution, nn.Conv3d: convolution, nn.Linear: linear, nn.GRU: recurrent}
+    hooks: dict[type[nn.Module], Callable[..., None]] = {
+        nn.Conv2d: convolution,
+        nn.Conv3d: convolution,
+        nn.Linear: linear,
+        nn.GRU: recurrent,
+    }
     handles = [
         module.register_forward_hook(hooks[type(module)])
         for module in net.modules()

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from sklearn.ensemble import HistGradientBoostingClassifier
 from threadpoolctl import threadpool_limits
 
 from analysis.baselines import cell_sums, step_sums
@@ -44,6 +43,8 @@ def boosted(
     Raises:
         ValueError: a class is missing among the training samples.
     """
+    from sklearn.ensemble import HistGradientBoostingClassifier  # takes a second
+
     if set(np.unique(train.y).tolist()) != set(range(len(CLASSES))):
         raise ValueError("gradient boosting needs training samples of every class")
     model = HistGradientBoostingClassifier(

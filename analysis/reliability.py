@@ -103,7 +103,9 @@ def cross_entropy(counts: Counts, labels: Labels, temperature: float) -> float:
     return -float(log_p[np.arange(len(labels)), labels].mean())
 
 
-def expected_calibration_error(probabilities: FloatArray, labels: Labels, bins: int = BINS) -> float:
+def expected_calibration_error(
+    probabilities: FloatArray, labels: Labels, bins: int = BINS
+) -> float:
     """Mean distance between what was said and what was right, 0..1, weighted by windows.
 
     Windows are put by their highest probability into bins of equal width. Where classes tie, each

@@ -83,9 +83,9 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
     near, far = reached(cells, k1, 1), reached(cells, k2, 2)
     tables = trainer.layout.tables
     result = [np.tile((np.outer(near, near) * c1).ravel(), channels)]
-    for table, each in zip(
-        tables[:3], ((np.outer(far, far) * c2)[:, :, None], hidden, classes), strict=True
-    ):
+    strided = (np.outer(far, far) * c2)[:, :, None]
+    each: I64
+    for table, each in zip(tables[:3], (strided, np.array(hidden), np.array(classes)), strict=True):
         plane = np.zeros(table.target.size, np.int64)
         plane[table.target.index()] = each
         result.append(plane)

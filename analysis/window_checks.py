@@ -133,7 +133,7 @@ def shuffled_chance(
     network: Network,
     windows: Windows,
     how: Training,
-    runs: int = 5,
+    runs: int = 8,
     per_class: int = 300,
     level: float = 0.999,
     deal: Callable[[IntArray, int], IntArray] = shuffle,
@@ -183,12 +183,11 @@ def check_chance(found: Chance) -> None:
     if not found.low <= chance <= found.high:
         raise CheckFailed(
             f"a network that learned from shuffled labels is right in {found.shuffled} of the test "
-            f"windows; their mean lies in {found.low:.3f}..{found.high:.3f}, and chance is a third: "
+            f"windows; their mean lies in {found.low:.3f}..{found.high:.3f}, chance is a third: "
             "something beside the training labels tells it the answer"
         )
     if not found.true > max(found.high, chance):
         raise CheckFailed(
-            f"the same training on true labels reaches {found.true:.3f}, no more than shuffled ones "
-            f"may ({found.high:.3f}): it learned nothing, so the check says nothing"
+            f"the same training on true labels reaches {found.true:.3f}, not more than shuffled "
+            f"ones may ({found.high:.3f}): it learned nothing, so the check says nothing"
         )
-

@@ -79,12 +79,24 @@ def evaluate(
         int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
     ] = None,
     reviewed: ReviewedOption = False,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Also train other methods to compare (minutes).")
+    ] = False,
+    checks: Annotated[
+        bool, typer.Option("--checks", help="Fail if permuted or shuffled labels show a fault.")
+    ] = False,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on trials it has never seen."""
     options = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
-    step(store, campaign, as_json, "evaluate", dask=dask, **options)
+    folder = located(store)
+    result = run_step(folder, campaign, "evaluate", dask, **options)
+    more = {"window_baselines": baselines, "window_checks": checks}
+    for name, wanted in more.items():
+        if wanted:
+            result[name] = run_step(folder, campaign, name, reviewed=reviewed)
+    finish(result, f"evaluate {store}", as_json)
 
 
 def report(

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis import metrics, model_file, training
-from analysis.baselines import evaluate_baselines
 from analysis.dataset import SampleSet
 from analysis.detection import detect
 from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
@@ -27,6 +24,7 @@ from flows.reviewed import Labels
 from flows.samples import load_samples
 from flows.timing import timed
 from flows.train import Model, training_settings, wanted_models
+from flows.window_scores import key_inputs, score_windows
 from protocols import Trial
 from protocols.settings import Detection
 from storage.derived import Derived, make_key
@@ -50,6 +48,8 @@ class Job:
     campaigns: list[Collected]
     labels: Labels
     model: Model
+    models: list[Model]
+    """Of all seeds, the chosen one among them."""
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
@@ -96,7 +96,7 @@ def make_job(
     change = {name: value for name, value in change.items() if value is not None}
     if change:
         change["choose"] = "protocol"
-    detection, trials, inputs = {}, [], []
+    detection, trials, inputs = {}, [], [key_inputs(models)]
     for item in campaigns:
         detection[item.name] = Detection.model_validate(
             {**item.settings.detection.model_dump(), **change}
@@ -116,7 +116,7 @@ def make_job(
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
     key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)
-    return Job(store, campaigns, labels, model, detection, trials, detectors, key, cluster)
+    return Job(store, campaigns, labels, model, models, detection, trials, detectors, key, cluster)
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
@@ -130,7 +130,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     rows = _score_trials(job, detection)
     result = {
         "seed": job.model.seed,
-        "windows": _score_windows(job, train, test),
+        "windows": score_windows(job, train, test),
         "trials": rows,
         "experiments": _summaries(rows),
         "label_error_ms": label_errors(job.store, job.campaigns),
@@ -141,26 +141,6 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "detectors": job.detectors.compare(job.store, settings, ours),
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
-
-
-def _score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
-    """The chosen samples of the test trials: the network and the baselines beside it."""
-    settings = training_settings(job.campaigns)
-    counts = training.predict_counts(model_file.load(job.model.path), test.windows)
-    margin = settings.detection.margin
-    by_trial = {
-        str(number): asdict(
-            metrics.accuracy(counts[test.trial == number], test.y[test.trial == number], margin)
-        )
-        for number in np.unique(test.trial).tolist()
-    }
-    baselines = evaluate_baselines(train.x, train.y, test.x, test.y)
-    return {
-        **metrics.score(counts, test.y, margin).as_dict(),
-        "by_trial": by_trial,
-        "baselines": {name: score.argmax for name, score in baselines.items()},
-        "samples": {"train": len(train), "test": len(test)},
-    }
 
 
 def _score_trials(job: Job, detection: dict[str, Detection]) -> list[dict[str, Any]]:

@@ -15,6 +15,7 @@ from flows.orchestration import Parcel, run
 from flows.summary import make_summary
 from flows.sync_page import PAGE as CLOCKS
 from flows.train import wanted_models
+from flows.window_baselines import fresh_keys
 from storage.derived import Derived, make_key
 from storage.files import read_json, write_json, write_text
 from storage.store import Store, StoreError
@@ -47,7 +48,7 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
         for item in campaigns
     ]
     clocks = (report_folder(store) / CLOCKS).exists()
-    return make_key(STEP, VERSION, [evaluated, collected, clocks], None)
+    return make_key(STEP, VERSION, [evaluated, collected, clocks, fresh_keys(store)], None)
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)

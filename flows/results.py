@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-import numpy as np
-
 from analysis import dataset, figures
 from analysis.detection import detect
-from analysis.metrics import CLASSES
-from analysis.report import Figure, Section, Table, number, percent
-from analysis.training import Fitted
+from analysis.report import Figure, Section, Table, number
 from flows import clock_words
 from flows.campaigns import Collected
 from flows.detector_section import choice_note
@@ -31,60 +27,6 @@ def seconds(value: int | None, origin: int) -> float | None:
 def condition_text(row: dict[str, Any]) -> str:
     """A trial's condition in words."""
     return ", ".join(f"{name} {text}" for name, text in row["condition"].items())
-
-
-def network(evaluation: dict[str, Any], fitted: Fitted, simulated: bool) -> Section:
-    """Accuracy on windows of test trials, with the baselines beside it."""
-    windows = evaluation["windows"]
-    accuracy = windows["accuracy"]
-    beside = windows["baselines"]
-    rows = [
-        [
-            "spiking network",
-            percent(accuracy["argmax"]),
-            percent(accuracy["strict"]),
-            percent(accuracy["margin"]),
-        ],
-        ["logistic regression on the event count", percent(beside["logistic"]), "", ""],
-        ["event-rate threshold", percent(beside["rate_threshold"]), "", ""],
-        ["majority class", percent(beside["majority"]), "", ""],
-    ]
-    classes = [
-        [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
-        for name, word in zip(CLASSES, figures.CLASS_WORDS, strict=True)
-    ]
-    trials = [row["argmax"] for row in windows["by_trial"].values() if row["argmax"] is not None]
-    return Section(
-        "The network on windows of 30 ms" if fitted.windows.length_ms == 30 else "The network",
-        [
-            f"{accuracy['n']} windows of test trials that were used neither for training nor for "
-            "choosing the model. Argmax shares a tie among its classes, strict wants a unique "
-            "winner, margin wants it to lead as a detection must. By trial the argmax accuracy "
-            f"runs from {percent(min(trials, default=None))} to "
-            f"{percent(max(trials, default=None))}.",
-            *(f"Warning: {text}" for text in fitted.warnings),
-        ],
-        [
-            Figure(
-                figures.confusion(np.asarray(windows["confusion"]), simulated=simulated),
-                "Rows are true classes and add up to 100 %. The last column holds windows whose "
-                "two highest spike counts are equal.",
-            ),
-            Figure(
-                figures.training_curves(
-                    [vars(record) for record in fitted.history],
-                    fitted.chosen_epoch,
-                    simulated=simulated,
-                ),
-                "Training; the dashed line is the epoch with the best strict validation accuracy, "
-                "whose weights are used.",
-            ),
-        ],
-        [
-            Table(["method", "argmax", "strict", "margin"], rows, "Accuracy on the same windows."),
-            Table(["class", "precision", "recall"], classes),
-        ],
-    )
 
 
 def outputs(

@@ -13,6 +13,7 @@ from analysis.windows import first_pixel
 from flows import clock_words, detector_section, label_section, results
 from flows.campaigns import Collected
 from flows.label import STEP as LABELS
+from flows.window_section import window_sections
 from protocols.factors import Level
 from storage.derived import Derived
 from storage.recording import Recording
@@ -68,7 +69,9 @@ def make_sections(
     if example is not None:
         found.append(_one_trial(store, *example, simulated))
     found += [
-        results.network(evaluation, fitted, simulated),
+        *window_sections(
+            evaluation["windows"], summary["kinematic"]["trained_baselines"], fitted, simulated
+        ),
         results.outputs(store, evaluation, example, simulated),
         results.latency(evaluation, summary, simulated),
         results.lead(evaluation, summary, simulated),

@@ -9,6 +9,7 @@ from typing import Any
 from flows import timing
 from flows.campaigns import Collected, training_campaigns
 from flows.estimate import plan_bytes
+from flows.window_baselines import beside
 from rigs.rig_file import load_rig_file
 from storage.store import Store
 
@@ -23,7 +24,21 @@ _PACKAGES = (
     "pandas",
     "h5py",
     "opencv-contrib-python-headless",
+    "scikit-learn",
 )
+_WINDOWS = (
+    "interval",
+    "seeds",
+    "reliability",
+    "calibration",
+    "by_factor",
+    "by_tenth",
+    "no_slip",
+    "by_trial",
+    "work",
+    "beside",
+)
+"""What the summary takes over from the evaluation's windows as it is; docs/metrics.md."""
 
 
 def make_summary(
@@ -38,6 +53,8 @@ def make_summary(
         "recall": windows["recall"],
         "baselines": windows["baselines"],
         "samples": windows["samples"],
+        "trained_baselines": beside(store),
+        **{name: windows[name] for name in _WINDOWS},
         **experiments["kinematic"],
     }
     return {
