@@ -219,8 +219,9 @@ def _lost(windows: Json, beside: Json) -> list[str]:
         f"It costs: the best other method on these windows is this one: {_METHODS[best]}, with "
         f"{percent(found[best]['argmax'])}"
         + (f" for {cost:,} multiply-adds a window" if cost is not None else "")
-        + f". The spiking network is {number(abs(points))} points {word} it "
-        f"({_points(ahead)}); "
+        + f". The spiking network is {number(abs(points))} points {word} it"
+        + _span(ahead)
+        + "; "
         + ("trials tell them apart." if sure else "so few trials do not tell them apart.")
         + " It was picked as the best on these very windows, which flatters it."
     ]
@@ -244,6 +245,12 @@ def _others(beside: Json) -> list[Table]:
         return []
     columns = ["method", "weights", "multiply-adds a window", "epochs or rounds"]
     return [Table(columns, rows, "What the other methods are.")]
+
+
+def _span(row: Json) -> str:
+    if row["low"] is None:
+        return ""
+    return f" (difference {100 * row['low']:+.1f} to {100 * row['high']:+.1f} in 95 %)"
 
 
 def _of_seeds(seeds: Json) -> list[str]:
