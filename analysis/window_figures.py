@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.figure_style import BLUE, GREY, STYLE, svg_text
 from analysis.figures import CLASS_COLOURS, CLASS_WORDS
+from analysis.metrics import CLASSES
 
 
 def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
@@ -50,14 +51,12 @@ def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simula
     """Recall of each class over its phase, a panel a class.
 
     Args:
-        tenths: from `analysis.window_groups.by_tenth`, in the order of the classes.
+        tenths: from `analysis.window_groups.by_tenth`.
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(tenths), figsize=(7.6, 2.5), sharey=True)
-        for axes, rows, word, colour in zip(
-            grid, tenths.values(), CLASS_WORDS, CLASS_COLOURS, strict=True
-        ):
-            for row in rows:
+        for axes, name, word, colour in zip(grid, CLASSES, CLASS_WORDS, CLASS_COLOURS, strict=True):
+            for row in tenths[name]:
                 if row["share"] is None:
                     continue
                 middle = 10 * row["tenth"] - 5

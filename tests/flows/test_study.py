@@ -12,17 +12,23 @@ import numpy as np
 import pytest
 
 from analysis import training
-from flows import trial_work
-from flows.campaigns import collected
+from analysis.dataset import recorded_span
+from analysis.metrics import CLASSES
+from analysis.window_checks import Chance
+from flows import trial_work, window_baselines, window_checks
+from flows.campaigns import collected, training_campaigns
 from flows.collect import collect
 from flows.evaluate import evaluate
 from flows.orders import Order, make_order
 from flows.report import read_summary, report
+from flows.reviewed import Labels
+from flows.samples import load_samples
 from flows.study import Outcome, study
 from flows.train import train
+from flows.window_scores import owners, whose
 from storage.derived import Derived
 from storage.files import write_bytes
-from storage.store import Store
+from storage.store import Store, StoreError
 from tests.flows.conftest import tiny, tiny_gravity, write
 
 
@@ -132,6 +138,96 @@ def test_another_margin_is_evaluation_and_report_only(
     assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
     assert read_summary(store)["detection"]["tiny"]["margin"] == 3.0
     study(ran[0])  # back to what the other tests know
+
+
+def test_windows_are_looked_at_from_every_side(ran: tuple[list[Order], Outcome]) -> None:
+    summary = read_summary(store_of(ran))
+    kinematic = summary["kinematic"]
+    n = kinematic["accuracy"]["n"]
+    strict = kinematic["accuracy"]["strict"]
+    assert kinematic["interval"]["share"] == pytest.approx(strict)
+    assert kinematic["interval"]["trials"] == 2
+    assert sum(row["n"] for row in kinematic["reliability"]) == n
+    assert sum(row["right"] for row in kinematic["reliability"]) == pytest.approx(strict * n)
+    assert sum(row["errors"] for row in kinematic["by_trial"]) == pytest.approx((1 - strict) * n)
+    for rows in kinematic["by_factor"].values():
+        assert sum(row["n"] for row in rows.values()) == n
+        assert sum(row["n"] * row["share"] for row in rows.values()) == pytest.approx(strict * n)
+    assert set(kinematic["by_factor"]["direction"]) == {"240 deg", "300 deg"}
+    classes = np.sum(kinematic["confusion"], axis=1)
+    for name, size in zip(CLASSES, classes, strict=True):
+        assert sum(row["n"] for row in kinematic["by_tenth"][name]) == size
+    assert sum(part["n"] for part in kinematic["no_slip"].values()) == classes[0]
+    # no slip is sampled up to the first slip, gross slip from its onset on
+    assert kinematic["by_tenth"]["no_slip"][9]["n"] > 0
+    assert kinematic["by_tenth"]["gross"][0]["n"] > 0
+    work = kinematic["work"]
+    assert work["n"] == n
+    assert 0 < work["share"] < 0.2
+    assert kinematic["seeds"]["each"][0]["strict"] == strict
+    for name, row in kinematic["beside"].items():
+        assert row["argmax"] == pytest.approx(kinematic["baselines"][name])
+        ahead = kinematic["accuracy"]["argmax"] - row["argmax"]
+        assert row["network_ahead"]["share"] == pytest.approx(ahead)
+    assert kinematic["trained_baselines"] == {}
+
+
+def test_no_window_of_a_test_trial_is_near_a_training_window(
+    ran: tuple[list[Order], Outcome],
+) -> None:
+    """Neighbours on a time line are alike: parts must have no trial, so no time line, in common."""
+    store = store_of(ran)
+    used = training_campaigns(collected(store))
+    found: dict[str, set[tuple[str, str]]] = {}
+    for split in ("train", "validation", "test"):
+        samples = load_samples(Labels(store), used, split)
+        known = owners(used, split)
+        of = whose(known, samples)
+        for k in np.unique(of).tolist():
+            item, trial, recording = known[k]
+            start, end = recorded_span(recording)
+            times = samples.start_ns[of == k]
+            assert start <= times.min()
+            assert times.max() < end
+            found.setdefault(split, set()).add((item.name, trial.id))
+    assert [len(trials) for trials in found.values()] == [2, 2, 2]
+    assert len(set.union(*found.values())) == 6
+
+
+def test_other_methods_are_kept_and_the_report_tells_of_them(
+    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_of(ran)
+    campaigns = collected(store)
+    monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1, "cnn_frame": 1})
+    first = window_baselines.window_baselines(store, campaigns)
+    assert (first["done"], first["fresh"]) == (2, 0)
+    assert window_baselines.window_baselines(store, campaigns)["done"] == 0
+    assert report(store, campaigns)["done"] == 1
+    kinematic = read_summary(store)["kinematic"]
+    for name, share in first["argmax"].items():
+        assert kinematic["trained_baselines"][name]["argmax"] == pytest.approx(share)
+    text = (store.folder / "report" / "index.html").read_text()
+    assert "ordinary convolutions on the summed frame" in text
+    assert "It buys:" in text
+    assert "It costs:" in text
+    for path in (store.folder / "derived" / "baselines").iterdir():
+        path.unlink()
+    assert report(store, campaigns)["done"] == 1
+
+
+def test_a_check_that_fails_ends_the_command(
+    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_of(ran)
+    campaigns = collected(store)
+    fair = Chance((0.3, 0.36), 0.2, 0.45, 0.8, 0.999)
+    monkeypatch.setattr(window_checks, "shuffled_chance", lambda *_: fair)
+    assert window_checks.window_checks(store, campaigns)["orders"] == 6
+    leak = Chance((0.9, 0.91), 0.85, 0.95, 0.92, 0.999)
+    monkeypatch.setattr(window_checks, "shuffled_chance", lambda *_: leak)
+    with pytest.raises(StoreError, match="shuffled labels"):
+        window_checks.window_checks(store, campaigns)
 
 
 def test_detectors_are_compared_at_equal_rates(ran: tuple[list[Order], Outcome]) -> None:
