@@ -33,6 +33,8 @@ def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: b
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(panels), figsize=(7.6, 4.0), sharey=True, squeeze=False)
+        curves = [points for lines in panels.values() for points in lines.values()]
+        most = max(1.0, *(100 * rate for points in curves for rate, _ in points))
         for axes, (title, lines) in zip(grid[0], panels.items(), strict=True):
             for number, (name, points) in enumerate(lines.items()):
                 colour, dashes, mark = _LINES[number % len(_LINES)]
@@ -45,6 +47,7 @@ def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: b
             axes.set_title(title)
             axes.set_xlabel("false early, validation trials (%)")
             axes.set_ylim(bottom=0)
+            axes.set_xlim(-0.05 * most, 1.05 * most)
         grid[0][0].set_ylabel("median incipient latency,\ntest trials (ms)")
         handles, names = grid[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=2, fontsize=8)

@@ -238,7 +238,8 @@ class Trainer:
             return self._idle.pop()
         except IndexError:
             layout = self.layout
-            planes = (layout.state(), layout.state()[:-1])
+            taps = np.zeros(layout.shapes[1][1] * layout.shapes[1][2] ** 2, np.float32)
+            planes = (layout.state(), layout.state()[:-1], taps)
             row = np.zeros(len(layout.rest[-1]), np.float32)
             return layout.state(), layout.scratch(), planes, row
 

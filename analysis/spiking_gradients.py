@@ -20,7 +20,7 @@ from numba import njit
 from analysis.spiking_kernels import fire, scatter, scatter_counts
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
-_U0, _U1, _U4 = np.uint64(0), np.uint64(1), np.uint64(4)
+_U0, _U1, _U2, _U3 = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
 _LEAST = np.float32(-80.0)
 """exp below it is nothing (and would make denormal numbers, which are slow)."""
 
@@ -118,40 +118,45 @@ def _below_full(du: Any, w: Any, g: Any) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _below_strided(du: Any, pixels: Any, w: Any, stride: Any, g: Any) -> None:
+def _below_strided(du: Any, pixels: Any, w: Any, rows: int, stride: Any, taps: Any, g: Any) -> None:
     """Gradient by the spikes of layer 1 from that by layer 2's currents.
+
+    A pixel's taps are summed up aside, where they are one run, and then added to the plane.
 
     Args:
         du: flat plane of layer 2.
         pixels: uint32 (pixels, 2): a pixel's first neuron in `du`, and where its first tap falls
             in `g`.
-        w: (channels of layer 2, rows of taps, taps and channels of layer 1 in a run).
+        w: (channels of layer 2, taps of a pixel), row by row of the kernel.
+        rows: of the kernel.
         stride: uint64, from a row of `g` to the next.
+        taps: scratch, (taps of a pixel,).
         g: flat plane of layer 1.
     """
     g[:] = _F0
-    channels, rows, run = w.shape
-    flat = w.reshape(w.size)
-    size, length = np.uint64(rows * run), np.uint64(run)
+    channels, size = w.shape
+    run = np.uint64(size // rows)
     for i in range(pixels.shape[0]):
         first, at = np.uint64(pixels[i, 0]), np.uint64(pixels[i, 1])
-        for y in range(np.uint64(rows)):
-            o = _U0
-            while o + _U4 <= np.uint64(channels):
-                d0, d1 = du[first + o], du[first + o + _U1]
-                d2, d3 = du[first + o + np.uint64(2)], du[first + o + np.uint64(3)]
-                w0 = o * size + y * length
-                w1, w2, w3 = w0 + size, w0 + size + size, w0 + size + size + size
-                for j in range(length):
-                    g[at + j] += (d0 * flat[w0 + j] + d1 * flat[w1 + j]) + (
-                        d2 * flat[w2 + j] + d3 * flat[w3 + j]
-                    )
-                o += _U4
-            while o < np.uint64(channels):
-                d0, w0 = du[first + o], o * size + y * length
-                for j in range(length):
-                    g[at + j] += d0 * flat[w0 + j]
-                o += _U1
+        taps[:] = _F0
+        o = 0
+        while o + 4 <= channels:
+            n = first + np.uint64(o)
+            d0, d1, d2, d3 = du[n], du[n + _U1], du[n + _U2], du[n + _U3]
+            w0, w1, w2, w3 = w[o], w[o + 1], w[o + 2], w[o + 3]
+            for j in range(size):
+                taps[j] += (d0 * w0[j] + d1 * w1[j]) + (d2 * w2[j] + d3 * w3[j])
+            o += 4
+        while o < channels:
+            row, d = w[o], du[first + np.uint64(o)]
+            for j in range(size):
+                taps[j] += d * row[j]
+            o += 1
+        k = _U0
+        for _ in range(rows):
+            for j in range(run):
+                g[at + j] += taps[k + j]
+            k += run
             at += stride
 
 
@@ -182,17 +187,19 @@ def backward(
     """One window back: grows the gradients of the packed weights.
 
     Args:
-        back: (pixels and weights of layer 2, weights of layer 3 (H, F), of layer 4 (3, H)).
+        back: (pixels, weights and kernel rows of layer 2, weights of layer 3 (H, F), of layer 4
+            (3, H)).
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
         by_count: float32, gradient by the window's output counts, zero beyond the three.
-        planes: scratch, (dL/du of each layer, gradient by the spikes of layers 1 to 3).
+        planes: scratch, (dL/du of each layer, gradient by the spikes of layers 1 to 3, taps of a
+            pixel).
         grads: of each layer, in the packed order.
     """
     reach, _, stride_w, stride = layers
-    pixels, back2, back3, back4 = back
+    pixels, back2, rows, back3, back4 = back
     threshold, width, scale = constants
-    du, g = planes
+    du, g, taps = planes
     for k in range(len(du)):
         du[k][:] = _F0
     start = 0
@@ -204,7 +211,7 @@ def backward(
         _through(g[2], potentials[2][t], threshold, width, scale, du[2])
         _below_full(du[2], back3, g[1])
         _through(g[1], potentials[1][t], threshold, width, scale, du[1])
-        _below_strided(du[1], pixels, back2, stride[0], g[0])
+        _below_strided(du[1], pixels, back2, rows, stride[0], taps, g[0])
         _through(g[0], potentials[0][t], threshold, width, scale, du[0])
         for k in range(1, len(du)):
             _gather(

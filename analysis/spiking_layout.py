@@ -221,7 +221,8 @@ class Layout:
         of4 = self.tables[3].pack(weights[3]).reshape(three.size, -1)
         return (
             strided_back(one, kernel, two),
-            np.ascontiguousarray(weights[1].transpose(0, 2, 3, 1)).reshape(c2, kernel, -1),
+            np.ascontiguousarray(weights[1].transpose(0, 2, 3, 1)).reshape(c2, -1),
+            kernel,
             np.ascontiguousarray(of3.T),
             np.ascontiguousarray(of4.T),
         )

@@ -32,6 +32,8 @@ def export_model(
     from flows.detect_order import load_model
     from storage.store import Store
 
+    if out.exists() and not out.is_dir():
+        raise InputError("--out", "", str(out), "must be a folder")
     fitted = load_model(model)
     folder = store or model.resolve().parent.parent
     if store is None and not (folder / "store.json").exists():

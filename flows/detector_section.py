@@ -10,10 +10,10 @@ from analysis.report import Figure, Section, Table, number, percent
 _WORDS = {
     "smoothing": "paper's rule",
     "smoothing chosen": "paper's rule, window chosen",
-    "hmm histograms": "hidden Markov filter, histograms of counts",
-    "hmm counts": "hidden Markov filter, counts",
-    "hmm counts and events": "hidden Markov filter, counts and events",
-    "cusum histograms": "CUSUM, histograms of counts",
+    "hmm histograms": "hidden Markov, histograms",
+    "hmm counts": "hidden Markov, counts",
+    "hmm counts and events": "hidden Markov, counts and events",
+    "cusum histograms": "CUSUM, histograms",
     "cusum counts": "CUSUM, counts",
     "cusum counts and events": "CUSUM, counts and events",
 }
@@ -22,13 +22,12 @@ _PAPER = ("smoothing", "smoothing chosen")
 _COLUMNS = (
     "detector",
     "stride (ms)",
-    "false early, validation",
-    "false early, test (95 %)",
-    "incipient median (ms)",
-    "p95",
+    "false early in validation",
+    "false early in test (95 %)",
+    "incipient, median / 95 % (ms)",
     "missed",
-    "gross median (ms)",
-    "lead median (ms)",
+    "gross, median (ms)",
+    "lead, median (ms)",
 )
 
 
@@ -121,9 +120,8 @@ def _cells(rate: dict[str, Any]) -> list[str]:
     share = test["false_early_rate"]
     return [
         str(rate["validation"]["latency_ms"]["incipient"]["false_early"]),
-        f"{incipient['false_early']} ({percent(share['low'])} to {percent(share['high'])})",
-        number(incipient["median"], 0),
-        number(incipient["p95"], 0),
+        f"{incipient['false_early']} ({100 * share['low']:.0f} to {percent(share['high'], 0)})",
+        f"{number(incipient['median'], 0)} / {number(incipient['p95'], 0)}",
         str(incipient["missed"]),
         number(test["latency_ms"]["gross"]["median"], 0),
         number(test["lead_ms"]["median"], 0),
