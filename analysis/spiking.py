@@ -311,7 +311,7 @@ def _constants(name: str, layer: Any) -> tuple[float, float, float]:
         and layer.tau_syn is None
     ):
         raise TypeError(f"{name}: the kernels compute only single spikes with reset to zero")
-    threshold = float(layer.spike_threshold)
+    threshold = float(layer.spike_threshold.detach())
     if not threshold > 0:
         raise TypeError(f"{name}: threshold {threshold}; the kernels need a positive one")
     return threshold, threshold * surrogate.grad_width, surrogate.grad_scale
