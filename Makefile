@@ -16,11 +16,9 @@ $(DONE): pyproject.toml constraints.txt
 demo: $(DONE)
 	$(BIN)/sliplab demo
 
-# Tests in real time mostly wait: they run beside the others, which stand back for them.
 test: $(DONE)
-	told=$$(mktemp); $(BIN)/python -m pytest -m realtime >"$$told" 2>&1 & realtime=$$!; \
-	nice -n 19 $(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime'; others=$$?; \
-	wait $$realtime; real=$$?; cat "$$told"; rm -f "$$told"; test $$others = 0 && test $$real = 0
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime'
+	$(BIN)/python -m pytest -m realtime
 
 lint: $(DONE)
 	$(BIN)/ruff check .
