@@ -24,7 +24,7 @@ from rigs.build import simulated_rig
 from rigs.levels import with_level
 from rigs.mock.devices import MockDevices, build_mock
 from rigs.rig_file import load_rig_file
-from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import EventChunk, FrameChunk, Unheeded
 
 ROOT = Path(__file__).parent.parent
 WINDOW_US = 30_000
@@ -32,7 +32,7 @@ STICKS, SLIDES, CLEAR = "#1f5fa8", "#d1495b", "#b9b9b9"
 
 
 @dataclass
-class Film:
+class Film(Unheeded):
     """A sink that keeps what a filmstrip shows."""
 
     events: list[EventChunk] = field(default_factory=list)
@@ -48,27 +48,6 @@ class Film:
         for index in np.flatnonzero(chunk.number % 5 == 0).tolist():
             self.images.append(chunk.images[index].copy())
             self.image_ns.append(int(chunk.t_ns[index]))
-
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        """Not shown."""
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        """Not shown."""
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        """Not shown."""
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Not shown."""
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        """Not shown."""
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        """Not shown."""
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Not shown."""
 
 
 def take(plan: Plan, trial: Trial) -> tuple[MockDevices, Film, dict[str, Any]]:

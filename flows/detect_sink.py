@@ -21,7 +21,7 @@ from analysis.live_decision import Decision
 from analysis.metrics import CLASSES, INCIPIENT
 from rigs.capabilities import Clock
 from rigs.reacting import SlipSeen
-from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from storage.streams import EventChunk, PulseChunk, Unheeded
 
 PATIENCE_US = 200_000
 """A window without an event after it is judged so long after its end, by the camera's clock as it
@@ -79,7 +79,7 @@ def state_name(valid_class: int) -> str:
     return UNDECIDED if valid_class < 0 else CLASSES[valid_class]
 
 
-class DetectSink:
+class DetectSink(Unheeded):
     """A `rigs.reacting.Watcher` that feeds a detector.
 
     Args:
@@ -175,29 +175,6 @@ class DetectSink:
             "compute_ms": _spread(self._compute),
             "losses": vars(self.detector.losses),
         }
-
-    # -- streams that tell the detector nothing ----------------------------------------------
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        """Not used."""
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        """Not used."""
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Not used."""
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        """Not used."""
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        """Not used."""
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Not used."""
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Not used."""
 
 
 def _spread(values: deque[float]) -> dict[str, float | int | None]:

@@ -26,7 +26,11 @@ from rigs.mock.skins import skin_of
 from rigs.rig import Rig, TrialRun
 from rigs.rig_file import RigFile
 from rigs.scene.onsets import retraction_onsets
-from storage.streams import ClockReads, EventChunk, FrameChunk, Json, PoseChunk, PulseChunk
+from storage.streams import (
+    EventChunk,
+    Json,
+    Unheeded,
+)
 
 MOTION = frozenset({"slide", "retract"})
 PERFECT = Clocks(
@@ -86,37 +90,13 @@ def with_true_times(rig: RigFile) -> RigFile:
 
 
 @dataclass
-class _Memory:
+class _Memory(Unheeded):
     """A sink that keeps the events and lets the rest go."""
 
     events: list[EventChunk] = field(default_factory=list)
 
     def add_events(self, chunk: EventChunk) -> None:
         self.events.append(chunk)
-
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        pass
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        pass
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        pass
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        pass
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        pass
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        pass
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        pass
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        pass
 
     def joined(self) -> EventChunk:
         """All events in one chunk."""

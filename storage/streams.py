@@ -147,4 +147,35 @@ class Sink(Protocol):
         """Append frames."""
 
 
+class Unheeded:
+    """A sink that lets every stream go; what wants some of them takes those."""
+
+    def add_events(self, chunk: EventChunk) -> None:
+        """Not kept."""
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        """Not kept."""
+
+    def add_arm_pulses(self, chunk: PulseChunk) -> None:
+        """Not kept."""
+
+    def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        """Not kept."""
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Not kept."""
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        """Not kept."""
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        """Not kept."""
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        """Not kept."""
+
+    def add_frames(self, chunk: FrameChunk) -> None:
+        """Not kept."""
+
+
 Json = dict[str, Any]
