@@ -109,7 +109,6 @@ def _where(windows: Json, simulated: bool) -> Section:
     ]
     worst = [
         [
-            ", ".join(f"{name} {text}" for name, text in row["condition"].items()),
             row["trial"],
             f"{row['errors']} of {row['n']}",
             ", ".join(f"{count} {_taken(what)}" for what, count in row["taken"].items()),
@@ -134,7 +133,7 @@ def _where(windows: Json, simulated: bool) -> Section:
             Table(["factor", "level", "trials", "windows", "right"], levels),
             Table(["no slip", "trials", "windows", "right"], still),
             Table(
-                ["condition", "trial", "wrong", "what was called what"],
+                ["trial", "wrong", "what was called what"],
                 worst,
                 f"The {len(worst)} worst trials of {len(windows['by_trial'])}.",
             ),
