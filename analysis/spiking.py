@@ -145,71 +145,72 @@ class Stream:
             state[:] = rest
 
 
-class WindowCounts(torch.autograd.Function):
-    """Output spikes of windows as a function of the weights, for training with torch."""
+class WindowLoss(torch.autograd.Function):
+    """The loss of a few windows as a function of the weights, for training with torch.
+
+    The sum of the cross-entropies of their output spike counts times the job's gain. The gradient is computed with it.
+    """
 
     @staticmethod
     def forward(ctx: Any, job: Job, *weights: torch.Tensor) -> torch.Tensor:
-        """Float32 (n, 3) for the job's windows; `weights` are the trainer's `leaves`."""
+        """Float64 (); `weights` are the trainer's `leaves`."""
         ctx.job = job
-        return torch.from_numpy(job.forward())
+        return torch.tensor(job.run(), dtype=torch.float64)
 
     @staticmethod
-    def backward(ctx: Any, by_count: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, by_loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Surrogate gradients by the weights."""
-        return None, *map(torch.from_numpy, ctx.job.backward(by_count.numpy()))
+        factor = float(by_loss)
+        grads = map(torch.from_numpy, ctx.job.grads)
+        return None, *(grads if factor == 1.0 else (grad * factor for grad in grads))
 
 
 class Job:
-    """A few windows through a network and back, with the memory for it.
+    """A few windows through a network and back.
 
     Args:
         trainer: the network.
         windows: samples; `rows` of them are meant.
-        rows: integer (n,).
+        rows: int64 (n,).
+        labels: classes int64 (n,) of these rows.
+        gain: what a spike counts in the cross-entropy.
+
+    Attributes:
+        counts: output spikes int64 (n, 3), when it was run.
+        grads: float32, gradients by the packed weights.
     """
 
-    def __init__(self, trainer: Trainer, windows: SparseWindows, rows: I64) -> None:
-        self._trainer, self._windows, self._rows = trainer, windows, rows
-        self._kept: list[tuple[Any, Any, Any]] = []
+    def __init__(
+        self,
+        trainer: Trainer,
+        windows: SparseWindows,
+        rows: I64,
+        labels: I64,
+        gain: float = 1.0,
+    ) -> None:
+        self._gain = gain
+        self._trainer, self._windows, self._rows, self._labels = trainer, windows, rows, labels
+        self._fired = np.zeros(len(SPIKING), np.int64)
+        self.counts = np.zeros((len(rows), len(CLASSES)), np.int64)
+        self.grads = tuple(np.zeros_like(w) for w in trainer.layers[1])
 
-    def forward(self) -> F32:
-        """Output spikes float32 (n, 3)."""
+    def run(self) -> float:
+        """The summed loss; once."""
         trainer, x = self._trainer, self._windows
-        state, scratch, *_ = memory = trainer.borrow()
-        out = np.zeros((len(self._rows), len(CLASSES)), np.int64)
-        for i, row in enumerate(self._rows.tolist()):
-            kept = trainer.kept()
-            spiking_gradients.forward_kept(
-                x.cell, x.count, x.offsets, row, trainer.steps, trainer.layers,
-                trainer.constants[0], trainer.layout.rest, state, scratch, *kept, out[i],
-            )  # fmt: skip
-            self._kept.append(kept)
+        memory = trainer.borrow()
+        loss = spiking_gradients.windows_loss(
+            x.cell, x.count, x.offsets, self._rows, self._labels, self._gain, trainer.steps,
+            trainer.layers, trainer.layout.spans, trainer.back, trainer.constants, trainer.layout.rest,
+            memory[:4], memory[4], self.counts, self._fired, self.grads,
+        )  # fmt: skip
         trainer.give_back(memory)
-        return out.astype(np.float32)
-
-    def backward(self, by_count: F32) -> tuple[F32, ...]:
-        """Gradients by the packed weights; may be called once."""
-        trainer, x = self._trainer, self._windows
-        _, _, planes, padded = memory = trainer.borrow()
-        grads = tuple(np.zeros_like(w) for w in trainer.layers[1])
-        for i, row in enumerate(self._rows.tolist()):
-            padded[: len(CLASSES)] = by_count[i]
-            spiking_gradients.backward(
-                x.cell, x.count, x.offsets, row, trainer.steps, trainer.layers, trainer.back,
-                trainer.constants, *self._kept[i], padded, planes, grads,
-            )  # fmt: skip
-            trainer.keep(self._kept[i])
-        self._kept = []
-        trainer.give_back(memory)
-        return grads
+        return float(loss)
 
     def rates(self) -> dict[str, float]:
-        """Mean spikes per neuron and step of each spiking layer, by name; before `backward`."""
+        """Mean spikes per neuron and step of each spiking layer, by name, when it was run."""
         steps = self._trainer.steps * len(self._rows)
         return {
-            name: sum(int(kept[2][k][-1]) for kept in self._kept)
-            / (steps * self._trainer.layout.neurons[k])
+            name: int(self._fired[k]) / (steps * self._trainer.layout.neurons[k])
             for k, name in enumerate(SPIKING)
         }
 
@@ -222,7 +223,6 @@ class Trainer:
         self.constants = neuron(net)
         self.layout = Layout(tuple(w.shape for w in torch_weights(net)), cells)
         self._idle: list[Any] = []
-        self._spare: list[Any] = []
         self.take(torch_weights(net))
 
     def take(self, weights: list[F32]) -> None:
@@ -230,38 +230,37 @@ class Trainer:
         self.layers = self.layout.layers(weights)
         self.back = self.layout.back(weights)
         self.leaves = tuple(torch.from_numpy(w).requires_grad_() for w in self.layers[1])
-        """The packed weights, by which `WindowCounts` is differentiated."""
+        """The packed weights, by which `WindowLoss` is differentiated."""
 
-    def borrow(self) -> tuple[Any, Any, Any, F32]:
-        """State, scratch, planes and a padded row for one thread."""
+    def borrow(self) -> tuple[Any, Any, Any, Any, F32]:
+        """State, scratch, kept, planes and a padded row for one thread.
+
+        Kept are, of each layer and for one window: potentials float32 (steps, neurons), spikes
+        uint64 and where each step's end, uint64 (steps + 1,).
+        """
         try:
             return self._idle.pop()
         except IndexError:
             layout = self.layout
-            taps = np.zeros(layout.shapes[1][1] * layout.shapes[1][2] ** 2, np.float32)
-            planes = (layout.state(), layout.state()[:-1], taps)
-            row = np.zeros(len(layout.rest[-1]), np.float32)
-            return layout.state(), layout.scratch(), planes, row
-
-    def give_back(self, memory: tuple[Any, Any, Any, F32]) -> None:
-        """For the next to borrow."""
-        self._idle.append(memory)
-
-    def kept(self) -> tuple[Any, Any, Any]:
-        """Potentials, lists of spikes and their ends for one window."""
-        try:
-            return self._spare.pop()
-        except IndexError:
-            sizes = [len(rest) for rest in self.layout.rest]
-            return (
+            sizes = [len(rest) for rest in layout.rest]
+            c2, c1, kernel, _ = layout.shapes[1]
+            kept = (
                 tuple(np.empty((self.steps, size), np.float32) for size in sizes),
                 tuple(np.empty(self.steps * size, np.uint64) for size in sizes),
                 tuple(np.empty(self.steps + 1, np.uint64) for size in sizes),
             )
+            planes = (
+                tuple(np.zeros((self.steps, size), np.float32) for size in sizes[1:]),
+                np.zeros(max(sizes), np.float32),
+                np.zeros(sizes[0], np.float32),
+                np.zeros((layout.tables[1].target.full ** 2, c1 * kernel * kernel), np.float32),
+            )
+            row = np.zeros(sizes[-1], np.float32)
+            return layout.state(), layout.scratch(), kept, planes, row
 
-    def keep(self, kept: tuple[Any, Any, Any]) -> None:
-        """For the next window."""
-        self._spare.append(kept)
+    def give_back(self, memory: tuple[Any, Any, Any, Any, F32]) -> None:
+        """For the next to borrow."""
+        self._idle.append(memory)
 
 
 def side_by_side(

@@ -7,11 +7,15 @@ Orchard, 2018). A weight's gradient is the sum of dL/dI over the spikes that wen
 of numbers a spike, as on the way forward (gather). Gradients by spikes have no zeros, so the way
 from a layer to the one below is dense; but it ends at the first event of a window.
 
+The loss is the cross-entropy of a window's own output counts, so a window goes forward and back at
+once, while its potentials (some 0.8 MB) are in the cache.
+
 The order of sums is that of the loops and vector lanes: the same on every run.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,19 +25,24 @@ from analysis.spiking_kernels import fire, scatter, scatter_counts
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 _U0, _U1, _U2, _U3 = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+_AT_ONCE = 4
+"""Steps that one product of matrices takes: few enough for the library not to ask other threads."""
+
 _LEAST = np.float32(-80.0)
 """exp below it is nothing (and would make denormal numbers, which are slow)."""
 
 
 @njit(cache=True, nogil=True)
 def forward_kept(
-    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, threshold: Any,
-    rest: Any, state: Any, scratch: Any, potentials: Any, lists: Any, ends: Any, out: Any,
+    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, spans: Any,
+    threshold: Any, rest: Any, state: Any, scratch: Any, potentials: Any, lists: Any, ends: Any,
+    out: Any,
 ) -> None:  # fmt: skip
     """One window forward, with what the way back needs.
 
     Args:
-        potentials: of each layer float32 (steps, neurons), filled with u.
+        spans: of each layer uint64 (n, 2), where its neurons lie; multiples of 8.
+        potentials: of each layer float32 (steps, neurons), filled with u inside the spans.
         lists: of each layer, filled with its spikes, one step after the other.
         ends: of each layer uint64 (steps + 1,), filled with where a step's spikes end.
         out: int64 (3,), grows by the output spikes.
@@ -57,10 +66,13 @@ def forward_kept(
                     lists[k - 1], ends[k - 1][t], ends[k - 1][t + 1], reach[k], weights[k],
                     stride_w[k], stride[k], currents[k],
                 )  # fmt: skip
-            ends[k][t + 1] = fire(
-                currents[k], state[k], potentials[k][t], threshold, fired, words, _U0,
-                np.uint64(currents[k].size), lists[k], ends[k][t],
-            )  # fmt: skip
+            n = ends[k][t]
+            for i in range(spans[k].shape[0]):
+                n = fire(
+                    currents[k], state[k], potentials[k][t], threshold, fired, words,
+                    spans[k][i, 0], spans[k][i, 1], lists[k], n,
+                )  # fmt: skip
+            ends[k][t + 1] = n
     for e in range(ends[last][steps]):
         if lists[last][e] < out.size:
             out[lists[last][e]] += 1
@@ -90,72 +102,48 @@ def _exp(x: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _through(g: Any, u: Any, threshold: Any, width: Any, scale: Any, du: Any) -> None:
-    """dL/du(t+1) in `du` becomes dL/du(t); all (m,)."""
+def _through(
+    g: Any, u: Any, threshold: Any, width: Any, scale: Any, du: Any, begin: Any, end: Any
+) -> None:
+    """dL/du(t+1) in `du` becomes dL/du(t); all (m,); neurons [begin, end), uint64."""
     height, inverse = scale / width, _F1 / width
-    for j in range(u.size):
+    for j in range(begin, end):
         over = u[j] - threshold
         carried = _F0 if over >= _F0 else du[j]
         du[j] = g[j] * (height * _exp(-abs(over) * inverse)) + carried
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _below_full(du: Any, w: Any, g: Any) -> None:
-    """Gradient by the spikes below a full layer: g (m,) = du (k,) @ w (k, m), four rows at once."""
-    g[:] = _F0
-    k = 0
-    while k + 4 <= w.shape[0]:
-        d0, d1, d2, d3 = du[k], du[k + 1], du[k + 2], du[k + 3]
-        w0, w1, w2, w3 = w[k], w[k + 1], w[k + 2], w[k + 3]
-        for j in range(g.size):
-            g[j] += (d0 * w0[j] + d1 * w1[j]) + (d2 * w2[j] + d3 * w3[j])
-        k += 4
-    while k < w.shape[0]:
-        row, d = w[k], du[k]
-        for j in range(g.size):
-            g[j] += d * row[j]
-        k += 1
+@njit(cache=True, nogil=True)
+def _back_in_time(
+    g: Any, u: Any, start: int, threshold: Any, width: Any, scale: Any, du: Any
+) -> None:
+    """The gradient by a layer's spikes in `g` (steps, m) becomes dL/du; `du` (m,) is scratch."""
+    n = np.uint64(u.shape[1])
+    du[:] = _F0
+    for t in range(u.shape[0] - 1, start - 1, -1):
+        _through(g[t], u[t], threshold, width, scale, du, _U0, n)
+        g[t] = du
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _below_strided(du: Any, pixels: Any, w: Any, rows: int, stride: Any, taps: Any, g: Any) -> None:
-    """Gradient by the spikes of layer 1 from that by layer 2's currents.
-
-    A pixel's taps are summed up aside, where they are one run, and then added to the plane.
+def _spread(taps: Any, pixels: Any, rows: int, stride: Any, g: Any) -> None:
+    """Gradient by the spikes of layer 1: what every pixel's taps add up to.
 
     Args:
-        du: flat plane of layer 2.
-        pixels: uint32 (pixels, 2): a pixel's first neuron in `du`, and where its first tap falls
-            in `g`.
-        w: (channels of layer 2, taps of a pixel), row by row of the kernel.
+        taps: (pixels with the border, taps of a pixel), row by row of the kernel.
+        pixels: uint32 (pixels, 2): a pixel's row in `taps`, and where its first tap falls in `g`.
         rows: of the kernel.
         stride: uint64, from a row of `g` to the next.
-        taps: scratch, (taps of a pixel,).
         g: flat plane of layer 1.
     """
     g[:] = _F0
-    channels, size = w.shape
-    run = np.uint64(size // rows)
+    run = np.uint64(taps.shape[1] // rows)
     for i in range(pixels.shape[0]):
-        first, at = np.uint64(pixels[i, 0]), np.uint64(pixels[i, 1])
-        taps[:] = _F0
-        o = 0
-        while o + 4 <= channels:
-            n = first + np.uint64(o)
-            d0, d1, d2, d3 = du[n], du[n + _U1], du[n + _U2], du[n + _U3]
-            w0, w1, w2, w3 = w[o], w[o + 1], w[o + 2], w[o + 3]
-            for j in range(size):
-                taps[j] += (d0 * w0[j] + d1 * w1[j]) + (d2 * w2[j] + d3 * w3[j])
-            o += 4
-        while o < channels:
-            row, d = w[o], du[first + np.uint64(o)]
-            for j in range(size):
-                taps[j] += d * row[j]
-            o += 1
-        k = _U0
+        of = taps[pixels[i, 0]]
+        at, k = np.uint64(pixels[i, 1]), _U0
         for _ in range(rows):
             for j in range(run):
-                g[at + j] += taps[k + j]
+                g[at + j] += of[k + j]
             k += run
             at += stride
 
@@ -180,46 +168,103 @@ def _gather(
 
 @njit(cache=True, nogil=True)
 def backward(
-    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, back: Any,
+    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, spans: Any, back: Any,
     constants: Any, potentials: Any, lists: Any, ends: Any, by_count: Any, planes: Any,
     grads: Any,
 ) -> None:  # fmt: skip
     """One window back: grows the gradients of the packed weights.
 
+    The three layers above the first go back one after the other, each through all steps; the
+    first, whose planes are large, step by step, while a step's planes are in the cache.
+
     Args:
-        back: (pixels, weights and kernel rows of layer 2, weights of layer 3 (H, F), of layer 4
-            (3, H)).
+        spans: see `forward_kept`.
+        back: (pixels, weights (channels of layer 2, taps) and kernel rows of layer 2, weights of
+            layer 3 (H, F), of layer 4 (3, H), rows of zeros below).
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
         by_count: float32, gradient by the window's output counts, zero beyond the three.
-        planes: scratch, (dL/du of each layer, gradient by the spikes of layers 1 to 3, taps of a
-            pixel).
+        planes: scratch, (dL/du of layers 2 to 4 (steps, neurons), dL/du of layer 1 or more, gradient
+            by its spikes, taps of a step).
         grads: of each layer, in the packed order.
     """
     reach, _, stride_w, stride = layers
     pixels, back2, rows, back3, back4 = back
     threshold, width, scale = constants
-    du, g, taps = planes
-    for k in range(len(du)):
-        du[k][:] = _F0
+    above, du, g, taps = planes
+    du2, du3, du4 = above
+    channels = back2.shape[0]
     start = 0
     while start < steps and offsets[row * steps + start] == offsets[row * steps + start + 1]:
         start += 1
+    for t in range(start, steps):
+        du4[t] = by_count
+    _back_in_time(du4, potentials[3], start, threshold, width, scale, du[: du4.shape[1]])
+    np.dot(du4, back4, du3)
+    _back_in_time(du3, potentials[2], start, threshold, width, scale, du[: du3.shape[1]])
+    for t in range(start, steps, _AT_ONCE):
+        until = min(t + _AT_ONCE, steps)
+        np.dot(du3[t:until], back3, du2[t:until])
+    _back_in_time(du2, potentials[1], start, threshold, width, scale, du[: du2.shape[1]])
+    du[:] = _F0
     for t in range(steps - 1, start - 1, -1):
-        _through(by_count, potentials[3][t], threshold, width, scale, du[3])
-        _below_full(du[3], back4, g[2])
-        _through(g[2], potentials[2][t], threshold, width, scale, du[2])
-        _below_full(du[2], back3, g[1])
-        _through(g[1], potentials[1][t], threshold, width, scale, du[1])
-        _below_strided(du[1], pixels, back2, rows, stride[0], taps, g[0])
-        _through(g[0], potentials[0][t], threshold, width, scale, du[0])
-        for k in range(1, len(du)):
+        np.dot(du2[t, : taps.shape[0] * channels].reshape((-1, channels)), back2, taps)
+        _spread(taps, pixels, rows, stride[0], g)
+        for i in range(spans[0].shape[0]):
+            _through(
+                g, potentials[0][t], threshold, width, scale, du, spans[0][i, 0], spans[0][i, 1]
+            )
+        for k in range(1, len(grads)):
             _gather(
-                lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], du[k],
+                lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], above[k - 1][t],
                 stride_w[k], stride[k], grads[k],
             )  # fmt: skip
         at = row * steps + t
         _gather(
-            cell, count, offsets[at], offsets[at + 1], reach[0], du[0], stride_w[0], stride[0],
+            cell, count, offsets[at], offsets[at + 1], reach[0], du, stride_w[0], stride[0],
             grads[0],
         )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def windows_loss(
+    cell: Any, count: Any, offsets: Any, rows: Any, labels: Any, gain: float, steps: int,
+    layers: Any, spans: Any, back: Any, constants: Any, rest: Any, memory: Any, by_count: Any,
+    out: Any, fired: Any, grads: Any,
+) -> float:  # fmt: skip
+    """Windows forward and back, one after the other: what a window leaves stays in the cache.
+
+    Args:
+        rows, labels: int64 (n,), which windows, and their classes.
+        gain: what a spike counts in the cross-entropy.
+        memory: (state, scratch, kept (potentials, lists, ends), planes) of one thread.
+        by_count: scratch float32, zero beyond the classes.
+        out: int64 (n, classes), grows by the output spikes.
+        fired: int64 (layers,), grows by every layer's spikes.
+        grads: of each layer, in the packed order; grow by the gradient of what is returned.
+
+    Returns:
+        the sum of the cross-entropies of the output spike counts times the gain.
+    """
+    state, scratch, kept, planes = memory
+    potentials, lists, ends = kept
+    classes, loss = out.shape[1], 0.0
+    for i in range(rows.size):
+        forward_kept(
+            cell, count, offsets, rows[i], steps, layers, spans, constants[0], rest, state,
+            scratch, potentials, lists, ends, out[i],
+        )  # fmt: skip
+        for k in range(fired.size):
+            fired[k] += np.int64(ends[k][steps])
+        most, total = out[i].max(), 0.0
+        for k in range(classes):
+            total += math.exp(gain * (out[i, k] - most))
+        loss += math.log(total) - gain * (out[i, labels[i]] - most)
+        for k in range(classes):
+            by_count[k] = np.float32(gain * math.exp(gain * (out[i, k] - most)) / total)
+        by_count[labels[i]] -= np.float32(gain)
+        backward(
+            cell, count, offsets, rows[i], steps, layers, spans, back, constants, potentials,
+            lists, ends, by_count, planes, grads,
+        )  # fmt: skip
+    return loss

@@ -17,6 +17,7 @@ import numpy.typing as npt
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U32 = npt.NDArray[np.uint32]
+U64 = npt.NDArray[np.uint64]
 
 LANES = 8
 """Planes hold a multiple of so many neurons, because spikes are looked for eight at a time."""
@@ -48,6 +49,18 @@ class Plane:
         line = np.arange(self.pad, self.pad + self.side)
         pixel = line[:, None] * self.full + line
         return pixel[:, :, None] * self.channels + np.arange(self.channels)
+
+    def spans(self) -> U64:
+        """Uint64 (n, 2): runs of neurons that hold all proper ones, bounds multiples of `LANES`."""
+        index = self.index().reshape(self.side, -1)
+        found: list[list[int]] = []
+        for first, last in zip(index[:, 0].tolist(), index[:, -1].tolist(), strict=True):
+            begin, end = first // LANES * LANES, -(-(last + 1) // LANES) * LANES
+            if found and begin <= found[-1][1]:
+                found[-1][1] = end
+            else:
+                found.append([begin, end])
+        return np.array(found, np.uint64)
 
     def rest(self) -> F32:
         """Potentials before a window: zero, and minus infinity in the border."""
@@ -174,14 +187,21 @@ def full_layer(below: Plane, n: int) -> Table:
 def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
     """For the way back through the second convolution: uint32 (pixels, 2).
 
-    A pixel's first neuron in its plane, and where tap (0, 0) falls in the plane below.
+    A pixel's place in its plane, and where tap (0, 0) falls in the plane below.
     """
     line = np.arange(plane.side)
     here = (line[:, None] + plane.pad) * plane.full + line + plane.pad
     there = 2 * line + below.pad - kernel // 2
     under = there[:, None] * below.full + there
-    pixels = np.stack([here * plane.channels, under * below.channels], axis=-1)
+    pixels = np.stack([here, under * below.channels], axis=-1)
     return pixels.reshape(-1, 2).astype(np.uint32)
+
+
+def _rows(matrix: F32, many: int) -> F32:
+    """A matrix with rows of zeros below, for neurons that fill up the lanes."""
+    rows = np.zeros((many, matrix.shape[1]), np.float32)
+    rows[: len(matrix)] = matrix
+    return rows
 
 
 class Layout:
@@ -202,6 +222,7 @@ class Layout:
         )
         planes = [table.target for table in self.tables]
         self.rest = tuple(plane.rest() for plane in planes)
+        self.spans = tuple(plane.spans() for plane in planes)
         self.neurons = tuple(plane.side * plane.side * plane.channels for plane in planes)
 
     def layers(self, weights: list[F32]) -> tuple[Any, ...]:
@@ -216,15 +237,15 @@ class Layout:
     def back(self, weights: list[F32]) -> tuple[Any, ...]:
         """What `analysis.spiking_gradients.backward` takes for them."""
         c2, _, kernel, _ = self.shapes[1]
-        one, two, three, _ = (table.target for table in self.tables)
+        one, two, three, four = (table.target for table in self.tables)
         of3 = self.tables[2].pack(weights[2]).reshape(two.size, -1)
         of4 = self.tables[3].pack(weights[3]).reshape(three.size, -1)
         return (
             strided_back(one, kernel, two),
             np.ascontiguousarray(weights[1].transpose(0, 2, 3, 1)).reshape(c2, -1),
             kernel,
-            np.ascontiguousarray(of3.T),
-            np.ascontiguousarray(of4.T),
+            _rows(of3.T, three.size),
+            _rows(of4.T, four.size),
         )
 
     def unpack(self, grads: Sequence[F32]) -> list[F32]:

@@ -104,22 +104,20 @@ def count_work(fitted: Fitted, x: SparseWindows) -> Work | None:
     fired = np.zeros((len(chunks), layers), np.int64)
 
     def some(begin: int) -> None:
-        state, scratch, *_ = memory = trainer.borrow()
-        potentials, lists, ends = kept = trainer.kept()
+        state, scratch, (potentials, lists, ends), *_ = memory = trainer.borrow()
         out = np.zeros(synapses[-1].max(), np.int64)
         row = begin // CHUNK
         for i in range(begin, min(begin + CHUNK, len(x))):
             forward_kept(
                 x.cell, x.count, x.offsets, i, trainer.steps, trainer.layers,
-                trainer.constants[0], trainer.layout.rest, state, scratch, potentials, lists,
-                ends, out,
+                trainer.layout.spans, trainer.constants[0], trainer.layout.rest, state, scratch,
+                potentials, lists, ends, out,
             )  # fmt: skip
             for k in range(layers):
                 spikes = lists[k][: int(ends[k][-1])]
                 fired[row, k] += len(spikes)
                 if k + 1 < layers:
                     done[row, k + 1] += synapses[k + 1][spikes].sum()
-        trainer.keep(kept)
         trainer.give_back(memory)
 
     side_by_side(some, chunks)

@@ -28,7 +28,7 @@ from torch import nn
 from analysis import metrics
 from analysis.network import SPIKING, WEIGHTED, build, on_grid, set_weights, weights
 from analysis.sparse import SparseWindows
-from analysis.spiking import Engine, Job, Samples, Trainer, WindowCounts, torch_weights
+from analysis.spiking import Engine, Job, Samples, Trainer, WindowLoss, torch_weights
 from protocols.settings import Network, Training, Windows
 
 MICRO_BATCH = 4
@@ -153,7 +153,7 @@ def fit(
             order = np.random.default_rng([seed, epoch]).permutation(len(train))
             loss, counts, rates = run.one_epoch(train, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
-            record = _record(epoch, loss, counts, train_y, val_counts, val_y, rates)
+            record = _record(epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain)
             run.keep(record)
             run.seconds.append(time.perf_counter() - started)
             if on_epoch is not None:
@@ -216,21 +216,25 @@ class _Run:
         self.training = training
         self.fine = build(network, windows, seed)
         self.trained = build(network, windows, seed)
-        """Has the fine weights at their points of the grid."""
+        """Has the fine weights at their points of the grid, between epochs."""
         self.parameters = [getattr(self.fine, name).weight for name in WEIGHTED]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=training.learning_rate)
+        self.optimizer = torch.optim.Adam(self.parameters, training.learning_rate, fused=True)
         self.trainer = Trainer(self.trained, windows.cells)
         self.history: list[EpochRecord] = []
         self.seconds: list[float] = []
         self.best = 0
         self.to_grid()
+        self.settle()
         self.kept = weights(self.trained)
 
     def to_grid(self) -> None:
         """Let the spikes be those of the fine weights as they are now."""
-        values = on_grid(torch_weights(self.fine))
-        self.trainer.take(values)
+        self.trainer.take(on_grid(torch_weights(self.fine)))
+
+    def settle(self) -> None:
+        """Let `trained` have the weights that the spikes are of."""
         with torch.no_grad():
+            values = on_grid(torch_weights(self.fine))
             for name, value in zip(WEIGHTED, values, strict=True):
                 getattr(self.trained, name).weight.copy_(torch.from_numpy(value))
 
@@ -255,16 +259,10 @@ class _Run:
             group["lr"] = learning_rate(self.training, len(self.history))
 
         def compute(rows: metrics.IntArray) -> _Part:
-            job = Job(self.trainer, x, rows)
-            out = WindowCounts.apply(job, *self.trainer.leaves)  # type: ignore[no-untyped-call]
-            rates = job.rates()
-            loss = nn.functional.cross_entropy(out, torch.from_numpy(y[rows]), reduction="sum")
-            return _Part(
-                loss=loss.item(),
-                counts=out.detach().numpy().astype(np.int64),
-                rates=rates,
-                gradients=torch.autograd.grad(loss, self.trainer.leaves),
-            )
+            job = Job(self.trainer, x, rows, y[rows], self.training.gain)
+            loss = WindowLoss.apply(job, *self.trainer.leaves)  # type: ignore[no-untyped-call]
+            grads = torch.autograd.grad(loss, self.trainer.leaves)
+            return _Part(loss.item(), job.counts, job.rates(), grads)
 
         loss = 0.0
         counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
@@ -287,6 +285,7 @@ class _Run:
                 parameter.grad = torch.from_numpy(gradient) / len(chosen)
             self.optimizer.step()
             self.to_grid()
+        self.settle()
         return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
 
     def keep(self, record: EpochRecord) -> None:
@@ -325,6 +324,7 @@ class _Run:
         except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
             raise ValueError(f"not a state of this training: {error}") from error
         self.to_grid()
+        self.settle()
 
 
 def learning_rate(training: Training, done: int) -> float:
@@ -346,10 +346,11 @@ def _record(
     val_counts: metrics.IntArray,
     val_y: metrics.IntArray,
     rates: dict[str, float],
+    gain: float,
 ) -> EpochRecord:
     val = metrics.accuracy(val_counts, val_y)
     train = metrics.accuracy(train_counts, train_y)
-    log_p = log_softmax(val_counts.astype(np.float64), axis=1)
+    log_p = log_softmax(gain * val_counts, axis=1)
     return EpochRecord(
         epoch=epoch,
         loss=loss,

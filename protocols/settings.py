@@ -114,6 +114,8 @@ class Training(StrictModel):
     learning_rate: float = Field(default=2e-3, gt=0, le=1)
     schedule: Literal["constant", "cosine"] = "constant"
     """Of the learning rate over the epochs."""
+    gain: float = Field(default=1.0, gt=0, le=10)
+    """What a spike counts in the cross-entropy. Less of it asks for counts further apart."""
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[int, ...] = (0,)

@@ -9,30 +9,40 @@ from torch import nn
 
 from analysis.network import WEIGHTED, build, reset_states
 from analysis.sparse import SparseWindows
-from analysis.spiking import Job, Trainer, WindowCounts, torch_weights
+from analysis.spiking import Job, Trainer, WindowLoss, torch_weights
 from analysis.spiking_gradients import _through
 from protocols.settings import Network, Windows
 from tests.analysis.test_spiking import FULL, SMALL, TINY, gridded, one_thread, put, sparse
 
 __all__ = ["one_thread"]
 
+CONSTANTS = np.array([1, 0.5, 1], np.float32)
+"""Threshold, width and scale of the surrogate."""
 
-def by_sinabs(net: nn.Sequential, x: np.ndarray, y: torch.Tensor) -> list[torch.Tensor]:
+
+def ends(n: int) -> np.ndarray:
+    return np.array([0, n], np.uint64)
+
+
+def by_sinabs(
+    net: nn.Sequential, x: np.ndarray, y: torch.Tensor, gain: float = 1.0
+) -> list[torch.Tensor]:
     reset_states(net)
     out = net(torch.from_numpy(x.astype(np.float32)).flatten(0, 1)).unflatten(0, (len(x), -1))
-    loss = nn.functional.cross_entropy(out.sum(dim=1), y)
+    loss = nn.functional.cross_entropy(gain * out.sum(dim=1), y)
     return list(torch.autograd.grad(loss, [getattr(net, name).weight for name in WEIGHTED]))
 
 
 def by_events(
-    net: nn.Sequential, x: np.ndarray, y: torch.Tensor, cells: int
+    net: nn.Sequential, x: np.ndarray, y: torch.Tensor, cells: int, gain: float = 1.0
 ) -> tuple[torch.Tensor, list[np.ndarray]]:
     trainer = Trainer(net, cells)
-    job = Job(trainer, SparseWindows.of(x), np.arange(len(x)))
-    out = WindowCounts.apply(job, *trainer.leaves)
-    loss = nn.functional.cross_entropy(out, y)
+    job = Job(trainer, SparseWindows.of(x), np.arange(len(x)), y.numpy(), gain)
+    loss = WindowLoss.apply(job, *trainer.leaves) / len(x)
     grads = torch.autograd.grad(loss, trainer.leaves)
-    return out, trainer.layout.unpack([grad.numpy() for grad in grads])
+    counts = torch.from_numpy(job.counts)
+    torch.testing.assert_close(loss, nn.functional.cross_entropy(gain * counts.double(), y))
+    return counts, trainer.layout.unpack([grad.numpy() for grad in grads])
 
 
 class _Spike(torch.autograd.Function):
@@ -114,6 +124,13 @@ def test_every_shape_of_network(k1: int, k2: int) -> None:
         assert np.linalg.norm(found - expected.numpy()) <= 1e-6 * np.linalg.norm(expected)
 
 
+def test_the_gain_of_the_loss() -> None:
+    net = gridded(SMALL, TINY, 0)
+    x, y = sparse(6, TINY, 0, 0.3), torch.arange(6) % 3
+    _, fast = by_events(net, x, y, TINY.cells, gain=0.5)
+    assert max(off(fast, by_sinabs(net, x, y, gain=0.5))) <= 1e-6
+
+
 def test_windows_without_events_give_none() -> None:
     net = gridded(SMALL, TINY, 0)
     x = np.zeros((2, 10, 1, 6, 6), np.uint8)
@@ -128,7 +145,7 @@ def test_gradient_of_one_neuron_in_closed_form() -> None:
     up = np.array([1.0, 10.0, 100.0, 1000.0], np.float32)
     du, found = np.zeros(1, np.float32), []
     for t in reversed(range(4)):
-        _through(up[t : t + 1], u[t : t + 1], *np.array([1, 0.5, 1], np.float32), du)
+        _through(up[t : t + 1], u[t : t + 1], *CONSTANTS, du, *ends(1))
         found.insert(0, float(du[0]))
     each = up * 2 * np.exp(-np.abs(u.astype(float) - 1) / 0.5)
     expected = [each[0] + each[1], each[1], each[2] + each[3], each[3]]
@@ -139,7 +156,7 @@ def test_slope_over_the_whole_range() -> None:
     """The kernel's own exponential, from the threshold to where nothing is left."""
     u = np.concatenate([np.linspace(-60, 60, 20_001), [-np.inf, np.inf]]).astype(np.float32)
     du = np.zeros_like(u)
-    _through(np.ones_like(u), u, *np.array([1, 0.5, 1], np.float32), du)
+    _through(np.ones_like(u), u, *CONSTANTS, du, *ends(u.size))
     assert np.isfinite(du).all()
     v = u.astype(np.float64)
     expected = 2 * np.exp(-np.abs(v - 1) / 0.5)
@@ -159,7 +176,7 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
     losses = []
     for _ in range(30):
         out, grads = by_events(net, x, y, TINY.cells)
-        losses.append(nn.functional.cross_entropy(out.detach(), y).item())
+        losses.append(nn.functional.cross_entropy(out.double(), y).item())
         values = torch_weights(net)
         put(net, [w - 0.05 * g for w, g in zip(values, grads, strict=True)])
     assert min(losses[20:]) < losses[0] - 0.1
