@@ -148,7 +148,8 @@ class Stream:
 class WindowLoss(torch.autograd.Function):
     """The loss of a few windows as a function of the weights, for training with torch.
 
-    The sum of the cross-entropies of their output spike counts times the job's gain. The gradient is computed with it.
+    The sum of the cross-entropies of their output spike counts times the job's gain. The gradient
+    is computed with it.
     """
 
     @staticmethod
@@ -200,8 +201,8 @@ class Job:
         memory = trainer.borrow()
         loss = spiking_gradients.windows_loss(
             x.cell, x.count, x.offsets, self._rows, self._labels, self._gain, trainer.steps,
-            trainer.layers, trainer.layout.spans, trainer.back, trainer.constants, trainer.layout.rest,
-            memory[:4], memory[4], self.counts, self._fired, self.grads,
+            trainer.layers, trainer.layout.spans, trainer.back, trainer.constants,
+            trainer.layout.rest, memory[:4], memory[4], self.counts, self._fired, self.grads,
         )  # fmt: skip
         trainer.give_back(memory)
         return float(loss)
@@ -243,7 +244,7 @@ class Trainer:
         except IndexError:
             layout = self.layout
             sizes = [len(rest) for rest in layout.rest]
-            c2, c1, kernel, _ = layout.shapes[1]
+            _, c1, kernel, _ = layout.shapes[1]
             kept = (
                 tuple(np.empty((self.steps, size), np.float32) for size in sizes),
                 tuple(np.empty(self.steps * size, np.uint64) for size in sizes),

@@ -184,8 +184,8 @@ def backward(
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
         by_count: float32, gradient by the window's output counts, zero beyond the three.
-        planes: scratch, (dL/du of layers 2 to 4 (steps, neurons), dL/du of layer 1 or more, gradient
-            by its spikes, taps of a step).
+        planes: scratch, (dL/du of layers 2 to 4 (steps, neurons), dL/du of the largest layer,
+            gradient by the spikes of layer 1, taps of a step).
         grads: of each layer, in the packed order.
     """
     reach, _, stride_w, stride = layers
