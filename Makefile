@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DONE := .venv/.installed
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo test test-long lint bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -17,8 +17,12 @@ demo: $(DONE)
 	$(BIN)/sliplab demo
 
 test: $(DONE)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime'
-	$(BIN)/python -m pytest -m realtime
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime and not long'
+	$(BIN)/python -m pytest -m 'realtime and not long'
+
+# further cases of what has been tested, which take longer than they tell
+test-long: $(DONE)
+	$(BIN)/python -m pytest -m long
 
 lint: $(DONE)
 	$(BIN)/ruff check .

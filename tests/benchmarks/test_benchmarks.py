@@ -57,12 +57,11 @@ PROMISED = {
 }  # fmt: skip
 
 
-REALTIME = pytest.mark.realtime
+MARKS = {"acquisition": pytest.mark.realtime, "scene": pytest.mark.long}
+"""The scene's takes longest to compile, and is all of it elsewhere in the tests."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=REALTIME if name == "acquisition" else ()) for name in TINY]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in TINY])
 def test_a_benchmark_gives_what_is_promised(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -156,7 +156,10 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {trial.name: read_json(trial / "checksums.json") for trial in trials.iterdir()}
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)],
+)
 def test_a_stopped_collection_goes_on_to_the_same_data(
     number: signal.Signals, tmp_path: Path, undisturbed: dict[str, Any]
 ) -> None:

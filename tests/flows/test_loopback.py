@@ -127,7 +127,7 @@ def with_arm(file: RigFile, kind: str) -> RigFile:
     )
 
 
-@pytest.mark.parametrize("kind", ["abb", "abb_socket"])
+@pytest.mark.parametrize("kind", [pytest.param("abb", marks=pytest.mark.long), "abb_socket"])
 def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> None:
     order = order_in(tmp_path / "live", quick(), rig_yaml(tmp_path))
     file = with_arm(order.rig, kind)

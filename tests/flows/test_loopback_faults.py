@@ -112,7 +112,21 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.device}-{case.kind}")
+FIRST = {("arm", "protective stop"), ("arm", "link cut"), ("event_camera", "unplug"),
+         ("sync_box", "unplug")}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(
+            case,
+            id=f"{case.device}-{case.kind}",
+            marks=() if (case.device, case.kind) in FIRST else pytest.mark.long,
+        )
+        for case in CASES
+    ],
+)
 def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
     scene: tuple[Loopback, Order], case: Case
 ) -> None:

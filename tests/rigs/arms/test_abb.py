@@ -78,7 +78,7 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> None:
     assert time.monotonic() - began < within_s + BUSY_S
 
 
-@pytest.mark.parametrize("speed", [0.6, 1.6])
+@pytest.mark.parametrize("speed", [pytest.param(0.6, marks=pytest.mark.long), 1.6])
 def test_a_slide_is_straight_and_at_its_speed(pair: MakePair, speed: float) -> None:
     arm, _ = pair(rate=5.0, cycle_hz=50)  # 25 s of controller time at 0.6 mm/s
     arm.read_poses()

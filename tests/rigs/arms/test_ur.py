@@ -40,7 +40,9 @@ def middle(chunk: PoseChunk, span: tuple[int, int]) -> tuple[npt.NDArray[np.floa
     return (chunk.t_ns[inside] - span[0]) / 1e9, chunk.xyz_mm[inside]
 
 
-@pytest.mark.parametrize("rate", [5.0, pytest.param(1.0, id="real time, 10 s")])
+@pytest.mark.parametrize(
+    "rate", [5.0, pytest.param(1.0, id="real time, 10 s", marks=pytest.mark.long)]
+)
 def test_a_slide_at_1_6_mm_s_is_straight_and_at_its_speed(
     robot_of: MakeRobot, arm_on: MakeArm, rate: float
 ) -> None:
