@@ -1,44 +1,111 @@
-"""The whole chain: collect every protocol, synchronise, then label, train, evaluate and report."""
+"""The whole chain: collect every protocol, synchronise, label, check the labels, train, evaluate,
+report. Run again it goes on where it was, and a step with nothing to do says so.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
-from flows import console
+from flows import label_check
 from flows.campaigns import collected
 from flows.collect import collect
 from flows.evaluate import evaluate
 from flows.label import label
+from flows.label_check import check_labels
 from flows.orders import Order
 from flows.report import report
+from flows.study_ledger import Ledger, Row
 from flows.sync import sync
 from flows.train import train
 from storage.store import Store
 
+COLLECT_S = {"tracks": 0.3, "video": 5.0}
+"""What a simulated trial is expected to take on two cores, by what the camera hands over; a real
+one takes what is planned."""
+LABEL_S = {"tracks": 0.2, "video": 1.5}
+SYNC_S = 0.03
+SAMPLES_PER_S = 1500.0
+EVALUATE_S, REPORT_S = 60.0, 20.0
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """What every step of a study did."""
+    """What every step of a study did, and what it cost."""
 
     collected: list[dict[str, Any]]
     steps: list[dict[str, Any]]
+    rows: list[Row] = field(default_factory=list)
 
 
-def study(orders: list[Order]) -> Outcome:
-    """Run what is missing or stale, step by step; a step with nothing to do says so."""
+def study(orders: list[Order], check: int = 0) -> Outcome:
+    """Run what is missing or stale, step by step; a step with nothing to do says so.
+
+    Args:
+        check: trials whose labels are checked with video, where the rig draws none.
+    """
+    Store.create(orders[0].store)
+    check = check if label_check.wanted(orders[0]) else 0
+    ledger = Ledger(orders[0].store, expected(orders, check))
     done = []
     for order in orders:
-        result = collect(order)
-        done.append(result)
-        if not result["taken"]:
-            console.say(f"collect {order.campaign}: nothing to do")
+        with ledger.step(f"collect {order.campaign}") as tell:
+            result = collect(order)
+            done.append(result)
+            _tell(tell, result["taken"], "trials taken")
     store = Store.open(orders[0].store)
     campaigns = collected(store, [order.campaign for order in orders])
     steps = []
-    for step in (sync, label, train, evaluate, report):
-        result = step(store, campaigns)
-        steps.append(result)
-        if not result["done"]:
-            console.say(f"{result['step']}: nothing to do")
-    return Outcome(done, steps)
+
+    def run(name: str, work: Callable[[], dict[str, Any]], of: str) -> None:
+        with ledger.step(name) as tell:
+            result = work()
+            steps.append(result)
+            _tell(tell, result["done"], of)
+
+    run("sync", lambda: sync(store, campaigns), "trials")
+    run("label", lambda: label(store, campaigns), "trials")
+    if check:
+        run(label_check.STEP, lambda: check_labels(orders[0], check), "trials")
+    run("train", lambda: train(store, campaigns), "networks")
+    run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
+    run("report", lambda: report(store, campaigns), "pages")
+    return Outcome(done, steps, ledger.rows())
+
+
+def expected(orders: list[Order], check: int) -> dict[str, float]:
+    """Seconds that each step is expected to take from nothing."""
+    seconds: dict[str, float] = {}
+    labelled, trials = 0.0, 0
+    for order in orders:
+        plan, source = order.plan, order.rig.frame_source
+        count = len(plan.trials)
+        trials += count
+        labelled += LABEL_S[source] * count
+        simulated = COLLECT_S[source] * count
+        taken = simulated if order.rig.in_virtual_time else plan.total_seconds
+        seconds[f"collect {order.campaign}"] = taken
+    seconds["sync"], seconds["label"] = SYNC_S * trials, labelled
+    if check:
+        seconds[label_check.STEP] = (COLLECT_S["video"] + LABEL_S["video"]) * check
+    seconds["train"] = _training_s(orders)
+    return {**seconds, "evaluate": EVALUATE_S, "report": REPORT_S}
+
+
+def _training_s(orders: list[Order]) -> float:
+    found = [order for order in orders if order.plan.protocol.collection.experiment == "kinematic"]
+    windows = sum(
+        3 * order.plan.protocol.analysis.samples.per_class
+        for order in found
+        for trial in order.plan
+        if trial.split == "train"
+    )
+    if not found:
+        return 0.0
+    training = found[0].plan.protocol.analysis.training
+    return windows * training.epochs * len(training.seeds) / SAMPLES_PER_S
+
+
+def _tell(tell: Callable[[str, bool], None], done: int, of: str) -> None:
+    tell(f"{done} {of}" if done else "nothing to do", bool(done))

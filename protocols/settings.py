@@ -112,9 +112,9 @@ class Training(StrictModel):
     epochs: int = Field(default=12, ge=1, le=10_000)
     batch: int = Field(default=32, ge=1, le=4096)
     learning_rate: float = Field(default=2e-3, gt=0, le=1)
-    schedule: Literal["constant", "cosine"] = "constant"
+    schedule: Literal["constant", "cosine"] = "cosine"
     """Of the learning rate over the epochs."""
-    gain: float = Field(default=1.0, gt=0, le=10)
+    gain: float = Field(default=0.25, gt=0, le=10)
     """What a spike counts in the cross-entropy. Less of it asks for counts further apart."""
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""

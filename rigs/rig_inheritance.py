@@ -96,8 +96,14 @@ def read_rig(path: Path) -> RigSource:
         merged = _merge(merged, data)
     if len(parts) > 1:
         names = " on ".join(file.name for file, _ in parts)
-        text = f"# Merged: {names}\n" + yaml.dump(merged, Dumper=_Dumper, sort_keys=False)
+        text = f"# Merged: {names}\n" + rig_yaml(merged)
     return RigSource(path, merged, text, tuple(parts))
+
+
+def rig_yaml(data: dict[str, Any]) -> str:
+    """A rig file's content as it is written down."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False)
+    return text
 
 
 def _same(a: Path, b: Path) -> bool:

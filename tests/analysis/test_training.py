@@ -24,7 +24,9 @@ from protocols.settings import Network, Training, Windows
 
 NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
 WINDOWS = Windows(length_ms=12, crop_px=160)  # (12, 1, 8, 8)
-TRAINING = Training(epochs=6, batch=16, learning_rate=1e-2, patience=6)
+TRAINING = Training(
+    epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0
+)
 
 
 @pytest.fixture(autouse=True, scope="module")

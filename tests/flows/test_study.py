@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from flows import trial_work, window_baselines, window_checks
 from flows.campaigns import collected, training_campaigns
 from flows.collect import collect
 from flows.evaluate import evaluate
+from flows.label_check import check_labels, folder_of, read_check, wanted
 from flows.orders import Order, make_order
 from flows.report import read_summary, report
 from flows.reviewed import Labels
@@ -62,6 +64,26 @@ def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[Order], Outcome]
     for kind in ("incipient", "gross"):
         assert errors[kind]["n"] >= 7
         assert errors[kind]["median_abs"] <= 10.0
+
+
+def test_labels_of_tracks_are_checked_with_video(
+    ran: tuple[list[Order], Outcome], tmp_path: Path
+) -> None:
+    order = replace(ran[0][0], store=tmp_path / "store")
+    shutil.copytree(store_of(ran).folder, order.store)
+    assert wanted(order)
+    assert check_labels(order, 2)["done"] == 2
+    found = read_check(Store.open(order.store))
+    assert found is not None
+    assert (found["trials"], found["simulated"]) == (2, True)
+    assert found["rules_ms"]["paper"]["incipient"]["n"] == 2
+    assert (
+        found["rules_ms"]["paper"]["incipient"]["max_abs"] < 25.0
+    )  # the true onset to within 2.5 frames
+    (first, second) = Store.open(folder_of(order)).campaign(order.campaign).committed()
+    assert {first, second} <= {trial.id for trial in order.plan}
+    assert check_labels(order, 2)["done"] == 0
+    assert check_labels(order, 3)["done"] == 1
 
 
 def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Outcome]) -> None:

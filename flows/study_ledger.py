@@ -1,0 +1,135 @@
+"""What a study has done, what each step cost, and how long is left: `study.json` in its store.
+
+A study runs for half an hour or for weeks, is stopped and gone on with, and is looked at from
+another terminal. So the seconds of a step are added up over all its runs and written as it ends,
+well or not; what is left is reckoned from what steps were expected to take, times how much longer
+than expected those took that are over.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flows import console
+from storage.files import read_json, write_json
+
+FILE = "study.json"
+TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"
+LEAST, MOST = 0.2, 5.0
+"""Limits of how much longer or shorter than expected the rest may take by what is over."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One step of a study.
+
+    Attributes:
+        state: `TO_DO`, `RUNNING`, `STOPPED` (in the middle, to be gone on with) or `DONE`.
+        seconds: what it took so far, over all runs.
+        expected_s: what it was expected to take from nothing.
+        note: what it did, in a few words.
+    """
+
+    name: str
+    state: str
+    seconds: float
+    expected_s: float
+    note: str
+
+
+class Ledger:
+    """The steps of one study.
+
+    Args:
+        folder: the study's store.
+        expected: seconds that each step is expected to take from nothing, in their order.
+        clock: seconds of a clock that only goes forwards.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        expected: Mapping[str, float],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._path, self._clock = folder / FILE, clock
+        before = {row.name: row for row in read(folder)}
+        self._rows = {
+            name: Row(name, TO_DO, before[name].seconds if name in before else 0.0, seconds, "")
+            for name, seconds in expected.items()
+        }
+        self._known = {name for name, row in before.items() if row.state == DONE}
+
+    def rows(self) -> list[Row]:
+        """All steps in their order."""
+        return list(self._rows.values())
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[Callable[[str, bool], None]]:
+        """Measure a step; give what tells what it did, and whether that was anything."""
+        before, began = self._rows[name], self._clock()
+        self._put(before, state=RUNNING)
+        place = list(self._rows).index(name) + 1
+        told: list[tuple[str, bool]] = []
+        console.say(f"[{place}/{len(self._rows)}] {name}{self._times()}")
+        state = STOPPED
+        try:
+            yield lambda note, worked: told.append((note, worked))
+            state = DONE
+        finally:
+            note, worked = told[-1] if told else ("", True)
+            spent = self._clock() - began if worked else 0.0
+            self._put(before, state=state, seconds=before.seconds + spent, note=note)
+
+    def left_s(self) -> float:
+        """Seconds that the steps to do and to go on with will take, by all that is known."""
+        over = [r for r in self._rows.values() if r.state == DONE and r.seconds > 0]
+        expected = sum(row.expected_s for row in over)
+        pace = sum(row.seconds for row in over) / expected if expected else 1.0
+        pace = min(max(pace, LEAST), MOST)
+        return sum(
+            max(row.expected_s * pace - row.seconds, 0.0)
+            for row in self._rows.values()
+            if row.state != DONE and row.name not in self._known
+        )
+
+    def _times(self) -> str:
+        spent = sum(row.seconds for row in self._rows.values())
+        left = self.left_s()
+        told = f": about {console.duration(left)} left" if left else ""
+        return told + (f", {console.duration(spent)} so far" if spent else "")
+
+    def _put(self, row: Row, *, state: str, seconds: float | None = None, note: str = "") -> None:
+        spent = row.seconds if seconds is None else seconds
+        self._rows[row.name] = Row(row.name, state, spent, row.expected_s, note)
+        write_json(self._path, {"steps": [vars(each) for each in self._rows.values()]})
+
+
+def read(folder: Path) -> list[Row]:
+    """The steps of a study as they were last written; none where there is no study."""
+    path = folder / FILE
+    if not path.exists():
+        return []
+    return [Row(**row) for row in read_json(path)["steps"]]
+
+
+def print_rows(rows: list[Row]) -> None:
+    """The one view of what is done, what it cost and how long is left, as a table."""
+    total = sum(row.seconds for row in rows)
+    shown: list[list[Any]] = [
+        [
+            row.name,
+            row.state,
+            console.duration(row.seconds) if row.seconds else "-",
+            f"{100 * row.seconds / total:.0f} %" if total else "-",
+            row.note,
+        ]
+        for row in rows
+    ]
+    shown.append(["all", "", console.duration(total), "", ""])
+    console.print_table("Study", ["step", "state", "took", "share", "what it did"], shown)

@@ -1,0 +1,88 @@
+"""The ledger of a study: what is done, what it cost, how long is left; over stops, too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flows.study_ledger import DONE, RUNNING, STOPPED, TO_DO, Ledger, read
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+EXPECTED = {"collect": 100.0, "label": 50.0, "train": 200.0}
+
+
+def test_a_study_from_its_beginning_to_its_end(tmp_path: Path) -> None:
+    clock = Clock()
+    ledger = Ledger(tmp_path, EXPECTED, clock)
+    assert ledger.left_s() == 350.0
+    with ledger.step("collect") as tell:
+        assert [row.state for row in read(tmp_path)] == [RUNNING, TO_DO, TO_DO]
+        clock.now += 50.0  # twice as fast as expected
+        tell("10 trials taken", True)
+    assert ledger.left_s() == pytest.approx(125.0)
+    with ledger.step("label") as tell:
+        clock.now += 25.0
+        tell("10 trials", True)
+    with ledger.step("train") as tell:
+        clock.now += 75.0
+        tell("1 networks", True)
+    assert ledger.left_s() == 0.0
+    rows = read(tmp_path)
+    assert [row.state for row in rows] == [DONE] * 3
+    assert [row.seconds for row in rows] == [50.0, 25.0, 75.0]
+    assert rows[0].note == "10 trials taken"
+
+
+def test_a_step_that_was_stopped_adds_up(tmp_path: Path) -> None:
+    clock = Clock()
+
+    def work() -> None:
+        with Ledger(tmp_path, EXPECTED, clock).step("collect"):
+            clock.now += 30.0
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
+    assert read(tmp_path)[0].state == STOPPED
+    again = Ledger(tmp_path, EXPECTED, clock)
+    assert again.left_s() == 70.0 + 50.0 + 200.0
+    with again.step("collect") as tell:
+        clock.now += 90.0
+        tell("6 trials taken", True)
+    assert read(tmp_path)[0].seconds == 120.0
+    assert again.left_s() == pytest.approx(250.0 * 1.2)
+
+
+def test_a_step_with_nothing_to_do_costs_nothing_and_keeps_what_it_cost(tmp_path: Path) -> None:
+    clock = Clock()
+    for worked in (True, False):
+        ledger = Ledger(tmp_path, EXPECTED, clock)
+        with ledger.step("collect") as tell:
+            clock.now += 40.0
+            tell("told", worked)
+        assert read(tmp_path)[0].seconds == 40.0
+    assert ledger.left_s() == pytest.approx(250.0 * 0.4)
+
+
+def test_what_is_left_is_never_beyond_reason(tmp_path: Path) -> None:
+    clock = Clock()
+    ledger = Ledger(tmp_path, EXPECTED, clock)
+    with ledger.step("collect") as tell:
+        clock.now += 1e6
+        tell("told", True)
+    assert ledger.left_s() == 5 * 250.0
+
+
+def test_no_study_no_rows(tmp_path: Path) -> None:
+    assert read(tmp_path) == []
