@@ -21,7 +21,7 @@ from flows.orders import Order, make_order
 from protocols.yaml_file import parse_yaml
 from rigs.rig_inheritance import rig_yaml
 from storage.derived import Derived, make_key
-from storage.files import make_folder, write_text
+from storage.files import write_text
 from storage.store import Store
 
 STEP = "label-check"
@@ -41,13 +41,13 @@ def video_order(order: Order, trials: int) -> Order:
         order: the study's own, of which something was collected.
     """
     folder = folder_of(order)
-    make_folder(folder)
     data = parse_yaml(order.rig_text, "rig file")
     data["name"] = f"{order.rig.name}-video"
     data.setdefault("mock", {}).setdefault("frame_camera", {})["level"] = "video"
-    write_text(folder / "rig.yaml", rig_yaml(data))
+    rig = folder.with_suffix(".yaml")
+    write_text(rig, rig_yaml(data))
     protocol = Store.open(order.store).campaign(order.campaign).protocol_file
-    wanted = make_order(protocol, folder / "rig.yaml", folder, campaign=order.campaign)
+    wanted = make_order(protocol, rig, folder, campaign=order.campaign)
     there = 0
     if (folder / "store.json").exists():
         there = len(Store.open(folder).campaign(order.campaign).committed())
