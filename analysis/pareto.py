@@ -29,8 +29,8 @@ def front(costs: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
         ValueError: not a table, or not a number in it.
     """
     costs = np.asarray(costs, np.float64)
-    if costs.ndim != 2:
-        raise ValueError(f"costs have the shape {costs.shape}; expected (n, k)")
+    if costs.ndim != 2 or not costs.shape[1]:
+        raise ValueError(f"costs have the shape {costs.shape}; expected (n, k), k at least 1")
     if np.isnan(costs).any():
         raise ValueError(f"costs of row {int(np.isnan(costs).any(axis=1).argmax())} hold a NaN")
     n, k = costs.shape

@@ -3,9 +3,10 @@
 Layers in whole numbers have a threshold each, and the kernels take one for all. A whole potential
 u reaches a whole threshold s exactly where m u reaches any T above m (s - 1) and up to m s; so
 each layer's weights are multiplied by a whole number of its own, and one T serves them all. All
-sums stay whole, and float32 holds them exactly below 2^24: as many as 2^24 / T thresholds, further
-than a window from rest goes. The chip's limit of 16 bits is not applied (`analysis.quantised.
-chip_run` has it); tests hold both to the same counts.
+sums stay whole, and float32 holds them exactly below 2^24, which is 2^24 / T thresholds.
+
+Potentials are not cut off at the chip's 16 bits (`analysis.quantised.chip_run` does that): some are
+that far down in a window, hundreds of thresholds, from where none comes back before it ends.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from analysis.network import SPIKING, WEIGHTED, build, set_weights
 from analysis.quantised import Quantised
 from analysis.training import Fitted
 
-MOST = 1 << 20
-"""Where the search for a common threshold ends; the products of thresholds end it far before."""
+MOST, BLOCK = 1 << 20, 1 << 13
+"""Where the search for a common threshold ends, and how many are tried at once."""
 
 
 def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:
@@ -33,13 +34,14 @@ def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:
     whole = np.asarray(thresholds, np.int64)
     if (whole < 1).any():
         raise ValueError(f"thresholds {list(thresholds)}: must be positive whole numbers")
-    tried = np.arange(int(whole.max(initial=1)), MOST, dtype=np.int64)
-    multiple = -(-tried[:, None] // whole)
-    fits = (multiple * (whole - 1) < tried[:, None]).all(axis=1)
-    if not fits.any():
-        raise ValueError(f"thresholds {list(thresholds)}: no common one below {MOST}")
-    at = int(fits.argmax())
-    return int(tried[at]), tuple(int(m) for m in multiple[at])
+    for start in range(int(whole.max(initial=1)), MOST, BLOCK):
+        tried = np.arange(start, start + BLOCK, dtype=np.int64)
+        multiple = -(-tried[:, None] // whole)
+        fits = (multiple * (whole - 1) < tried[:, None]).all(axis=1)
+        if fits.any():
+            at = int(fits.argmax())
+            return int(tried[at]), tuple(int(m) for m in multiple[at])
+    raise ValueError(f"thresholds {list(thresholds)}: no common one below {MOST}")
 
 
 def common_net(fitted: Fitted, found: Quantised) -> nn.Sequential:

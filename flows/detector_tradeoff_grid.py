@@ -2,7 +2,7 @@
 
 A whole cross of four factors is some 150 trainings a seed. By default every factor is varied alone
 with the others at the paper's values, and window length and pooling, which share the events among
-them, are crossed; `full` gives the whole cross.
+them, are crossed at the shortest, the paper's and the longest window; `full` gives the whole cross.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ class Axes:
 
     @property
     def default(self) -> list[Setting]:
-        """All lines through the paper's point, and the cross of length and pooling."""
+        """All lines through the paper's point, and the small cross of length and pooling."""
         lines = (setting for field in fields(self) for setting in self.line(field.name))
         cross = (
             replace(PAPER, length_ms=length, pool_px=pool)
-            for length in self.length_ms
+            for length in (min(self.length_ms), max(self.length_ms))
             for pool in self.pool_px
         )
         return _once([PAPER, *lines, *cross])
