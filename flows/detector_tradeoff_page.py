@@ -69,7 +69,8 @@ def _tried(result: Mapping[str, Any]) -> Section:
         "every value of the four factors with every other"
         if result["full"]
         else "each of the four factors alone with the others at the paper's values, and pooling "
-        "crossed with the shortest and the longest window; the other crosses were not tried (`--full` tries them)"
+        "crossed with the shortest and the longest window; the other crosses were not tried "
+        "(`--full` tries them)"
     )
     text = [
         f"{len(result['settings'])} settings of window length, step, pooling and width were "

@@ -13,14 +13,25 @@ COLUMNS = (
     "mean latency (ms)", "95 % (ms)", "false early (%)", "missed (%)", "µs a window",
     "in a batch", "operations a window (1000)", "operations/s (million)",
 )  # fmt: skip
-TERMINAL = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 13)
+TERMINAL_ROWS = 20
+TERMINAL = (
+    "network",
+    "stride",
+    "rule",
+    "strict (%)",
+    "latency (ms)",
+    "early (%)",
+    "missed (%)",
+    "M ops/s",
+)
 
 
 def flat(row: Row, simulated: bool) -> dict[str, Any]:
     """A row for CSV: means over seeds, with lowest and highest; units in the names."""
-    names = ("length_ms", "step_ms", "pool_px", "width", "precision", "stride_ms", "smoothing")
+    names = ("length_ms", "step_ms", "pool_px", "precision", "stride_ms", "rule")
     found: dict[str, Any] = {name: row[name] for name in names}
-    found |= {"margin_spikes": row["margin"], "rule": row["rule"], "seeds": len(row["seeds"])}
+    found |= {"width_factor": row["width"], "smoothing_windows": row["smoothing"]}
+    found |= {"margin_spikes": row["margin"], "seeds": len(row["seeds"])}
     parts = [(row["test"], "test", name) for name in row["test"]]
     parts += [
         (row["validation"], "validation", "strict"),
@@ -63,23 +74,37 @@ def front_rows(result: Mapping[str, Any], most: int | None = None) -> list[list[
     return [cells(row) for row in ordered_front(result, most)]
 
 
-def short_table(result: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Columns and the first rows of the front that fit a terminal."""
-    return (
-        [COLUMNS[k] for k in TERMINAL],
-        [[row[k] for k in TERMINAL] for row in front_rows(result, 20)],
-    )
+def short_table(result: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]]]:
+    """Columns and the first rows of the front that fit a terminal; means only."""
+    rows = []
+    for row in ordered_front(result, TERMINAL_ROWS):
+        test = row["test"]
+        rows.append(
+            [
+                _network(row) + (" 8 bit" if row["precision"] == "8 bit" else ""),
+                str(row["stride_ms"]),
+                f"{row['smoothing']}, {row['margin']:g}",
+                hundred(mean(test["strict"])),
+                number(mean(test["mean_ms"]), 0),
+                hundred(mean(test["false_early_either"])),
+                hundred(mean(test["missed_either"])),
+                scaled(mean(row["work"]["synaptic_operations_per_s"]), 1e6),
+            ]
+        )
+    return TERMINAL, rows
+
+
+def _network(row: Row) -> str:
+    name = f"{row['length_ms']}/{row['step_ms']} ms, {row['pool_px']} px, ×{row['width']:g}"
+    return f"★ {name}" if row["paper"] else name
 
 
 def cells(row: Row) -> list[str]:
     """A row as text under `COLUMNS`."""
-    mark = "★ " if row["paper"] else ""
-    if row["front"] and row["front_validation"]:
-        mark += "✓ "
-    name = f"{row['length_ms']}/{row['step_ms']} ms, {row['pool_px']} px, ×{row['width']:g}"
+    both = row["front"] and row["front_validation"]
     test, work = row["test"], row["work"]
     return [
-        mark + name,
+        _network(row) + (" ✓" if both else ""),
         row["precision"],
         str(row["stride_ms"]),
         str(row["smoothing"]),
