@@ -68,7 +68,7 @@ def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated:
 
 def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
     kinds = (
-        ("another is nowhere worse and somewhere better", False, GREY, ".", 4, 1, 0.45),
+        ("another is nowhere worse and somewhere better", False, GREY, "o", 3, 1, 0.5),
         ("on the front", True, BLUE, "o", 4.5, 2, 0.85),
     )
     drawn = [

@@ -74,7 +74,9 @@ def tradeoff(
     ] = False,
     minutes: Annotated[
         float | None,
-        typer.Option("--minutes", min=0, help="Detector: begin no training after so many."),
+        typer.Option(
+            "--minutes", min=0, help="Detector: begin no training after so many; 0: only the page."
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Detector: only say what is to do and how long.")
@@ -171,7 +173,9 @@ def _detector(
         shown = {key: result[key] for key in ("runs", "kept", "pending", "estimated_s")}
         console.print_pairs(f"tradeoff --detector {place}{simulated}", shown)
         return
-    console.print_table(f"The front of the detector{simulated}", *short_table(result))
+    console.print_table(
+        f"The quickest detectors by false early trials{simulated}", *short_table(result)
+    )
     console.results.print(f"Page{simulated}: {(target / steps.PAGE).resolve()}", soft_wrap=True)
 
 

@@ -175,7 +175,7 @@ def detector_tradeoff(
     """Make what is missing, and write page, numbers and table into `folder`.
 
     Args:
-        minutes: no run is begun after so many; the page is then of what is there.
+        minutes: no run is begun after so many; the page is of what is there then.
         dry_run: only say what there is to do, and how long it would take.
 
     Returns:
@@ -191,19 +191,19 @@ def detector_tradeoff(
     for words, why in search.grid.left_out.items():
         console.say(f"left out: {words}: {why}")
     plan = search.plan()
-    seconds = search.estimated_s
-    console.say(
+    told = (
         f"{plan['runs']} trainings ({len(search.grid.settings)} settings, {ask.seeds} seeds), "
-        f"{plan['kept']} of them kept; the others take about {console.duration(seconds)}"
+        f"{plan['kept']} of them kept"
     )
-    if dry_run:
-        return {**plan, "estimated_s": round(seconds, 1)}
-    began = time.monotonic()
-
-    def over() -> bool:
-        return minutes is not None and time.monotonic() - began >= 60 * minutes
-
-    search.make(over)
+    if minutes == 0 and not dry_run:
+        console.say(told)
+    else:
+        seconds = search.estimated_s
+        console.say(f"{told}; the others take about {console.duration(seconds)}")
+        if dry_run:
+            return {**plan, "estimated_s": round(seconds, 1)}
+        began = time.monotonic()
+        search.make(lambda: minutes is not None and time.monotonic() - began >= 60 * minutes)
     result = search.result()
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / NUMBERS, result)

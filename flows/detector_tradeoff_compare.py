@@ -22,7 +22,7 @@ FACTORS = {
     "width": "width (×)",
     "stride_ms": "stride (ms)",
     "precision": "precision",
-    "rule": "smoothing and margin",
+    "rule": "rule",
 }
 FIGURES = {
     "strict": ("test", "strict"),

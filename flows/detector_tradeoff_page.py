@@ -8,9 +8,17 @@ from typing import Any
 from analysis.detector_tradeoff_figure import Bar, Panel, Point, factor_lines, front_panels
 from analysis.report import Figure, Section, Table, number, percent, render_page
 from flows.detector_tradeoff_compare import FACTORS
-from flows.detector_tradeoff_rows import OBJECTIVES, Row, mean, objective
+from flows.detector_tradeoff_rows import (
+    MOST_MISSED,
+    OBJECTIVES,
+    Row,
+    mean,
+    objective,
+    short_list,
+)
 from flows.detector_tradeoff_text import (
     COLUMNS,
+    cells,
     front_rows,
     hundred,
     ordered_front,
@@ -58,8 +66,8 @@ def make_sections(result: Mapping[str, Any]) -> list[Section]:
     """What the page shows, in order."""
     sections = [_tried(result)]
     if result["rows"]:
-        sections += [_front(result), _plots(result), _factors(result), _cross(result)]
-        sections.append(_pairs(result))
+        sections += [_short_list(result), _front(result), _plots(result), _factors(result)]
+        sections += [_cross(result), _pairs(result)]
     return [section for section in sections if section.tables or section.figures or section.text]
 
 
@@ -133,6 +141,20 @@ def _front(result: Mapping[str, Any]) -> Section:
     else:
         text.append("The store has no labelled gravity or disturbance trials: no leads.")
     return Section("The Pareto front", text, (), [Table(columns, table, caption)])
+
+
+def _short_list(result: Mapping[str, Any]) -> Section:
+    rows = [[percent(budget, 0), *cells(row)] for budget, row in short_list(result["rows"])]
+    text = [
+        "The front is long, because it has seven figures. For each share of trials that may be "
+        "false early (either onset), this is the detector with the lowest mean latency of those "
+        f"that keep it and miss at most {percent(MOST_MISSED, 0)}. Validation trials picked it; "
+        "figures are of test trials, which may be over the budget.",
+    ]
+    if not rows:
+        text.append("No detector keeps any of the budgets.")
+    tables = [Table(("budget", *COLUMNS), rows)] if rows else []
+    return Section("A short list", text, (), tables)
 
 
 def _plots(result: Mapping[str, Any]) -> Section:

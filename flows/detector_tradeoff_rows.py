@@ -38,6 +38,12 @@ OBJECTIVES = {
 }
 """What the front is over, and whether it is to be low (1) or high (-1)."""
 
+BUDGETS = (0.02, 0.05, 0.1, 0.2)
+"""Shares of trials that may be false early, for the short list."""
+
+MOST_MISSED = 0.05
+"""Share of trials that a detector of the short list may miss."""
+
 Row = dict[str, Any]
 
 
@@ -191,6 +197,31 @@ def _costs(rows: Sequence[Row], part: str) -> npt.NDArray[np.float64]:
             if value is not None:
                 costs[i, k] = sign * value
     return costs
+
+
+def short_list(rows: Sequence[Row]) -> list[tuple[float, Row]]:
+    """For each of `BUDGETS` the quickest detector that keeps it, by validation trials alone.
+
+    Quickest is the lowest mean latency; among equals the fewest synaptic operations a second. A
+    budget that none keeps has no line.
+    """
+    found = []
+    for budget in BUDGETS:
+        ours = [
+            (late, objective(row, "synaptic_operations_per_s", "validation") or 0.0, place)
+            for place, row in enumerate(rows)
+            if (late := objective(row, "mean_ms", "validation")) is not None
+            and _within(row, "false_early_either", budget)
+            and _within(row, "missed_either", MOST_MISSED)
+        ]
+        if ours:
+            found.append((budget, rows[min(ours)[-1]]))
+    return found
+
+
+def _within(row: Row, name: str, limit: float) -> bool:
+    value = objective(row, name, "validation")
+    return value is not None and value <= limit
 
 
 def _repeated(trials: Trials, times: int) -> Trials:

@@ -244,7 +244,8 @@ def _window_figures(
 def measure(engine: Engine, x: SparseWindows) -> tuple[float, float]:
     """Microseconds a window in one thread: one at a time, and in a batch; medians.
 
-    Rounds of both alternate, so that whatever else runs meets both.
+    The processor's time of this thread, so that what else runs does not count as computing. Rounds
+    of both alternate, so that what the machine does meanwhile meets both.
     """
     few = [x.take(np.array([k])) for k in range(min(SINGLE, len(x)))]
     many = x.take(np.arange(min(BATCH, len(x))))
@@ -252,10 +253,10 @@ def measure(engine: Engine, x: SparseWindows) -> tuple[float, float]:
     single, batched = [], []
     for _ in range(ROUNDS):
         for one in few:
-            began = time.perf_counter()
+            began = time.thread_time()
             engine.counts(one, threads=1)
-            single.append(time.perf_counter() - began)
-        began = time.perf_counter()
+            single.append(time.thread_time() - began)
+        began = time.thread_time()
         engine.counts(many, threads=1)
-        batched.append((time.perf_counter() - began) / len(many))
+        batched.append((time.thread_time() - began) / len(many))
     return 1e6 * float(np.median(single)), 1e6 * float(np.median(batched))

@@ -5,25 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.report import number
-from flows.detector_tradeoff_rows import Row, mean, objective
+from analysis.report import number, percent
+from flows.detector_tradeoff_rows import Row, mean, objective, short_list
 
 COLUMNS = (
     "network", "precision", "stride (ms)", "windows", "margin (spikes)", "strict (%)",
     "mean latency (ms)", "95 % (ms)", "false early (%)", "missed (%)", "µs a window",
     "in a batch", "operations a window (1000)", "operations/s (million)",
 )  # fmt: skip
-TERMINAL_ROWS = 20
-TERMINAL = (
-    "network",
-    "stride",
-    "rule",
-    "strict (%)",
-    "latency (ms)",
-    "early (%)",
-    "missed (%)",
-    "M ops/s",
-)
+TERMINAL = ("", "network", "stride", "rule", "strict", "latency", "early", "missed")
 
 
 def flat(row: Row, simulated: bool) -> dict[str, Any]:
@@ -75,20 +65,23 @@ def front_rows(result: Mapping[str, Any], most: int | None = None) -> list[list[
 
 
 def short_table(result: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]]]:
-    """Columns and the first rows of the front that fit a terminal; means only."""
+    """The paper's row and the short list, for a terminal: columns and rows; means only."""
+    wanted = [("paper's", row) for row in result["rows"] if row["paper"]]
+    wanted += [(percent(budget, 0), row) for budget, row in short_list(result["rows"])]
     rows = []
-    for row in ordered_front(result, TERMINAL_ROWS):
+    for name, row in wanted:
         test = row["test"]
+        network = [f"{row[key]:g}" for key in ("length_ms", "step_ms", "pool_px", "width")]
         rows.append(
             [
-                _network(row) + (" 8 bit" if row["precision"] == "8 bit" else ""),
-                str(row["stride_ms"]),
+                name,
+                "/".join(network) + (", 8 bit" if row["precision"] == "8 bit" else ""),
+                f"{row['stride_ms']} ms",
                 f"{row['smoothing']}, {row['margin']:g}",
-                hundred(mean(test["strict"])),
-                number(mean(test["mean_ms"]), 0),
-                hundred(mean(test["false_early_either"])),
-                hundred(mean(test["missed_either"])),
-                scaled(mean(row["work"]["synaptic_operations_per_s"]), 1e6),
+                percent(mean(test["strict"])),
+                number(mean(test["mean_ms"]), 0, "ms"),
+                percent(mean(test["false_early_either"])),
+                percent(mean(test["missed_either"])),
             ]
         )
     return TERMINAL, rows

@@ -19,7 +19,7 @@ from flows.campaigns import Collected, collected
 from flows.detector_tradeoff import NUMBERS, PAGE, TABLE, Search, detector_tradeoff
 from flows.detector_tradeoff_data import Ask
 from flows.detector_tradeoff_grid import PAPER, Axes, Setting, counted_stride, make_grid, strides
-from flows.detector_tradeoff_rows import OBJECTIVES, RULES, mean, objective
+from flows.detector_tradeoff_rows import OBJECTIVES, RULES, mean, objective, short_list
 from flows.detector_tradeoff_runs import PRECISIONS, trial_counts
 from flows.label import STEP, label_key
 from protocols.errors import InputError
@@ -170,13 +170,34 @@ def test_the_front_is_the_definitions(result: Any) -> None:
     assert 0 < sum(row["front"] for row in rows) < len(rows)
 
 
+def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
+    def row(late: float, early: float, missed: float, work: float, test: float) -> dict[str, Any]:
+        figures = {"mean_ms": [late], "false_early_either": [early], "missed_either": [missed]}
+        return {
+            "validation": figures,
+            "test": {"mean_ms": [test]},
+            "work": {"synaptic_operations_per_s": [work]},
+        }
+
+    rows = [
+        row(100, 0.02, 0.0, 5, 1),
+        row(90, 0.03, 0.0, 5, 900),
+        row(90, 0.05, 0.05, 4, 900),
+        row(10, 0.0, 0.06, 1, 1),
+        row(5, 0.21, 0.0, 1, 1),
+    ]
+    found = [(budget, rows.index(one)) for budget, one in short_list(rows)]
+    assert found == [(0.02, 0), (0.05, 2), (0.1, 2), (0.2, 2)]
+    assert short_list(rows[3:]) == []
+
+
 def test_page_numbers_and_table_say_the_same(result: Any) -> None:
     found, folder = result
     assert sorted(item.name for item in folder.iterdir()) == sorted([PAGE, NUMBERS, TABLE])
     assert json.loads((folder / NUMBERS).read_text()) == json.loads(json.dumps(found))
     page = (folder / PAGE).read_text()
     assert page.count("<svg") == 2
-    assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 6
+    assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 7
     assert "★" in page
     table = list(csv.DictReader(io.StringIO((folder / TABLE).read_text())))
     assert len(table) == len(found["rows"])
