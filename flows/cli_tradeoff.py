@@ -176,6 +176,7 @@ def _detector(
     console.print_table(
         f"The quickest detectors by false early trials{simulated}", *short_table(result)
     )
+    console.results.print("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
     console.results.print(f"Page{simulated}: {(target / steps.PAGE).resolve()}", soft_wrap=True)
 
 

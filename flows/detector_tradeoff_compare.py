@@ -12,8 +12,8 @@ from typing import Any
 
 from analysis.paired import paired_difference
 from flows.detector_tradeoff_grid import PAPER
-
-Row = dict[str, Any]
+from flows.detector_tradeoff_rows import RULES, Row
+from flows.detector_tradeoff_runs import PRECISIONS
 
 FACTORS = {
     "length_ms": "window length (ms)",
@@ -83,8 +83,10 @@ def _own(row: Row, factor: str) -> bool:
     return bool(row[factor] == own[factor])
 
 
-def _order(value: Any) -> tuple[bool, Any]:
-    return isinstance(value, str), value if not isinstance(value, str) else -len(value)
+def _order(value: Any) -> float:
+    """Numbers as they are, words as they are listed."""
+    words = (*PRECISIONS, *RULES)
+    return words.index(value) if isinstance(value, str) else value
 
 
 def _differences(row: Row, start: Row) -> dict[str, Any]:
