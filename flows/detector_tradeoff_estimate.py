@@ -20,15 +20,9 @@ def estimate(kept: Kept, run: Run, like: list[Run]) -> dict[str, float]:
     As long as a kept run `like` it took; without one, reckoned from a few windows. Fresh weights
     fire less or more than trained ones, so the second is right within a factor of two or so.
     """
-    train, count = None, None
-    for other in like:
-        if kept.done(other):
-            train, count = (
-                float(kept.derived.read(other.name)["seconds"][part]) for part in ("train", "count")
-            )
-            break
-    if train is None or count is None:
-        train, count = _probe(kept.data, run)
+    known = [kept.derived.read(other.name)["seconds"] for other in like if kept.done(other)]
+    told = next((seconds for seconds in known if seconds["train"] is not None), None)
+    train, count = _probe(kept.data, run) if told is None else (told["train"], told["count"])
     return {"train": 0.0 if kept.model_path(run).exists() else train, "count": count}
 
 

@@ -20,6 +20,7 @@ from flows.detector_tradeoff_rows import (
 from flows.detector_tradeoff_text import (
     COLUMNS,
     cells,
+    distinct,
     front_rows,
     hundred,
     ordered_front,
@@ -93,8 +94,8 @@ def _tried(result: Mapping[str, Any]) -> Section:
         f"{percent(result['false_early_rate'], 0)} are false early, for either onset; or at most "
         f"{percent(LOOSE, 0)}. Figures are "
         f"of {trials['test']} test trials, means over seeds.",
-        "Windows of every length lie in the same stretches of a trial. A channel's width is that "
-        "of both convolutions and the hidden layer together.",
+        "Windows of every length lie in the same stretches of a trial. Width is a factor on the "
+        "channels of both convolutions and on the hidden neurons.",
     ]
     if result["pending"]:
         text.append(
@@ -108,7 +109,7 @@ def _tried(result: Mapping[str, Any]) -> Section:
 
 
 def _front(result: Mapping[str, Any]) -> Section:
-    rows = result["rows"]
+    rows = distinct(result["rows"])
     on = sum(row["front"] for row in rows)
     both = sum(row["front"] and row["front_validation"] for row in rows)
     paper = next((row for row in rows if row["paper"]), None)
@@ -130,7 +131,8 @@ def _front(result: Mapping[str, Any]) -> Section:
     caption = (
         "Network: window/step, pooling, width. In brackets lowest and highest over seeds. Latency "
         "is of counted detections of incipient slip; false early and missed are shares of trials, "
-        "for either onset. µs: one thread, one window at a time and in a batch."
+        "for either onset (false early in brackets: incipient, gross). µs: one thread, one window "
+        "at a time and in a batch."
     )
     if on > MOST_ROWS:
         caption += f" The first {MOST_ROWS} by latency; the CSV has all."
@@ -189,20 +191,20 @@ def _factors(result: Mapping[str, Any]) -> Section:
         bars[title].append(Bar(value, item["paper"], ranges))
         found = item["difference"]
         if item["paper"] or found is None:
-            cells = ["paper's" if item["paper"] else "–"] * 3
+            shown = ["paper's" if item["paper"] else "–"] * 3
         else:
-            cells = [
+            shown = [
                 told(found["strict"], 100, "points"),
                 told(found["mean_ms"], 1, "ms"),
                 told(found["false_early_either"], 100, "points"),
             ]
         table.append(
             [f"{title}: {value}", spread(row["test"]["strict"], 100, 1),
-             spread(row["test"]["mean_ms"], 1, 0), *cells]
+             spread(row["test"]["mean_ms"], 1, 0), *shown]
         )  # fmt: skip
-    shown = {title: each for title, each in bars.items() if each}
+    drawn = {title: each for title, each in bars.items() if each}
     figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
-    svg = factor_lines(shown, figures, simulated=result["simulated"])
+    svg = factor_lines(drawn, figures, simulated=result["simulated"])
     seeds = max((len(row["seeds"]) for row in result["rows"]), default=0)
     text = [
         "One factor at a time, the others at the paper's values, with the pair that validation "

@@ -135,9 +135,8 @@ class Kept:
 
     def make(self, run: Run, advance: Advance) -> None:
         """Train, count, measure and keep."""
-        began = time.perf_counter()
         fitted = self.fitted(run, partial(advance, "train"))
-        trained = time.perf_counter()
+        began = time.perf_counter()
         results: dict[str, Any] = {}
         arrays: dict[str, npt.NDArray[Any]] = {}
         for precision in PRECISIONS:
@@ -165,7 +164,10 @@ class Kept:
             "seed": run.seed,
             "chosen_epoch": fitted.chosen_epoch,
             "warnings": list(fitted.warnings),
-            "seconds": {"train": trained - began, "count": time.perf_counter() - trained},
+            "seconds": {
+                "train": sum(fitted.epoch_seconds) or None,  # None: it was trained before
+                "count": time.perf_counter() - began,
+            },
             "precisions": results,
         }
         self.derived.write(run.name, run.key, figures, arrays)

@@ -51,10 +51,21 @@ _UNITS = {
 }
 
 
+def distinct(rows: Sequence[Row]) -> list[Row]:
+    """Each detector once: two rules may have chosen the same pair."""
+    names = (
+        "length_ms", "step_ms", "pool_px", "width", "precision", "stride_ms", "smoothing", "margin"
+    )  # fmt: skip
+    found: dict[Any, Row] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in names), row)
+    return list(found.values())
+
+
 def ordered_front(result: Mapping[str, Any], most: int | None = None) -> list[Row]:
     """The paper's row, then the front by mean latency: at most so many of it."""
     paper = [row for row in result["rows"] if row["paper"]]
-    front = [row for row in result["rows"] if row["front"] and not row["paper"]]
+    front = [row for row in distinct(result["rows"]) if row["front"] and not row["paper"]]
     front.sort(key=lambda row: (objective(row, "mean_ms") is None, objective(row, "mean_ms") or 0))
     return [*paper, *front[:most]]
 
@@ -105,7 +116,8 @@ def cells(row: Row) -> list[str]:
         spread(test["strict"], 100, 1),
         spread(test["mean_ms"], 1, 0),
         number(mean(test["p95_ms"]), 0),
-        hundred(mean(test["false_early_either"])),
+        f"{hundred(mean(test['false_early_either']))} "
+        f"({hundred(mean(test['false_early']), 0)}, {hundred(mean(test['false_early_gross']), 0)})",
         hundred(mean(test["missed_either"])),
         number(mean(work["us_single"]), 0),
         number(mean(work["us_batched"]), 0),
