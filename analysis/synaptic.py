@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from torch import nn
 
 from analysis.network import SPIKING, WEIGHTED
 from analysis.sparse import SparseWindows
@@ -94,10 +95,15 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
 
 def count_work(fitted: Fitted, x: SparseWindows) -> Work | None:
     """Count what a trained network does for each window, from rest; None without windows."""
+    return count_net_work(restore(fitted), fitted.windows.cells, x)
+
+
+def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | None:
+    """The same of any network that the kernels compute, with so many cells along a side."""
     if not len(x):
         return None
-    trainer = Trainer(restore(fitted), fitted.windows.cells)
-    synapses = fan_out(trainer, fitted.windows.cells)
+    trainer = Trainer(net, cells)
+    synapses = fan_out(trainer, cells)
     layers = len(WEIGHTED)
     chunks = range(0, len(x), CHUNK)
     done = np.zeros((len(chunks), layers), np.int64)

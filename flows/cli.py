@@ -25,6 +25,7 @@ from flows.cli_models import register as register_models
 from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
 from flows.cli_serve import register as register_serve
+from flows.cli_tradeoff import register as register_tradeoff
 
 app = typer.Typer(
     name="sliplab",
@@ -145,6 +146,7 @@ def collect(
 
 
 cli_steps.register(app)
+register_tradeoff(app)
 cli_chain.register(app)
 cli_store.register(app)
 cli_remote.register(app)

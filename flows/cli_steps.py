@@ -1,4 +1,4 @@
-"""`sliplab sync`, `label`, `train`, `evaluate`, `report`, `tradeoff`: a step on what is stored."""
+"""`sliplab sync`, `label`, `train`, `evaluate`, `report`: a step on what is stored."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from flows.cli_common import (
     DaskOption,
     JsonOption,
     PlaceArgument,
-    RigOption,
     finish,
     located,
     run_step,
@@ -108,36 +107,7 @@ def report(
     console.say(f"report: {folder / 'report' / 'index.html'}")
 
 
-def tradeoff(
-    scene: Annotated[
-        Path, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
-    ],
-    rig: RigOption = Path("mock"),
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for page and numbers; made if missing.")
-    ] = Path("sliplab-tradeoff"),
-    trials: Annotated[int, typer.Option("--trials", min=1, help="Trials to simulate.")] = 4,
-    sensitivity: Annotated[
-        bool, typer.Option("--sensitivity", help="Also what each guessed number changes.")
-    ] = False,
-    dask: DaskOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure what simulating a protocol's scene costs, and how far off cheaper ways are."""
-    from flows import tradeoff as steps
-    from flows.tradeoff_page import choice_pairs, short_table
-
-    result = steps.tradeoff(scene, rig, out, trials, sensitivity, dask=dask)
-    if as_json:
-        console.print_json(result)
-        return
-    title = f"Cost and error of the scene of {result['protocol']} (simulated)"
-    console.print_table(title, *short_table(result))
-    console.print_pairs("The level that the protocol needs", choice_pairs(result))
-    console.results.print(f"Page (simulated): {(out / steps.PAGE).resolve()}", soft_wrap=True)
-
-
 def register(app: typer.Typer) -> None:
     """Make them commands of `app`."""
-    for command in (sync, label, train, evaluate, report, tradeoff):
+    for command in (sync, label, train, evaluate, report):
         app.command()(command)
