@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
 from analysis.figures_conditions import WIDTH
@@ -100,13 +100,17 @@ def clocks(
                 numbers, values, mark, color=colour, ms=2.5, mew=0, alpha=0.6, label=name,
                 rasterized=len(numbers) >= DENSE,
             )  # fmt: skip
-        for name, first in starts.items():
-            axes.axvline(first, color=GREY, lw=0.6)
-            axes.annotate(
-                f" {name}", (first, 1), xycoords=("data", "axes fraction"), fontsize=7, va="top"
-            )
         axes.set_yscale("log")
-        axes.margins(y=0.25)
+        axes.margins(y=0.35)
+        for place, (name, first) in enumerate(starts.items()):
+            axes.axvline(first, color=GREY, lw=0.6)
+            axes.annotate(  # below each other: a small campaign is narrower than its name
+                f" {name}", (first, 1), xycoords=("data", "axes fraction"), fontsize=7, va="top",
+                xytext=(0, -8 * place), textcoords="offset points",
+            )  # fmt: skip
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.set_ylabel("uncertainty, 95 % (µs)")
         axes.set_xlabel("trial, campaign after campaign")
         axes.legend(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import matplotlib.pyplot as plt
 import numpy as np
 
-from analysis.figure_style import BLUE, GREY, STYLE, svg_text
+from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
 from analysis.intervals import interval
 
 WIDTH = 6.4
@@ -57,7 +57,7 @@ def by_condition(
             for place, row in enumerate(rows):
                 there = np.asarray(panel.values.get(row, ()), np.float64)
                 spread = rng.uniform(-0.2, 0.2, len(there))
-                axes.plot(there, place + spread, "o", ms=2.6, color=panel.colour, alpha=0.45, mew=0)
+                axes.plot(there, place + spread, "o", ms=2.6, color=panel.colour, alpha=0.6, mew=0)
                 if len(there):
                     low, high = interval(there) or (there.mean(), there.mean())
                     axes.plot([low, high], [place, place], color="black", lw=1.6)
@@ -134,5 +134,27 @@ def shares(
             axes.legend(loc="upper right", fontsize=7.5, bbox_to_anchor=(1, 1.0))
         axes.set_yticks(places, names, fontsize=8)
         axes.set_ylim(place - 0.3, -0.7)
+        axes.set_xlabel(label)
+        return svg_text(figure, simulated)
+
+
+def differences(
+    rows: Sequence[tuple[str, float, float, float]], label: str, *, simulated: bool
+) -> str:
+    """Differences with intervals, a row each, around a line at zero, as SVG.
+
+    Args:
+        rows: name, difference, low and high.
+    """
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(WIDTH, 0.26 * len(rows) + 0.9))
+        for place, (_, value, low, high) in enumerate(rows):
+            off = not low <= 0 <= high
+            colour = ORANGE if off else BLUE
+            axes.plot([low, high], [place] * 2, color=colour, lw=1.6)
+            axes.plot(value, place, "D" if off else "o", color=colour, ms=4.5)
+        axes.axvline(0, color=GREY, lw=0.8)
+        axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
+        axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlabel(label)
         return svg_text(figure, simulated)

@@ -95,8 +95,8 @@ def gravity(
         groups, ("latency_gross_ms", "lead_ms"), breaks, lead_line, "gravity-gross",
         f"Left: how late gross slip is detected, by {by}; right: how far ahead of it incipient "
         f"slip was. {_DOTS}.{note}",
-        f"gross latency has {PAPER['gross_trend'].text}; incipient slip is detected "
-        f"{PAPER['gravity_lead'].text} before gross slip.", simulated,
+        f"gross latency has {PAPER['gross_trend'].text}; in every trial incipient slip is "
+        "detected at least 360 ms before gross slip (dotted).", simulated,
     )  # fmt: skip
     return Section(
         "Gravity trials: a plate slips by its own weight",

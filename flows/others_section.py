@@ -64,11 +64,25 @@ def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> S
     )
 
 
+def in_order(rows: Mapping[str, Json]) -> list[tuple[str, Json]]:
+    """A factor's levels by their number, words after numbers."""
+
+    def place(item: tuple[str, Json]) -> tuple[float, str]:
+        try:
+            return float(item[0].split()[0]), ""
+        except ValueError:
+            return math.inf, item[0]
+
+    return sorted(rows.items(), key=place)
+
+
 def factors(by_factor: Mapping[str, Mapping[str, Json]], strict: float | None,
             simulated: bool) -> Figure:  # fmt: skip
     """Accuracy by each factor's levels."""
     groups = {
-        factor: [Share(level, row["share"], row["low"], row["high"]) for level, row in rows.items()]
+        factor: [
+            Share(level, row["share"], row["low"], row["high"]) for level, row in in_order(rows)
+        ]
         for factor, rows in by_factor.items()
     }
     named = [

@@ -9,24 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from analysis.figures import CLASS_WORDS
-from analysis.metrics import INCIPIENT, winners
 from analysis.published import PAPER
 from analysis.report import Section, Table, number, percent
-from analysis.window_groups import credit, share
-from flows.window_scores import kept_counts
-from storage.derived import Derived
-from storage.store import Store
 
 Json = dict[str, Any]
 
-_EVALUATION = "evaluation"
 _COLUMNS = ("figure", "paper", "here", "95 % over trials", "n")
 
 
-def section(store: Store, summary: Json) -> Section:
+def section(summary: Json) -> Section:
     """Every published figure beside this one's."""
     kind = "simulated" if summary["simulated"] else "measured on this rig"
     words = "here" if not summary["simulated"] else "here (simulated)"
@@ -41,7 +33,7 @@ def section(store: Store, summary: Json) -> Section:
         (),
         [
             Table(
-                columns, [*_windows(store, summary), *_times(summary)],
+                columns, [*_windows(summary), *_times(summary)],
                 "Intervals draw whole trials again, windows of a trial together. Accuracy of raw "
                 "spike counts, ties shared.",
             )
@@ -49,29 +41,9 @@ def section(store: Store, summary: Json) -> Section:
     )  # fmt: skip
 
 
-def window_intervals(store: Store) -> Json:
-    """Accuracy, and incipient precision and recall, of the test windows with intervals over trials.
-
-    Returns:
-        by name what `analysis.window_groups.share` gives; empty where the evaluation kept none.
-    """
-    found = kept_counts(store, Derived.of(store, _EVALUATION).key(_EVALUATION))
-    if found is None:
-        return {}
-    counts, y, trial = found["counts"], found["y"], found["trial"]
-    said = winners(counts)
-    true, called = y == INCIPIENT, said == INCIPIENT
-    both = (true & called).astype(np.float64)
-    return {
-        "accuracy": share(credit(counts, y), trial),
-        "incipient_precision": share(both[called], trial[called]),
-        "incipient_recall": share(both[true], trial[true]),
-    }
-
-
-def _windows(store: Store, summary: Json) -> list[list[str]]:
+def _windows(summary: Json) -> list[list[str]]:
     kinematic = summary["kinematic"]
-    known = window_intervals(store)
+    known = kinematic["window_intervals"]
     rows = []
     for name, title, value in (
         ("accuracy", "test accuracy of windows", kinematic["accuracy"]["argmax"]),

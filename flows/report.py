@@ -15,8 +15,10 @@ from prefect import flow
 from analysis import model_file
 from analysis import report as page
 from flows import evaluate, sections, timing
+from flows import report_against_page as against_page
 from flows.campaigns import Collected
 from flows.orchestration import Parcel, run
+from flows.report_against import compare, load_other
 from flows.report_extras import extras
 from flows.summary import make_summary
 from flows.sync_page import PAGE as CLOCKS
@@ -122,6 +124,22 @@ def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     if stale:
         run(report_flow, Parcel((store, campaigns, key)))
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
+
+
+def against(store: Store, other: Path) -> dict[str, Any]:
+    """Hold the last report against another one, and write `report/against.html` about it.
+
+    Args:
+        other: a store with a report, or its ``summary.json``.
+
+    Raises:
+        InputError: there is no such report.
+    """
+    theirs = load_other(other)
+    compared = compare(read_summary(store), theirs)
+    path = report_folder(store) / against_page.PAGE
+    write_text(path, against_page.render(compared, store.folder, other))
+    return {**compared, "page": str(path)}
 
 
 def read_summary(store: Store) -> dict[str, Any]:

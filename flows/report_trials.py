@@ -56,6 +56,7 @@ def told(row: Json) -> Json:
         length = (row["gross_ns"] - row["incipient_ns"]) / 1e6
     return {
         "campaign": row["campaign"],
+        "experiment": row["experiment"],
         "trial": row["trial"],
         "outcome": outcome(row),
         "gross": _gross(row),

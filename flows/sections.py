@@ -85,7 +85,7 @@ def make_sections(material: Material) -> list[Section]:
     simulated = bool(summary["simulated"])
     example = trial_section.example(campaigns, evaluation)
     found: list[Section | None] = [
-        paper_section.section(store, summary),
+        paper_section.section(summary),
         campaign_section.collected(campaigns, summary, simulated),
         campaign_section.quality(store, campaigns, simulated),
         None if example is None else trial_section.section(store, *example, simulated),

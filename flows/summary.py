@@ -11,8 +11,10 @@ from flows.campaign_section import reference_rows, wear
 from flows.campaigns import Collected, training_campaigns
 from flows.estimate import plan_bytes
 from flows.report_trials import accounted, intervals, told
-from flows.window_baselines import beside
+from flows.window_baselines import EVALUATION, beside
+from flows.window_scores import window_intervals
 from rigs.rig_file import load_rig_file
+from storage.derived import Derived
 from storage.store import Store
 
 _PACKAGES = (
@@ -57,6 +59,7 @@ def make_summary(
         "samples": windows["samples"],
         "trained_baselines": beside(store),
         **{name: windows[name] for name in _WINDOWS},
+        "window_intervals": window_intervals(store, Derived.of(store, EVALUATION).key(EVALUATION)),
         **experiments["kinematic"],
     }
     return {

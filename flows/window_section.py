@@ -63,8 +63,7 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
             Figure(
                 figures.confusion(np.asarray(windows["confusion"]), simulated=simulated),
                 "Rows are true classes and add up to 100 %. The last column holds windows whose "
-                "two highest spike counts are equal. What is off the diagonal is an error: early "
-                "and late parts of a trial look alike where hardly anything moves.",
+                "two highest spike counts are equal. Everything off the diagonal is an error.",
                 "confusion",
                 {
                     "true class": list(figures.CLASS_WORDS),
@@ -107,7 +106,7 @@ def _where(windows: Json, simulated: bool) -> Section:
     levels = [
         [factor, level, str(row["trials"]), str(row["n"]), _share(row)]
         for factor, rows in windows["by_factor"].items()
-        for level, row in rows.items()
+        for level, row in others_section.in_order(rows)
     ]
     still = [
         [word, str(row["trials"]), str(row["n"]), _share(row)]
