@@ -32,6 +32,13 @@ STATISTICS: Mapping[str, Callable[..., Any]] = {
 }
 """What can be asked for, by name; each over an axis, trials without a value left out."""
 
+_WHOLE: Mapping[str, Callable[..., Any]] = {
+    "mean": np.mean,
+    "median": np.median,
+    "p95": lambda values, axis: np.percentile(values, 95, axis=axis),
+}
+"""The same where every trial has a value, some ten times as fast."""
+
 
 def drawn(n: int, draws: int = DRAWS) -> npt.NDArray[np.int64]:
     """Which of n trials are drawn, (draws, n); the same ones at every call."""
@@ -53,7 +60,7 @@ def interval(values: Values, statistic: str = "mean") -> tuple[float, float] | N
         raise ValueError("values must be finite")
     if len(there) < _FEWEST:
         return None
-    return _span(STATISTICS[statistic](there[drawn(len(there))], axis=1))
+    return _span(_WHOLE[statistic](there[drawn(len(there))], axis=1))
 
 
 def difference(
@@ -78,7 +85,8 @@ def difference(
         return None
     of_a = drawn(len(a))
     of_b = of_a if paired else _others(len(b))
-    measure = STATISTICS[statistic]
+    whole = np.isfinite(a).all() and np.isfinite(b).all()
+    measure = (_WHOLE if whole else STATISTICS)[statistic]
     with warnings.catch_warnings():  # a draw may hold only trials without a value
         warnings.simplefilter("ignore", RuntimeWarning)
         found = measure(a[of_a], axis=1) - measure(b[of_b], axis=1)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from analysis.figures_conditions import Share, shares
-from analysis.report import Figure, Section, Table, percent
+from analysis.report import Figure, Link, Section, Table, percent
 from flows import tradeoff_page
 from flows.report_extras import FILES, command
 from flows.search_section import search
@@ -131,7 +132,14 @@ def tradeoff(store: Store, found: Mapping[str, Json]) -> Section:
             raise _odd("detector", error) from None
         pictures.append(picture)
         tables.append(table)
-    return Section("Speed against error", said, pictures, tables, (), commands)
+    pages = {"scene": "the scene's", "detector": "the detector's"}
+    links = []
+    for name, whose in pages.items():
+        file = (store.folder / FILES[name]).with_suffix(".html")
+        if name in found and file.exists():
+            address = os.path.relpath(file, store.folder / "report")
+            links.append(Link(address.replace(os.sep, "/"), f"The whole of {whose} search"))
+    return Section("Speed against error", said, pictures, tables, links, commands)
 
 
 def _scene(numbers: Json, said: list[str], tables: list[Table]) -> Figure:
@@ -184,6 +192,6 @@ def _checked(found: Json, name: str, key: str) -> Json:
 
 def _odd(name: str, error: Exception) -> StoreError:
     return StoreError(
-        f"derived/{FILES[name]}: is not of the shape that this version reads ({error!r}); delete "
+        f"{FILES[name]}: is not of the shape that this version reads ({error!r}); delete "
         "it, or make it again"
     )

@@ -56,7 +56,9 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
         for item in campaigns
     ]
     clocks = (report_folder(store) / CLOCKS).exists()
-    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store)]
+    # commands in the page name the store's folder
+    where = str(store.folder.resolve())
+    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store), where]
     return make_key(STEP, VERSION, inputs, None)
 
 

@@ -4,7 +4,7 @@
     STORE/derived/tradeoff/tradeoff.json        sliplab tradeoff --scene
     STORE/derived/tradeoff/labels.json          python -m benchmarks labels --json
     STORE/derived/tradeoff/labels_truth.json    python -m benchmarks labels_truth --json
-    STORE/derived/tradeoff/detector.json        sliplab tradeoff --detector
+    STORE/report/detector_tradeoff.json         sliplab tradeoff --detector
 
 They take hours, so the report never makes them: it shows what is there, and says how to make what
 is not. None of them is checked for being fresh; what they were made of is theirs to say.
@@ -21,13 +21,13 @@ from storage.store import Store
 Json = dict[str, Any]
 
 FILES = {
-    "generalisation": "generalisation/results.json",
-    "scene": "tradeoff/tradeoff.json",
-    "labels": "tradeoff/labels.json",
-    "labels_truth": "tradeoff/labels_truth.json",
-    "detector": "tradeoff/detector.json",
+    "generalisation": "derived/generalisation/results.json",
+    "scene": "derived/tradeoff/tradeoff.json",
+    "labels": "derived/tradeoff/labels.json",
+    "labels_truth": "derived/tradeoff/labels_truth.json",
+    "detector": "report/detector_tradeoff.json",
 }
-"""By name, where each stands under ``derived/``."""
+"""By name, where each stands in the store."""
 
 COMMANDS = {
     "generalisation": "python -m benchmarks.generalisation {store} --out {folder}",
@@ -47,7 +47,7 @@ def extras(store: Store) -> dict[str, Json]:
     """
     found = {}
     for name, place in FILES.items():
-        path = store.folder / "derived" / place
+        path = store.folder / place
         try:
             found[name] = read_json(path)
         except FileNotFoundError:
@@ -59,5 +59,5 @@ def extras(store: Store) -> dict[str, Json]:
 
 def command(store: Store, name: str) -> str:
     """The command that makes one of `FILES`, for this store."""
-    path = store.folder.resolve() / "derived" / FILES[name]
+    path = store.folder.resolve() / FILES[name]
     return COMMANDS[name].format(store=store.folder.resolve(), folder=path.parent, file=path)

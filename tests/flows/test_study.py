@@ -32,18 +32,6 @@ from storage.store import Store, StoreError
 from tests.flows.conftest import tiny, tiny_gravity, write
 
 
-@pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> tuple[list[Order], Outcome]:
-    """Both small campaigns, run once through every step."""
-    folder = tmp_path_factory.mktemp("study")
-    protocols = [
-        write(folder / "tiny.yaml", tiny()),
-        write(folder / "tiny_gravity.yaml", tiny_gravity()),
-    ]
-    orders = [make_order(protocol, rig_path, folder / "store") for protocol in protocols]
-    return orders, study(orders)
-
-
 def store_of(ran: tuple[list[Order], Outcome]) -> Store:
     """The study's store."""
     return Store.open(ran[0][0].store)
