@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, NullLocator
 
 from analysis.figure_style import BLUE, GREY, RED, STYLE, svg_text
 from analysis.figures_conditions import WIDTH
@@ -41,6 +42,9 @@ def cost_and_error(panels: Sequence[tuple[str, str, Sequence[Point]]], *, simula
                     axes.plot(point.cost, point.error, "*", color=RED, ms=12, zorder=3)
             axes.plot([], [], "*", color=RED, ms=10, label="paper's settings")
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel(cost)
             axes.set_ylabel(error)
         figure.legend(

@@ -73,12 +73,12 @@ def search(found: Json, simulated: bool) -> tuple[Figure, Table]:
     table = [
         [
             "paper's" if row["paper"] else "front",
-            *(_text(row[name]) for name in SETTINGS),
+            _words(row),
             *(_cell(row, key) for key in FIGURES),
         ]
         for row in shown[:MOST]
     ]
-    columns = ("", *SETTINGS.values(), *(heading for heading, _, _ in FIGURES.values()))
+    columns = ("", "detector", *(heading for heading, _, _ in FIGURES.values()))
     told = f" The first {MOST} of {len(shown)}, by latency." if len(shown) > MOST else ""
     return figure, Table(columns, table, f"The front of {len(rows)} detectors, test trials.{told}")
 
@@ -106,5 +106,10 @@ def _cell(row: Json, key: tuple[str, str]) -> str:
     return number(None if value is None else factor * value, digits)
 
 
-def _text(value: object) -> str:
-    return f"{value:g}" if isinstance(value, int | float) else str(value)
+def _words(row: Json) -> str:
+    """A row's settings in words."""
+    return (
+        f"{row['length_ms']} ms in steps of {row['step_ms']} ms, cells of {row['pool_px']} px, "
+        f"width ×{row['width']:g}, {row['precision']}; every {row['stride_ms']} ms, "
+        f"{row['smoothing']} windows, margin {row['margin']:g}"
+    )
