@@ -15,12 +15,12 @@ import pytest
 
 from analysis.metrics import CLASSES
 from analysis.scene_windows import PHASES
-from flows import campaign_section
+from flows import campaign_section, others_section, trial_work
 from flows.campaigns import collected
 from flows.collect import collect
 from flows.label import label
 from flows.orders import Order, make_order
-from flows.report import read_summary, report
+from flows.report import read_summary, report, write_figures
 from flows.report_against import compare
 from flows.report_extras import FILES
 from flows.report_trials import OUTCOMES, Conditions, accounted, intervals, told
@@ -267,20 +267,25 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     assert (data / "tradeoff-scene.csv").exists()
 
     path = other.folder / FILES["detector"]
-    write_json(path, {"rows": [{}]})
-    with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
-        report(other, collected(other))
     path.write_text("{")
     with pytest.raises(StoreError, match=r"delete .*detector_tradeoff\.json"):
         report(other, collected(other))
-    path.unlink()
-    (other.folder / FILES["scene"]).unlink()
-    report(other, collected(other))
-    assert not (data / "tradeoff-detector.csv").exists()  # an older report's figures go
-    assert "sliplab tradeoff --scene PROTOCOL" in page(other)
+    with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
+        others_section.tradeoff(other, {"detector": {"rows": [{}]}})
+    with pytest.raises(StoreError, match=r"derived/tradeoff/tradeoff\.json: is not of the shape"):
+        others_section.tradeoff(other, {"scene": {"variants": []}})
+    with pytest.raises(StoreError, match=r"results\.json: is not of the shape"):
+        others_section.skins(other, {}, read_summary(other), simulated=True)
+    absent = others_section.tradeoff(other, {})
+    assert absent.commands[0][0].startswith("sliplab tradeoff --scene PROTOCOL --out ")
+    write_figures(other.folder / "report", [absent], simulated=True)
+    assert list(data.iterdir()) == []  # an older report's figures go
 
 
-def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
+def test_wear_is_the_slope_of_reference_trials(
+    tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial_work, "FEW", 8)  # here, without processes
     rows = [
         {"trial": str(k), "place": 1 + 10 * k, "hold_events_per_s": 1000.0 + 2 * k,
          "first_slip_ms": None if k else 900.0}
