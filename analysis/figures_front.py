@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from analysis.figure_style import BLUE, GREY, RED, STYLE, svg_text
 from analysis.figures_conditions import WIDTH
@@ -42,7 +42,7 @@ def cost_and_error(panels: Sequence[tuple[str, str, Sequence[Point]]], *, simula
                     axes.plot(point.cost, point.error, "*", color=RED, ms=12, zorder=3)
             axes.plot([], [], "*", color=RED, ms=10, label="paper's settings")
             axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
             axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_locator(NullLocator())
             axes.set_xlabel(cost)

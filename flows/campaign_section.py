@@ -233,7 +233,10 @@ def wear(rows: Sequence[Json]) -> dict[str, Json]:
 
 
 def _wear(rows: Sequence[Json]) -> list[str]:
-    words = {"hold_events_per_s": "events in the hold", "first_slip_ms": "time to the first slip"}
+    words = {
+        "hold_events_per_s": "event rate in the hold",
+        "first_slip_ms": "time to the first slip",
+    }
     texts = []
     for name, found in wear(rows).items():
         if found["percent_per_100_trials"] is None:
@@ -241,7 +244,7 @@ def _wear(rows: Sequence[Json]) -> list[str]:
             continue
         sure = not found["low"] <= 0 <= found["high"]
         texts.append(
-            f"{words[name]} change by {found['percent_per_100_trials']:+.2f} % in 100 trials "
+            f"{words[name]} changes by {found['percent_per_100_trials']:+.2f} % in 100 trials "
             f"(95 %: {found['low']:+.2f} to {found['high']:+.2f}, {found['n']} reference trials): "
             + ("more than chance." if sure else "no wear that these trials can tell.")
         )

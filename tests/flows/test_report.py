@@ -320,7 +320,7 @@ def test_wear_is_the_slope_of_reference_trials(
     section = campaign_section.quality(store, [item], simulated=True)
     assert [figure.name for figure in section.figures] == ["quality-tiny", "references-tiny"]
     assert section.text[1] == (
-        "Campaign tiny: events in the hold: 2 reference trials, too few for a trend."
+        "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
     )
 
 
