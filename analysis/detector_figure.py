@@ -32,7 +32,7 @@ def latency_over_rate(panels: Mapping[str, Mapping[str, Curve]], *, simulated: b
             where more than half of the onsets were missed.
     """
     with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(1, len(panels), figsize=(7.6, 4.0), sharey=True, squeeze=False)
+        figure, grid = plt.subplots(1, len(panels), figsize=(6.4, 4.0), sharey=True, squeeze=False)
         curves = [points for lines in panels.values() for points in lines.values()]
         most = max(1.0, *(100 * rate for points in curves for rate, _ in points))
         for axes, (title, lines) in zip(grid[0], panels.items(), strict=True):

@@ -81,7 +81,7 @@ def trial_overview(
     """
     with plt.rc_context(STYLE):
         figure, (top, middle, low) = plt.subplots(
-            3, 1, figsize=(7.6, 6.2), sharex=True, height_ratios=(3, 1.6, 2.2)
+            3, 1, figsize=(6.4, 6.2), sharex=True, height_ratios=(3, 1.6, 2.2)
         )
         top.plot(frame_s, displacement_px[:, 1:], color=GREY, lw=0.7, alpha=0.7)
         top.plot([], [], color=GREY, lw=0.7, label="other papillae")
@@ -109,7 +109,8 @@ def trial_overview(
         top.plot([], [], color=GREEN, lw=1, ls="--", label="motion begins")
         for name, colour in zip(names, (ORANGE, RED), strict=True):
             top.plot([], [], color=colour, lw=1.2, label=name)
-        top.legend(loc="upper left", fontsize=8)
+        handles, titles = top.get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=3, fontsize=8)
         low.set_xlim(0, span)
         return svg_text(figure, simulated)
 
@@ -151,7 +152,7 @@ def outputs(
         end_s: (n,) ends of the windows, seconds; counts, smoothed: (n, 3).
     """
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(2, 1, figsize=(7.6, 4.2), sharex=True, sharey=True)
+        figure, axes = plt.subplots(2, 1, figsize=(6.4, 4.2), sharex=True, sharey=True)
         for panel, values, name in (
             (axes[0], counts, "raw"),
             (axes[1], smoothed, "smoothed"),
@@ -167,46 +168,17 @@ def outputs(
                     panel.axvline(found, color=colour, lw=1.2, ls=":")
         axes[0].plot([], [], color="black", lw=1.4, label="true onset")
         axes[0].plot([], [], color="black", lw=1.2, ls=":", label="detected")
-        axes[0].legend(loc="upper right", ncols=5, fontsize=8, bbox_to_anchor=(1.0, 1.25))
+        handles, titles = axes[0].get_legend_handles_labels()
+        figure.legend(handles, titles, loc="outside lower center", ncols=5, fontsize=8)
         axes[1].set_xlabel("time since the recording began (s)")
         axes[1].set_xlim(0, float(end_s[-1]) if len(end_s) else 1.0)
-        return svg_text(figure, simulated)
-
-
-def distributions(
-    groups: Mapping[str, Sequence[float]],
-    label: str,
-    *,
-    simulated: bool,
-    zero: str = "",
-) -> str:
-    """Every value of each group as a dot, the median as a bar."""
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(6.6, 0.42 * max(len(groups), 2) + 1.1))
-        rng = np.random.default_rng(0)
-        for row, (name, values) in enumerate(groups.items()):
-            there = np.asarray(values, np.float64)
-            spread = rng.uniform(-0.18, 0.18, len(there))
-            axes.plot(there, row + spread, "o", ms=3.5, color=BLUE, alpha=0.6, mew=0)
-            if len(there):
-                median = float(np.median(there))
-                axes.plot([median, median], [row - 0.3, row + 0.3], color=RED, lw=2)
-            else:
-                axes.text(0, row, " none", va="center", color=GREY, fontsize=8)
-            del name
-        axes.axvline(0, color=GREY, lw=0.8)
-        if zero:
-            axes.text(0, -0.62, f" {zero}", color=GREY, fontsize=8, va="center")
-        axes.set_yticks(range(len(groups)), list(groups))
-        axes.set_ylim(len(groups) - 0.5, -0.8)
-        axes.set_xlabel(label)
         return svg_text(figure, simulated)
 
 
 def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simulated: bool) -> str:
     """Loss and accuracies by epoch, with the chosen epoch."""
     with plt.rc_context(STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(7.6, 2.5))
+        figure, (left, right) = plt.subplots(1, 2, figsize=(6.4, 2.5))
         epochs = [row["epoch"] for row in history]
         left.plot(epochs, [row["loss"] for row in history], color=BLUE, label="training")
         left.plot(epochs, [row["val_loss"] for row in history], color=ORANGE, label="validation")

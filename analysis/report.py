@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,19 +17,33 @@ _TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture (SVG text) and what to see in it."""
+    """A picture (SVG text) and what to see in it.
+
+    Attributes:
+        name: of its files beside the page, without an ending; none are written without a name.
+        data: what is drawn, columns by their headings, units in these; they may differ in length.
+        paper: what the paper shows in its place, in words.
+    """
 
     svg: str
     caption: str
+    name: str = ""
+    data: Mapping[str, Sequence[object]] = field(default_factory=dict)
+    paper: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text; the first column names the row."""
+    """Rows of text; the first column names the row.
+
+    Attributes:
+        commands: which columns hold commands, to be copied.
+    """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    commands: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -39,13 +56,18 @@ class Link:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the report."""
+    """One part of the report.
+
+    Attributes:
+        commands: to be copied, each with what it does.
+    """
 
     title: str
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = field(default=())
     links: Sequence[Link] = ()
+    commands: Sequence[tuple[str, str]] = ()
 
 
 @dataclass(frozen=True)
@@ -86,6 +108,20 @@ def render_page(
     return environment.get_template(template).render(
         sections=sections, simulated=simulated, **values
     )
+
+
+def csv_text(data: Mapping[str, Sequence[object]], *, simulated: bool) -> str:
+    """A figure's data as CSV: headings first, then rows; what is missing is empty.
+
+    A last column says of every row whether it is simulated, so that no table loses it.
+    """
+    buffer = io.StringIO()
+    write = csv.writer(buffer, lineterminator="\n")
+    write.writerow([*data, "simulated"])
+    said = "yes" if simulated else "no"
+    for row in itertools.zip_longest(*data.values()):
+        write.writerow([*("" if cell is None else cell for cell in row), said])
+    return buffer.getvalue()
 
 
 def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:

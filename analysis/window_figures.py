@@ -54,7 +54,7 @@ def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simula
         tenths: from `analysis.window_groups.by_tenth`.
     """
     with plt.rc_context(STYLE):
-        figure, grid = plt.subplots(1, len(tenths), figsize=(7.6, 2.5), sharey=True)
+        figure, grid = plt.subplots(1, len(tenths), figsize=(6.4, 2.4), sharey=True)
         for axes, name, word, colour in zip(grid, CLASSES, CLASS_WORDS, CLASS_COLOURS, strict=True):
             for row in tenths[name]:
                 if row["share"] is None:

@@ -99,11 +99,33 @@ def evaluate(
 
 
 def report(
-    store: PlaceArgument, campaign: CampaignOption = None, as_json: JsonOption = False
+    store: PlaceArgument,
+    campaign: CampaignOption = None,
+    against: Annotated[
+        Path | None,
+        typer.Option("--against", help="Another store or its summary.json: what changed."),
+    ] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Write report/index.html and report/summary.json."""
+    """Write report/index.html and report/summary.json, and compare with another report."""
     folder = located(store)
-    finish(run_step(folder, campaign, "report"), f"report {store}", as_json)
+    if against is not None:
+        from flows.report_against import load_other
+
+        load_other(against)  # wrong input is told before anything is made
+    result = run_step(folder, campaign, "report")
+    if against is not None:
+        from flows import report, report_against_page
+        from storage.store import Store
+
+        compared = report.against(Store.open(folder), against)
+        if as_json:
+            result["against"] = compared
+        else:
+            title = "Two reports" + (" (simulated)" if any(compared["simulated"].values()) else "")
+            console.print_table(title, *report_against_page.short_table(compared["figures"]))
+            console.results.print(f"Page: {compared['page']}", soft_wrap=True)
+    finish(result, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.report import Link, Section, number
-from flows.sync_page import PAGE
+from analysis.report import number
 from protocols.timing import WIRED
-from storage.store import Store
 
 _NO_GRADE = "unknown clocks"
 
@@ -62,20 +60,3 @@ def worst(summary: dict[str, Any]) -> tuple[str, str]:
     device = max(known, key=lambda name: known[name])
     against = "" if device == "events" else "events against "
     return value, f"{against}{device} ({sync['grades'][device]})"
-
-
-def section(store: Store, summary: dict[str, Any]) -> Section:
-    """The report's few words on clocks, with the way to their own page."""
-    sync = summary["sync"]
-    rows = [
-        f"{device} ({grade}): {number(sync['worst_against_events_us'][device], 1, 'µs')}"
-        for device, grade in sync["grades"].items()
-    ]
-    text = [
-        "Events, frames and arm keep time by clocks of their own; the sync box's pulses tie them "
-        f"together. Uncertainty in the worst trial: {'; '.join(rows)}. Of events it is that of "
-        "their own clock, of the others that of events against them."
-    ]
-    if (store.folder / "report" / PAGE).exists():
-        return Section("Clocks", text, links=[Link(PAGE, "Residuals, drift and pulses by trial")])
-    return Section("Clocks", [*text, "`sliplab sync` shows residuals, drift and pulses by trial."])

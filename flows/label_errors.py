@@ -66,6 +66,20 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     }
 
 
+def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, list[float]]]:
+    """Every trial's distance of each rule's onset from its own truth, ms, by rule and kind.
+
+    Rules of which no truth is known are left out.
+    """
+    found: dict[str, dict[str, list[float]]] = {}
+    for rule, kind, label, truth in _cases(store, campaigns):
+        mine = _known(label, rule, kind)
+        if mine is not None and truth is not None:
+            kinds = found.setdefault(rule, {name: [] for name in KINDS})
+            kinds[kind].append(abs(mine - truth) / 1e6)
+    return found
+
+
 def spread(values: list[float]) -> dict[str, Any]:
     """Number, median, median distance and largest."""
     there = np.asarray(values)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
-from analysis.report import Section, Table, number, percent
+from analysis.figures_campaign import label_uncertainty
+from analysis.report import Figure, Section, Table, number, percent
+from flows.campaigns import Collected
+from flows.label import STEP as LABELS
+from flows.label_errors import KINDS, distances
 from flows.results import source_text
+from storage.derived import Derived
+from storage.store import Store
 
 _ROWS = (
     ("paper", "paper's rule less the true crossing"),
@@ -14,7 +21,9 @@ _ROWS = (
 )
 
 
-def section(summary: dict[str, Any]) -> Section | None:
+def section(
+    store: Store, campaigns: list[Collected], summary: dict[str, Any], simulated: bool
+) -> Section | None:
     """Both rules against the simulation's truth; None where nothing is labelled by both."""
     rules = summary["labels"]["rules_ms"]
     if not rules["apart"]["incipient"]["n"]:
@@ -47,10 +56,70 @@ def section(summary: dict[str, Any]) -> Section | None:
             f"{number(papillae['median_abs'], 2, 'ms')} off in the median, and its 95 % interval "
             f"holds the truth in {percent(papillae['coverage'])} of them."
         )
-    columns = ["difference", "onset", "trials", "median (ms)", "median distance", "largest"]
+    columns = (
+        "difference", "onset", "trials", "median (ms)", "median distance (ms)", "largest (ms)"
+    )  # fmt: skip
     return Section(
-        "How exact the labels are", said, (), [Table(columns, rows, "One frame is 10 ms.")]
+        "How exact the labels are",
+        said,
+        [_figure(store, campaigns, simulated)],
+        [Table(columns, rows, "One frame is 10 ms."), *_doubted(store, campaigns)],
     )
+
+
+def _figure(store: Store, campaigns: list[Collected], simulated: bool) -> Figure:
+    """Distances from the truth where it is known, and the change points' own intervals."""
+    errors = {_RULES[rule]: kinds for rule, kinds in distances(store, campaigns).items()}
+    widths: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.trials:
+            found = labels.read(trial.id)["change_point"]
+            centre = int(recording.record["geometry"]["centre"])
+            for kind, marker in (("incipient", found["first_marker"]), ("gross", centre)):
+                if found["doubts"][kind] is None and found[f"{kind}_ns"] is not None:
+                    width = found["high_ns"][marker] - found["low_ns"][marker]
+                    widths[kind].append(width / 1e6)
+    data: dict[str, list[float]] = {
+        f"{rule}, {kind}: distance from the truth (ms)": values
+        for rule, kinds in errors.items()
+        for kind, values in kinds.items()
+    }
+    for kind, values in widths.items():
+        data[f"change point, {kind}: width of the 95 % interval (ms)"] = values
+    seen = (
+        "Left: how many trials' labels lie within so much of the truth, each rule against its own "
+        "(the crossing of 2 pixels, the start of the slip). Right: how"
+        if errors
+        else "How"
+    )
+    return Figure(
+        label_uncertainty(errors, widths, simulated=simulated),
+        f"{seen} sure the change points are of themselves. A curve further left is better.",
+        "labels",
+        data,
+    )
+
+
+_RULES = {"paper": "paper's rule", "change_point": "change point"}
+
+
+def _doubted(store: Store, campaigns: list[Collected]) -> list[Table]:
+    """Why labels of the ruling rule lack an onset."""
+    causes = Counter(
+        (item.name, kind, str(label["doubts"][kind]))
+        for item in campaigns
+        for trial, _ in item.trials
+        for label in (Derived.of(store, LABELS, item.name).read(trial.id),)
+        for kind in KINDS
+        if label["doubts"][kind] is not None
+    )
+    if not causes:
+        return []
+    rows = [[*key[:2], str(count), key[2]] for key, count in causes.most_common()]
+    return [
+        Table(("campaign", "onset", "trials", "in doubt because"), rows, "Doubted onsets are none.")
+    ]
 
 
 def _ruling(summary: dict[str, Any]) -> str:

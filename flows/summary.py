@@ -7,10 +7,14 @@ from importlib.metadata import version
 from typing import Any
 
 from flows import timing
+from flows.campaign_section import reference_rows, wear
 from flows.campaigns import Collected, training_campaigns
 from flows.estimate import plan_bytes
-from flows.window_baselines import beside
+from flows.report_trials import accounted, intervals, told
+from flows.window_baselines import EVALUATION, beside
+from flows.window_scores import window_intervals
 from rigs.rig_file import load_rig_file
+from storage.derived import Derived
 from storage.store import Store
 
 _PACKAGES = (
@@ -55,13 +59,19 @@ def make_summary(
         "samples": windows["samples"],
         "trained_baselines": beside(store),
         **{name: windows[name] for name in _WINDOWS},
+        "window_intervals": window_intervals(store, Derived.of(store, EVALUATION).key(EVALUATION)),
         **experiments["kinematic"],
     }
     return {
         "simulated": store.simulated,
-        "kinematic": kinematic,
-        "gravity": experiments["gravity"],
-        "disturbance": experiments["disturbance"],
+        "kinematic": {**kinematic, **_judged(campaigns, evaluation, "kinematic")},
+        "gravity": {**experiments["gravity"], **_judged(campaigns, evaluation, "gravity")},
+        "disturbance": {
+            **experiments["disturbance"],
+            **_judged(campaigns, evaluation, "disturbance"),
+        },
+        "trials": [told(row) for row in evaluation["trials"]],
+        "references": _references(store, campaigns),
         "labels": {
             "error_ms": evaluation["label_error_ms"],
             "rules_ms": evaluation["label_rules_ms"],
@@ -89,6 +99,23 @@ def make_summary(
             "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
         },
     }
+
+
+def _judged(
+    campaigns: list[Collected], evaluation: dict[str, Any], experiment: str
+) -> dict[str, Any]:
+    """What became of an experiment's trials, and how sure its figures are."""
+    rows = evaluation["trials"]
+    return {
+        "accounted": accounted(campaigns, rows, experiment),
+        "intervals": intervals([told(row) for row in rows if row["experiment"] == experiment]),
+    }
+
+
+def _references(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Wear by campaign, of those that take reference trials."""
+    found = {item.name: reference_rows(store, item) for item in campaigns}
+    return {name: {"trials": rows, "wear": wear(rows)} for name, rows in found.items() if rows}
 
 
 def _sources(campaigns: list[Collected]) -> dict[str, int]:

@@ -214,3 +214,26 @@ def kept_counts(store: Store, evaluated: str | None) -> dict[str, npt.NDArray[An
     """
     kept = Derived.of(store, STEP)
     return kept.arrays(NAME) if evaluated is not None and kept.fresh(NAME, evaluated) else None
+
+
+def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
+    """Accuracy, and incipient precision and recall, of the test windows with intervals over trials.
+
+    Args:
+        evaluated: the evaluation's key.
+
+    Returns:
+        by name what `analysis.window_groups.share` gives; empty where the evaluation kept none.
+    """
+    found = kept_counts(store, evaluated)
+    if found is None:
+        return {}
+    counts, y, trial = found["counts"], found["y"], found["trial"]
+    said = metrics.winners(counts)
+    true, called = y == metrics.INCIPIENT, said == metrics.INCIPIENT
+    both = (true & called).astype(np.float64)
+    return {
+        "accuracy": window_groups.share(window_groups.credit(counts, y), trial),
+        "incipient_precision": window_groups.share(both[called], trial[called]),
+        "incipient_recall": window_groups.share(both[true], trial[true]),
+    }

@@ -8,21 +8,14 @@ import numpy as np
 
 from analysis import figures, window_figures
 from analysis.metrics import CLASSES
+from analysis.published import PAPER
 from analysis.report import Figure, Section, Table, number, percent
 from analysis.training import Fitted
+from flows import others_section, work_section
+from flows.work_section import METHODS
 
 Json = dict[str, Any]
 
-_METHODS = {
-    "majority": "majority class",
-    "rate_threshold": "event-rate threshold",
-    "logistic": "logistic regression on the event count",
-    "logistic_cells": "logistic regression on each cell's events",
-    "boosting": "gradient boosting on counts",
-    "cnn_frame": "ordinary convolutions on the summed frame",
-    "cnn_volume": "ordinary convolutions on space and time",
-    "gru": "gated recurrent unit over the steps",
-}
 _WORST = 10
 
 
@@ -37,7 +30,7 @@ def window_sections(windows: Json, beside: Json, fitted: Fitted, simulated: bool
     if windows["reliability"]:
         sections.append(_lead(windows, simulated))
     if windows["work"] is not None:
-        sections.append(_cost(windows, beside))
+        sections.append(work_section.section(windows, beside))
     return sections
 
 
@@ -48,7 +41,7 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
     rows = [["spiking network", *(percent(accuracy[kind]) for kind in kinds), ""]]
     for name, found in {**windows["beside"], **beside}.items():
         rows.append(
-            [_METHODS[name], percent(found["argmax"]), "", "", _points(found["network_ahead"])]
+            [METHODS[name], percent(found["argmax"]), "", "", _points(found["network_ahead"])]
         )
     classes = [
         [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
@@ -70,7 +63,18 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
             Figure(
                 figures.confusion(np.asarray(windows["confusion"]), simulated=simulated),
                 "Rows are true classes and add up to 100 %. The last column holds windows whose "
-                "two highest spike counts are equal.",
+                "two highest spike counts are equal. Everything off the diagonal is an error.",
+                "confusion",
+                {
+                    "true class": list(figures.CLASS_WORDS),
+                    **{
+                        f"called {word} (windows)": [row[k] for row in windows["confusion"]]
+                        for k, word in enumerate((*figures.CLASS_WORDS, "undecided"))
+                    },
+                },
+                f"accuracy {PAPER['accuracy'].text}; incipient precision "
+                f"{PAPER['incipient_precision'].text} and recall {PAPER['incipient_recall'].text}; "
+                f"most confused {PAPER['confused'].text}.",
             ),
             Figure(
                 figures.training_curves(
@@ -79,7 +83,10 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
                     simulated=simulated,
                 ),
                 "Training; the dashed line is the epoch with the best strict validation accuracy, "
-                "whose weights are used.",
+                "whose weights are used. Where validation turns while training still improves, the "
+                "network begins to learn its training trials by heart.",
+                "training",
+                _history(fitted),
             ),
         ],
         [
@@ -95,10 +102,11 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
 
 def _where(windows: Json, simulated: bool) -> Section:
     """By condition, phase and trial."""
+    accuracy = windows["accuracy"]
     levels = [
         [factor, level, str(row["trials"]), str(row["n"]), _share(row)]
         for factor, rows in windows["by_factor"].items()
-        for level, row in rows.items()
+        for level, row in others_section.in_order(rows)
     ]
     still = [
         [word, str(row["trials"]), str(row["n"]), _share(row)]
@@ -126,8 +134,16 @@ def _where(windows: Json, simulated: bool) -> Section:
             Figure(
                 window_figures.recall_by_tenth(windows["by_tenth"], simulated=simulated),
                 "Recall by where the window's middle lies in its class's phase: no slip ends and "
-                "incipient slip begins at the first slip, gross slip begins at the centre's.",
-            )
+                "incipient slip begins at the first slip, gross slip begins at the centre's. Bars "
+                "are 95 % intervals over trials. It falls where a phase looks like its neighbour.",
+                "recall-by-tenth",
+                _tenths(windows["by_tenth"]),
+            ),
+            *(
+                [others_section.factors(windows["by_factor"], accuracy["strict"], simulated)]
+                if windows["by_factor"]
+                else []
+            ),
         ],
         [
             Table(["factor", "level", "trials", "windows", "right"], levels),
@@ -158,98 +174,50 @@ def _lead(windows: Json, simulated: bool) -> Section:
         [
             Figure(
                 window_figures.reliability(windows["reliability"], simulated=simulated),
-                "Bars are Wilson's 95 % intervals, which take windows for independent.",
+                "Share of windows called rightly, by how far the winner leads; below, how many "
+                "windows there are. Bars are Wilson's 95 % intervals, which take windows for "
+                "independent. The paper's detection asks for a lead of 2.",
+                "lead-reliability",
+                _leads(windows["reliability"]),
             )
         ],
     )
 
 
-def _cost(windows: Json, beside: Json) -> Section:
-    """What spiking buys, and what it costs."""
-    work = windows["work"]
-    synaptic, dense = work["synaptic_operations"], work["dense_multiply_adds"]
-    rows = [
-        [
-            layer,
-            f"{synaptic[layer]:,.0f}",
-            f"{dense[layer]:,}",
-            percent(_part(synaptic, dense, layer)),
-        ]
-        for layer in synaptic
-    ]
-    fired = [
-        [layer, number(work["spikes"][layer], 1), percent(rate, 2)]
-        for layer, rate in work["rates"].items()
-    ]
-    said = [
-        f"It buys: {synaptic['all']:,.0f} synaptic operations a window, where the same layers "
-        f"computed densely do {dense['all']:,} multiply-adds: {percent(work['share'])}. A synaptic "
-        "operation is one addition that a spike, or an event, causes at one neuron, counted by "
-        "where it fired; a multiply-add does more. What is neither is not counted: keeping "
-        "potentials, memory, moving spikes about. So this says nothing about joules.",
-        *_lost(windows, beside),
-    ]
-    return Section(
-        "What spiking buys, and what it costs",
-        said,
-        (),
-        [
-            Table(["layer", "synaptic operations", "dense multiply-adds", "share"], rows,
-                  f"Means of {work['n']} test windows of {number(work['events'], 0)} events."),
-            Table(["spiking layer", "spikes a window", "of neurons and steps"], fired),
-            *_others(beside),
-        ],
-    )  # fmt: skip
+def _history(fitted: Fitted) -> dict[str, list[object]]:
+    rows = [vars(record) for record in fitted.history]
+    headings = {
+        "epoch": "epoch",
+        "loss": "training loss (nats)",
+        "val_loss": "validation loss (nats)",
+        "train_argmax": "training accuracy, argmax (share)",
+        "val_argmax": "validation accuracy, argmax (share)",
+        "val_strict": "validation accuracy, strict (share)",
+    }
+    return {heading: [row[name] for row in rows] for name, heading in headings.items()}
 
 
-def _lost(windows: Json, beside: Json) -> list[str]:
-    """The accuracy that the best other method has more or less."""
-    there = {**windows["beside"], **beside}
-    found = {name: row for name, row in there.items() if row["argmax"] is not None}
-    if not beside or not found:
-        return []
-    best = max(found, key=lambda name: float(found[name]["argmax"]))
-    ahead = found[best]["network_ahead"]
-    points = 100 * ahead["share"]
-    sure = ahead["low"] is not None and not ahead["low"] <= 0 <= ahead["high"]
-    word = "ahead of" if points > 0 else "behind"
-    cost = found[best].get("made", {}).get("multiply_adds")
-    return [
-        f"It costs: the best other method on these windows is this one: {_METHODS[best]}, with "
-        f"{percent(found[best]['argmax'])}"
-        + (f" for {cost:,} multiply-adds a window" if cost is not None else "")
-        + f". The spiking network is {number(abs(points))} points {word} it"
-        + _span(ahead)
-        + "; "
-        + ("trials tell them apart." if sure else "so few trials do not tell them apart.")
-        + " It was picked as the best on these very windows, which flatters it."
-    ]
+def _tenths(tenths: Json) -> dict[str, list[object]]:
+    rows = [(name, row) for name, of in tenths.items() for row in of]
+    return {
+        "class": [name for name, _ in rows],
+        "phase, from (%)": [10 * row["tenth"] - 10 for _, row in rows],
+        "recall (share)": [row["share"] for _, row in rows],
+        "95 % interval, low (share)": [row["low"] for _, row in rows],
+        "95 % interval, high (share)": [row["high"] for _, row in rows],
+        "windows": [row["n"] for _, row in rows],
+    }
 
 
-def _others(beside: Json) -> list[Table]:
-    rows = []
-    for name, found in beside.items():
-        made = found["made"]
-        ran = made.get("epochs", made.get("rounds", made.get("iterations")))
-        most = made.get("most_epochs", made.get("most_rounds"))
-        rows.append(
-            [
-                _METHODS[name],
-                "–" if "weights" not in made else f"{made['weights']:,}",
-                "–" if "multiply_adds" not in made else f"{made['multiply_adds']:,}",
-                f"{ran} of at most {most}" if most is not None else str(ran),
-            ]
-        )
-    if not rows:
-        return []
-    columns = ["method", "weights", "multiply-adds a window", "epochs or rounds"]
-    return [Table(columns, rows, "What the other methods are.")]
-
-
-def _span(row: Json) -> str:
-    if row["low"] is None:
-        return ""
-    return f" (difference {100 * row['low']:+.1f} to {100 * row['high']:+.1f} in 95 %)"
+def _leads(rows: list[Json]) -> dict[str, list[object]]:
+    headings = {
+        "lead": "lead (spikes)",
+        "n": "windows",
+        "share": "right (share)",
+        "low": "95 % interval, low (share)",
+        "high": "95 % interval, high (share)",
+    }
+    return {heading: [row[name] for row in rows] for name, heading in headings.items()}
 
 
 def _of_seeds(seeds: Json) -> list[str]:
@@ -261,10 +229,6 @@ def _of_seeds(seeds: Json) -> list[str]:
         f"the mean, from {percent(strict['min'])} to {percent(strict['max'])}. The one shown was "
         "chosen by validation windows."
     ]
-
-
-def _part(synaptic: Json, dense: Json, layer: str) -> float:
-    return float(synaptic[layer] / dense[layer])
 
 
 def _taken(what: str) -> str:

@@ -18,6 +18,8 @@ _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
 from flows.orchestration import prepare  # noqa: E402
+from flows.orders import Order, make_order  # noqa: E402
+from flows.study import Outcome, study  # noqa: E402
 
 prepare(Path(_HOME))
 
@@ -63,3 +65,15 @@ def write(path: Path, data: dict[str, Any]) -> Path:
 def rig_path() -> Path:
     """The shipped rig for rehearsals: tracks in place of videos, which take most of the time."""
     return ROOT / "rigs" / "rehearsal.yaml"
+
+
+@pytest.fixture(scope="session")
+def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> tuple[list[Order], Outcome]:
+    """Both small campaigns, run once through every step; who changes the store puts it back."""
+    folder = tmp_path_factory.mktemp("study")
+    protocols = [
+        write(folder / "tiny.yaml", tiny()),
+        write(folder / "tiny_gravity.yaml", tiny_gravity()),
+    ]
+    orders = [make_order(protocol, rig_path, folder / "store") for protocol in protocols]
+    return orders, study(orders)
