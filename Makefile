@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DONE := .venv/.installed
 
-.PHONY: setup demo test test-long lint bench clean
+.PHONY: setup demo test test-long lint docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -29,6 +29,10 @@ lint: $(DONE)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# every link, anchor and page is looked at; nothing is fetched
+docs: $(DONE)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 bench: $(DONE)
 	$(BIN)/python -m benchmarks

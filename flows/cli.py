@@ -24,6 +24,7 @@ from flows.cli_exchange import register as register_exchange
 from flows.cli_models import register as register_models
 from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
+from flows.cli_schema import register as register_schema
 from flows.cli_serve import register as register_serve
 from flows.cli_tradeoff import register as register_tradeoff
 
@@ -157,5 +158,6 @@ register_exchange(app)
 register_review(app)
 register_detect(app)
 register_models(app)
+register_schema(app)
 app.add_typer(teach_app, name="teach")
 app.add_typer(calibrate_app, name="calibrate")

@@ -6,12 +6,21 @@ import re
 from decimal import Decimal
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from protocols.quantity import UNITS, canonical, to_decimal
 from protocols.yaml_file import StrictModel
 
 MAX_TRIALS = 1_000_000
+_UNITS = sorted({kind for kind, _ in UNITS.values()})
 _WORD = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 
 Level = Decimal | str
@@ -21,7 +30,12 @@ def _number(raw: object) -> Decimal:
     return to_decimal(raw)
 
 
-Number = Annotated[Decimal, BeforeValidator(_number), PlainSerializer(canonical)]
+Number = Annotated[
+    Decimal,
+    BeforeValidator(_number),
+    PlainSerializer(canonical),
+    WithJsonSchema({"type": "number"}),
+]
 
 
 class Range(StrictModel):
@@ -71,13 +85,25 @@ def _write_level(level: Level) -> str:
     return level if isinstance(level, str) else canonical(level)
 
 
-LevelField = Annotated[Level, BeforeValidator(_level), PlainSerializer(_write_level)]
+LevelField = Annotated[
+    Level,
+    BeforeValidator(_level),
+    PlainSerializer(_write_level),
+    WithJsonSchema(
+        {"anyOf": [{"type": "number"}, {"type": "string", "pattern": f"^{_WORD.pattern}$"}]}
+    ),
+]
 
 
 class Factor(StrictModel):
     """One factor of the factorial: its unit and its levels, as a list or a range."""
 
-    unit: str | None = None
+    model_config = ConfigDict(
+        json_schema_extra={"oneOf": [{"required": ["values"]}, {"required": ["range"]}]}
+    )
+
+    unit: str | None = Field(default=None, json_schema_extra={"enum": [*_UNITS, None]})
+    """Of all its levels; words have none."""
     values: tuple[LevelField, ...] | None = None
     range: Range | None = None
     optional: tuple[LevelField, ...] = ()
@@ -88,9 +114,8 @@ class Factor(StrictModel):
     @field_validator("unit")
     @classmethod
     def _known(cls, unit: str | None) -> str | None:
-        canonical_units = sorted({kind for kind, _ in UNITS.values()})
-        if unit is not None and unit not in canonical_units:
-            raise ValueError(f"must be one of {', '.join(canonical_units)}")
+        if unit is not None and unit not in _UNITS:
+            raise ValueError(f"must be one of {', '.join(_UNITS)}")
         return unit
 
     @model_validator(mode="after")

@@ -27,7 +27,10 @@ class Collection(StrictModel):
 
     experiment: Literal["kinematic", "gravity", "disturbance"]
     seed: Annotated[int, Field(ge=0, lt=2**63)]
-    factors: dict[str, Factor]
+    factors: dict[str, Factor] = Field(
+        json_schema_extra={"minProperties": 1, "propertyNames": {"pattern": f"^{_NAME.pattern}$"}}
+    )
+    """What is varied; every combination of their levels is a condition."""
     repetitions: Annotated[int, Field(ge=1, le=100_000)]
     order: Literal["shuffled", "listed"] = "shuffled"
     references: References | None = None

@@ -5,9 +5,10 @@ from __future__ import annotations
 from decimal import Decimal
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
 from protocols.quantity import (
+    REF_SCHEMA,
     DegreesOrRef,
     FactorRef,
     MillimetresOrRef,
@@ -61,7 +62,10 @@ def _share_or_side(raw: object) -> object:
 
 
 SideField = Annotated[
-    Literal["left", "right"] | FactorRef, BeforeValidator(_share_or_side), PlainSerializer(str)
+    Literal["left", "right"] | FactorRef,
+    BeforeValidator(_share_or_side),
+    PlainSerializer(str),
+    WithJsonSchema({"anyOf": [{"enum": ["left", "right"]}, REF_SCHEMA]}),
 ]
 
 

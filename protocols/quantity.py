@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
 # unit -> (canonical unit of its kind, factor to it); all factors are exact decimals
 UNITS: dict[str, tuple[str, Decimal]] = {
@@ -110,6 +110,31 @@ def parse_or_ref(raw: object, unit: str) -> Decimal | FactorRef:
     return parse(raw, unit)
 
 
+REF_SCHEMA: dict[str, Any] = {
+    "type": "string",
+    "pattern": r"^\$[a-z][a-z0-9_]*$",
+    "description": "The level of this factor in the trial at hand, such as $depth.",
+}
+
+
+def quantity_schema(unit: str, *, negative: bool = True, zero: bool = True) -> dict[str, Any]:
+    """JSON Schema of text that `parse` reads as a quantity in `unit`, for editors.
+
+    Args:
+        negative: whether it may be below 0; zero: whether it may be 0.
+    """
+    units = [name for name, (kind, _) in UNITS.items() if kind == unit]
+    sign = "[+-]?" if negative else "[+]?"
+    some = "" if zero else "(?=[^eE]*[1-9])"
+    number = r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
+    return {
+        "type": "string",
+        "pattern": rf"^\s*{some}{sign}{number}\s*({'|'.join(units)})\s*$",
+        "description": f"A number with its unit: {', '.join(units)}.",
+        "examples": [f"1.5 {unit}"],
+    }
+
+
 def _checked(
     unit: str, reader: Callable[[object, str], Any], low: Decimal | None, strict: bool
 ) -> Callable[[object], Any]:
@@ -136,10 +161,12 @@ def _quantity(unit: str, low: str | None, strict: bool, *, ref: bool) -> Any:
     bound = None if low is None else Decimal(low)
     kind: Any = (Decimal | FactorRef) if ref else Decimal
     reader = parse_or_ref if ref else parse
+    schema = quantity_schema(unit, negative=bound is None, zero=not strict)
     return Annotated[
         kind,
         BeforeValidator(_checked(unit, reader, bound, strict)),
         PlainSerializer(_writer(unit)),
+        WithJsonSchema({"anyOf": [schema, REF_SCHEMA]} if ref else schema),
     ]
 
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from datetime import date
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from protocols.quantity import parse
+from protocols.quantity import parse, quantity_schema
 from protocols.yaml_file import StrictModel
 
 
@@ -41,10 +41,14 @@ def _days(raw: object) -> int:
     return int(match[1])
 
 
-Millimetre = Annotated[float, BeforeValidator(_mm)]
-Pixel = Annotated[float, BeforeValidator(_px)]
-Degree = Annotated[float, BeforeValidator(_deg)]
-Days = Annotated[int, BeforeValidator(_days)]
+Millimetre = Annotated[float, BeforeValidator(_mm), WithJsonSchema(quantity_schema("mm"))]
+Pixel = Annotated[float, BeforeValidator(_px), WithJsonSchema(quantity_schema("px"))]
+Degree = Annotated[float, BeforeValidator(_deg), WithJsonSchema(quantity_schema("deg"))]
+Days = Annotated[
+    int,
+    BeforeValidator(_days),
+    WithJsonSchema({"type": "string", "pattern": f"^{_DAYS.pattern}$", "examples": ["30 d"]}),
+]
 Point = tuple[Millimetre, Millimetre, Millimetre]
 Method = Annotated[str, Field(min_length=1, max_length=120)]
 

@@ -1,0 +1,156 @@
+"""Pages of the site that are made from the program itself when it is built, so that they are true.
+
+The command line, the keys of protocol and rig files, and the list of decisions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from schema_tables import tables
+
+DOCS = Path(__file__).parent
+_ITEM = re.compile(r"(- |1\. )\S")
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put every record under Decisions, so that none can be forgotten."""
+    section = next(item for item in config.nav if "Decisions" in item)
+    section["Decisions"] += [f"decisions/{path.name}" for path in _records()]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made here."""
+    pages: dict[str, Callable[[], str]] = {
+        "decisions/index.md": decisions,
+        "reference/commands.md": commands,
+        "reference/protocol-file.md": protocol_file,
+        "reference/rig-file.md": rig_file,
+    }
+    for name, make in pages.items():
+        files.append(File.generated(config, name, content=make()))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Begin a list where GitHub begins one: this Markdown wants an empty line before it."""
+    lines: list[str] = []
+    fenced = listed = False
+    for line in markdown.split("\n"):
+        fenced ^= line.lstrip().startswith("```")
+        begins = not fenced and _ITEM.match(line) is not None
+        if begins and not listed and lines and lines[-1].strip():
+            lines.append("")
+        listed = (listed or begins) and bool(line.strip())
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def _records() -> list[Path]:
+    return sorted((DOCS / "decisions").glob("[0-9]*.md"))
+
+
+def decisions() -> str:
+    """The list of decisions."""
+    lines = ["# Decisions", "", "Why things are as they are: context, decision, consequences.", ""]
+    for path in _records():
+        number, _, title = path.read_text().splitlines()[0].removeprefix("# ").partition(". ")
+        lines.append(f"- {number}: [{title}]({path.name})")
+    return "\n".join(lines) + "\n"
+
+
+def protocol_file() -> str:
+    """Every key of a protocol file."""
+    from flows.schema import file_schema
+
+    schema = file_schema("protocol")
+    return f"""# Protocol files
+
+Every key that a protocol may have. [Write a protocol](../howto/write-a-protocol.md) says how they
+go together, and how an editor completes and checks them, by [its schema](../schema/protocol.json).
+
+{tables(schema, schema["$defs"])}"""
+
+
+def rig_file() -> str:
+    """Every key of a rig file."""
+    from flows.schema import file_schema
+
+    models = file_schema("rig")["$defs"]
+    return f"""# Rig files
+
+Every key that a rig file may have. A file that begins with `extends: OTHER.yaml` has those that
+differ, and all others from that file. [Bring up a rig](../howto/bring-up-a-rig.md) says how to come
+by their values; for editors there is [rig.json](../schema/rig.json).
+
+{tables(models["RigFile"], models)}"""
+
+
+def commands() -> str:
+    """The whole command line, as `--help` says it."""
+    import typer
+
+    from flows.cli import app
+
+    lines = [
+        "# Commands",
+        "",
+        "Every command takes `--json`: one JSON object on standard output, everything else on",
+        "standard error. Exit codes: 0 done, 1 it ran and failed, 2 the input was wrong (the",
+        "message names file, key, value and what would be right), 130 interrupted.",
+        "",
+    ]
+    for words, command in _walk("sliplab", typer.main.get_command(app)):
+        arguments = [item for item in command.params if item.param_type_name == "argument"]
+        options = [item for item in command.params if item.param_type_name == "option"]
+        usage = [_argument(item) for item in arguments]
+        usage += [_option(item, item.opts) for item in options if item.required]
+        lines += [f"## {words}", "", f"`{' '.join([words, *usage])}`", "", command.help or "", ""]
+        rows = [(_argument(item), item.help or "") for item in arguments]
+        rows += [
+            (_option(item, (*item.opts, *item.secondary_opts)), _help(item)) for item in options
+        ]
+        lines += ["| argument or option | meaning |", "| --- | --- |"]
+        lines += [f"| `{name}` | {_cell(text)} |" for name, text in rows]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _walk(words: str, command: Any) -> Iterator[tuple[str, Any]]:
+    if hasattr(command, "commands"):
+        for name, inner in command.commands.items():
+            yield from _walk(f"{words} {name}", inner)
+    else:
+        yield words, command
+
+
+def _argument(item: Any) -> str:
+    name = (item.metavar or item.name.upper()) + ("..." if item.nargs == -1 else "")
+    return name if item.required else f"[{name}]"
+
+
+def _option(item: Any, names: Iterable[str]) -> str:
+    kind = getattr(item.type_descriptor.annotation, "__name__", "").upper()
+    value = item.metavar or {"STR": "TEXT", "LIST": "TEXT", "INT": "N", "FLOAT": "NUMBER"}.get(
+        kind, kind
+    )
+    return ", ".join(names) + ("" if item.is_flag else f" {value}")
+
+
+def _help(item: Any) -> str:
+    text = item.help or ""
+    if item.required:
+        return f"{text} Required."
+    if item.is_flag or item.default is None or callable(item.default) or item.default == "":
+        return text
+    return f"{text} Default: `{item.default}`."
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")

@@ -1,0 +1,144 @@
+"""JSON Schemas of protocol and rig files, for editors that complete, explain and check YAML.
+
+They are made from the models that read the files, so they know the same keys. They know less than
+`sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level breaks,
+stands in the models alone.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sys
+from functools import cache
+from typing import Any, Literal
+
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema
+
+from protocols.model import Protocol
+from rigs.rig_file import RigFile
+from rigs.rig_inheritance import KEY
+
+Kind = Literal["protocol", "rig"]
+Schema = dict[str, Any]
+_PART = "Part"
+
+
+class _Described(GenerateJsonSchema):
+    """Without titles that repeat the keys; each key with the text that stands below its field."""
+
+    def model_schema(self, schema: Any) -> Schema:
+        made = super().model_schema(schema)
+        told = _field_texts(schema["cls"])
+        for name, field in made.get("properties", {}).items():
+            if name in told:
+                _describe(field, told[name])
+        return made
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def file_schema(kind: Kind) -> Schema:
+    """The JSON Schema (2020-12) of a protocol file or a rig file, as plain data."""
+    return _protocol_schema() if kind == "protocol" else _rig_schema()
+
+
+def _protocol_schema() -> Schema:
+    return _finished(_made(Protocol), "A protocol of SlipLab")
+
+
+def _rig_schema() -> Schema:
+    """A file with `extends` may leave out what it takes over, at any depth."""
+    whole = _made(RigFile)
+    models: Schema = {**whole.pop("$defs"), "RigFile": whole}
+    parts = {f"{name}{_PART}": _partial(model) for name, model in models.items()}
+    parts[f"RigFile{_PART}"]["properties"][KEY] = {
+        "type": "string",
+        "description": "The rig file that this one changes, from its own folder.",
+        "examples": ["mock.yaml"],
+    }
+    schema = {
+        "type": "object",
+        "if": {"required": [KEY]},
+        "then": {"$ref": f"#/$defs/RigFile{_PART}"},
+        "else": {"$ref": "#/$defs/RigFile"},
+        "$defs": models | parts,
+    }
+    return _finished(schema, "A rig file of SlipLab")
+
+
+def _made(model: type[BaseModel]) -> Schema:
+    return model.model_json_schema(schema_generator=_Described, ref_template="#/$defs/{model}")
+
+
+def _finished(schema: Schema, title: str) -> Schema:
+    plain: Schema = _plain(schema)
+    plain.pop("title", None)
+    return {"$schema": GenerateJsonSchema.schema_dialect, "title": title, **plain}
+
+
+def _plain(part: Any) -> Any:
+    """Without what other formats than JSON Schema know, and whole sections as defaults."""
+    if isinstance(part, list):
+        return [_plain(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    left = {key: _plain(value) for key, value in part.items() if key != "discriminator"}
+    if isinstance(left.get("default"), dict):
+        left.pop("default")
+    return left
+
+
+def _partial(part: Any) -> Any:
+    """As `part`, with nothing required and only such models below it."""
+    if isinstance(part, list):
+        return [_partial(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    made = {key: _partial(value) for key, value in part.items() if key != "required"}
+    if "properties" in part:
+        made["properties"] = {key: _partial(value) for key, value in part["properties"].items()}
+    if isinstance(part.get("$ref"), str):
+        made["$ref"] = part["$ref"] + _PART
+    if "oneOf" in made:  # a part need not say which one it is
+        made["anyOf"] = made.pop("oneOf")
+    return made
+
+
+def _describe(field: Schema, text: str) -> None:
+    known = field.get("description", "")
+    field["description"] = f"{text} {known}".strip()
+
+
+def _field_texts(model: type[BaseModel]) -> dict[str, str]:
+    """The texts below the fields of a model and of those it is made from, by key."""
+    found: dict[str, str] = {}
+    for kind in reversed(model.__mro__):
+        if issubclass(kind, BaseModel) and not kind.__module__.startswith("pydantic"):
+            found |= _texts_in(kind.__module__).get(kind.__name__, {})
+    return {
+        field.alias or name: found[name]
+        for name, field in model.model_fields.items()
+        if name in found
+    }
+
+
+@cache
+def _texts_in(module: str) -> dict[str, dict[str, str]]:
+    """The texts below the fields of each class of a module."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: _texts(node) for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def _texts(node: ast.ClassDef) -> dict[str, str]:
+    return {
+        field.target.id: " ".join(below.value.value.split())
+        for field, below in zip(node.body, node.body[1:], strict=False)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+        and isinstance(below.value.value, str)
+    }

@@ -1,0 +1,201 @@
+"""The published JSON Schemas: as strict as they can be, and never stricter than the readers."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterator
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+
+from flows.schema import Kind, file_schema
+from protocols.errors import InputError
+from protocols.model import Protocol
+from protocols.yaml_file import StrictModel, validate
+from rigs.rig_file import RigFile, load_rig_file
+from storage.files import json_text
+from tests.conftest import ROOT
+
+FILES: list[tuple[Kind, Path]] = [
+    *(("protocol", path) for path in sorted((ROOT / "protocols").glob("*.yaml"))),
+    *(("rig", path) for path in sorted((ROOT / "rigs").glob("*.yaml"))),
+]
+MODELS: dict[Kind, type[StrictModel]] = {"protocol": Protocol, "rig": RigFile}
+KINDS: tuple[Kind, ...] = ("protocol", "rig")
+CHECKERS = {kind: Draft202012Validator(file_schema(kind)) for kind in KINDS}
+
+
+def _read(path: Path) -> Any:
+    """A file as an editor sees it: dates are text."""
+    return _plain(yaml.safe_load(path.read_text()))
+
+
+def _plain(part: Any) -> Any:
+    if isinstance(part, dict):
+        return {key: _plain(value) for key, value in part.items()}
+    if isinstance(part, list):
+        return [_plain(item) for item in part]
+    return part.isoformat() if isinstance(part, date) else part
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_schemas_are_schemas_and_published_as_they_are(kind: Kind) -> None:
+    made = file_schema(kind)
+    Draft202012Validator.check_schema(made)
+    published = (ROOT / "docs" / "schema" / f"{kind}.json").read_text()
+    assert published == json_text(made), f"run: sliplab schema {kind} --out docs/schema/{kind}.json"
+
+
+@pytest.mark.parametrize(("kind", "path"), FILES, ids=lambda item: getattr(item, "name", item))
+def test_every_shipped_file_is_accepted(kind: Kind, path: Path) -> None:
+    found = [
+        f"{error.json_path}: {error.message}" for error in CHECKERS[kind].iter_errors(_read(path))
+    ]
+    assert not found
+
+
+def _leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    items = part.items() if isinstance(part, dict) else enumerate(part)
+    for key, value in items:
+        if isinstance(value, dict | list):
+            yield from _leaves(value, (*at, key))
+        yield (*at, key)
+
+
+def _set(data: Any, at: tuple[Any, ...], value: Any) -> Any:
+    changed = copy.deepcopy(data)
+    part = changed
+    for key in at[:-1]:
+        part = part[key]
+    part[at[-1]] = value
+    return changed
+
+
+JUNK: tuple[Any, ...] = ("no such thing", -1.5, None, {"no_such_key": 1})
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("protocol", _read(ROOT / "protocols" / "gravity.yaml")),
+        ("rig", _plain(yaml.safe_load(load_rig_file(Path("loopback"))[1]))),
+    ],
+    ids=["gravity", "loopback"],
+)
+def test_nothing_is_refused_that_the_readers_take(kind: Kind, data: Any) -> None:
+    """With every value made nonsense, one at a time, the readers refuse what the schema does."""
+    refused = 0
+    for at in _leaves(data):
+        for junk in JUNK:
+            wrong = _set(data, at, junk)
+            if CHECKERS[kind].is_valid(wrong):
+                continue
+            refused += 1
+            with pytest.raises(InputError):
+                validate(MODELS[kind], wrong, "wrong.yaml")
+    assert refused > 200
+
+
+Change = Callable[[Any], None]
+
+
+def _put(*at: Any, to: Any) -> tuple[tuple[Any, ...], Any]:
+    return at, to
+
+
+PILOT = _read(ROOT / "protocols" / "pilot.yaml")
+MOTION = ("collection", "motion")
+WRONG_PROTOCOLS = {
+    "unknown key": _put("collection", "repetition", to=2),
+    "unknown key in a phase": _put(*MOTION, 1, "sped", to="1 mm/s"),
+    "unknown phase": _put(*MOTION, 1, "phase", to="jump"),
+    "a phase's other key": _put(*MOTION, 1, "direction", to="0 deg"),
+    "wrong unit": _put(*MOTION, 1, "speed", to="2 kg"),
+    "no unit": _put(*MOTION, 3, "distance", to=12),
+    "a speed below 0": _put(*MOTION, 0, "speed", to="-2 mm/s"),
+    "a speed of 0": _put(*MOTION, 0, "speed", to="0.00 mm/s"),
+    "no reference": _put(*MOTION, 1, "depth", to="$Depth"),
+    "a factor's unit": _put("collection", "factors", "depth", "unit", to="furlong"),
+    "a factor's name": _put("collection", "factors", "Depth", to={"unit": "mm", "values": [1]}),
+    "both levels and range": _put(
+        "collection", "factors", "depth", "range", to={"from": 1, "to": 2, "step": 1}
+    ),
+    "a level with a unit": _put("collection", "factors", "depth", "values", 0, to="2.4 mm"),
+    "no factors": _put("collection", "factors", to={}),
+    "repetitions": _put("collection", "repetitions", to=0),
+    "a seed as text": _put("collection", "seed", to="one"),
+    "a protocol's name": _put("name", to="My Protocol"),
+    "another version": _put("protocol", to=2),
+    "an even kernel": _put("analysis", "network", to={"conv1_kernel": 4}),
+    "epochs as text": _put("analysis", "training", "epochs", to="many"),
+    "an unknown rule": _put("analysis", "labelling", "rule", to="mine"),
+    "a list for a mapping": _put("analysis", "windows", to=[30]),
+}
+
+
+@pytest.mark.parametrize("at_to", WRONG_PROTOCOLS.values(), ids=WRONG_PROTOCOLS.keys())
+def test_wrong_protocols_are_refused(at_to: tuple[tuple[Any, ...], Any]) -> None:
+    assert not CHECKERS["protocol"].is_valid(_set(PILOT, *at_to))
+
+
+@pytest.mark.parametrize("key", ["protocol", "name", "collection"])
+def test_a_missing_key_is_refused(key: str) -> None:
+    assert not CHECKERS["protocol"].is_valid({k: v for k, v in PILOT.items() if k != key})
+
+
+UR5 = _read(ROOT / "rigs" / "ur5.yaml")
+NOISY = _read(ROOT / "rigs" / "mock_noisy.yaml")
+WRONG_RIGS = {
+    "unknown driver": (UR5, _put("driver", to="abacus")),
+    "unknown arm": (UR5, _put("devices", "arm", "driver", to="kuka")),
+    "an arm's missing host": (UR5, _put("devices", "arm", to={"driver": "ur"})),
+    "wrong unit": (UR5, _put("limits", "speed", to="5 kg")),
+    "a plane without units": (
+        UR5,
+        _put("calibration", "contact_plane", "centre", to=[1.0, 2.0, 3.0]),
+    ),
+    "ages in hours": (UR5, _put("calibration", "max_age", to={"lens": "3 h"})),
+    "an age without a unit": (UR5, _put("calibration", "max_age", to={"lens": 3})),
+    "unknown key in a file that extends": (NOISY, _put("mock", "event_camera", "nose_hz", to=1)),
+    "wrong value in a file that extends": (NOISY, _put("mock", "event_camera", "noise_hz", to=-1)),
+    "a file that extends a list": (NOISY, _put("extends", to=["mock.yaml"])),
+    "an unknown fault": (NOISY, _put("mock", "faults", to=[{"kind": "earthquake"}])),
+}
+
+
+@pytest.mark.parametrize(("data", "at_to"), WRONG_RIGS.values(), ids=WRONG_RIGS.keys())
+def test_wrong_rig_files_are_refused(data: Any, at_to: tuple[tuple[Any, ...], Any]) -> None:
+    assert not CHECKERS["rig"].is_valid(_set(data, *at_to))
+
+
+def test_only_a_file_that_extends_may_leave_keys_out() -> None:
+    assert CHECKERS["rig"].is_valid(NOISY)
+    assert not CHECKERS["rig"].is_valid({k: v for k, v in NOISY.items() if k != "extends"})
+
+
+def test_keys_are_explained() -> None:
+    """An editor shows what stands below a field in the models, by the key a file has."""
+    models = file_schema("protocol")["$defs"]
+    told = models["Training"]["properties"]["patience"]["description"]
+    assert told.startswith("Epochs without a better validation accuracy")
+    assert models["Range"]["properties"].keys() == {"from", "to", "step"}
+
+
+def test_the_command_prints_and_writes_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from flows.cli import app
+
+    out = tmp_path / "rig.json"
+    assert not app(["schema", "rig", "--out", str(out)], standalone_mode=False)
+    assert json.loads(out.read_text()) == file_schema("rig")
+    capsys.readouterr()
+    assert not app(["schema", "protocol"], standalone_mode=False)
+    assert json.loads(capsys.readouterr().out) == file_schema("protocol")
+    with pytest.raises(InputError, match="must be one of protocol, rig"):
+        app(["schema", "store"], standalone_mode=False)
