@@ -1,0 +1,89 @@
+"""The printed commands that take no hardware and no minutes are run, on a store with one trial.
+
+`test_commands.py` has looked at all of them; the tutorial runs those that train and evaluate.
+"""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from protocols.plan import load_plan
+from rigs.rig_file import load_rig_file
+from tests.conftest import ROOT
+from tests.docs.blocks import PAGES, Command, commands
+from tests.docs.walk import run
+
+ORDER = (
+    "plan", "schema", "rigs", "check", "trials", "verify", "migrate", "sync", "teach", "calibrate",
+    "export", "import", "push", "pull", "skip", "again",
+)  # fmt: skip
+"""What is cheap, in an order in which each finds what it needs."""
+ELSEWHERE = ("--rig loopback", "--dask", "s3://", "--follow", "KIND", "lab-pickles", "--help")
+"""Needs a rig in real time, other machines or a running campaign, or stands for a word."""
+
+
+def test_cheap_commands_run_as_printed(tmp_path: Path) -> None:
+    for folder in ("protocols", "rigs", "docs"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    (tmp_path / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
+    begun = "sliplab collect protocols/pilot.yaml --rig rehearsal --store data --trials 1"
+    assert run(begun, tmp_path).code == 0
+    # what exchange.md takes in
+    assert run("sliplab export data pilot --format aedat4 --output recordings", tmp_path).code == 0
+
+    trials = [trial.id for trial in load_plan(ROOT / "protocols" / "pilot.yaml")]
+    wanted = sorted(
+        {_filled(command, tmp_path, trials) for page in PAGES for command in commands(page)} - {""},
+        key=lambda line: (_place(line), line),
+    )
+    assert len(wanted) > 25
+    failed = []
+    for line in wanted:
+        done = run(line, tmp_path)
+        if done.code != 0:
+            failed.append(f"{line}: exit {done.code}\n{done.out}{done.said}")
+    assert not failed, "\n".join(failed)
+
+
+def _place(line: str) -> int:
+    word = line.split()[1]
+    return ORDER.index("pull" if word == "verify" and "file://" in line else word)
+
+
+def _filled(command: Command, folder: Path, trials: list[str]) -> str:
+    """The line to run, with names in place of what stands for them; empty if it is not run."""
+    name, *words = command.words
+    line = " ".join(words)
+    if name != "sliplab" or len(words) < 2 or words[0] not in ORDER:
+        return ""
+    if any(part in line for part in ELSEWHERE):
+        return ""
+    moves = words[0] == "teach" or words[:2] in (["calibrate", "lens"], ["calibrate", "crop"])
+    if moves and "--dry-run" not in words:
+        return ""
+    if not command.fenced and not any(word.isupper() or "/" in word for word in words):
+        return ""  # named in prose, without what it works on
+    if words[-1] == "--why" or command.page.name == "tutorial.md":
+        return ""
+    names = {
+        "PROTOCOL": "protocols/pilot.yaml",
+        "FILE": "rehearsal" if words[0] == "rigs" else "protocols/pilot.yaml",
+        "FILE.pdf": "board.pdf",
+        "RIG": "rehearsal",
+        "STORE": "data",
+        "DIR": "out" if words[0] == "export" else "data",
+        "WHAT": "pilot",
+        "PATH": "recordings/",
+        "NAME": "others",
+        "TRIAL": trials[-1],
+        "ID": trials[-1],
+        "TEXT": "a reason",
+        "N": "1",
+        "EXPR": "depth_mm < 3",
+        "URL": f"file://{folder}/shelf",
+        "COPY": "copy",
+    }
+    if words[0] == "pull":
+        names["STORE"] = "copy"
+    return shlex.join([name, *(names.get(word, word) for word in words)])
