@@ -129,6 +129,10 @@ def over_trials(
                 name, (first - 0.5, 1.0), xycoords=("data", "axes fraction"), fontsize=8,
                 color=GREY, xytext=(3, 3), textcoords="offset points",
             )  # fmt: skip
+        # whole trials: round a single one the names would be far outside, and nothing fit
+        numbers = [x for panel in panels for _, xs, _ in panel.series.values() for x in xs]
+        if numbers:
+            grid[-1, 0].set_xlim(min(campaigns.values()) - 0.5, max(numbers) + 0.5)
         grid[-1, 0].set_xlabel("trial, in the order taken")
         grid[-1, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
         if handles:
