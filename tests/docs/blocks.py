@@ -135,9 +135,7 @@ def _without_brackets(text: str) -> list[str]:
         return [text]
     before, after = text[: match.start()], text[match.end() :]
     return [
-        line
-        for inside in ("", match[1])
-        for line in _without_brackets(f"{before}{inside}{after}")
+        line for inside in ("", match[1]) for line in _without_brackets(f"{before}{inside}{after}")
     ]
 
 

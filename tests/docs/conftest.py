@@ -1,5 +1,40 @@
-"""Prefect at home in a folder of the tests, before anything imports it."""
+"""A checkout to work in as the how-to guides do, with a store of two trials."""
 
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+# Prefect at home in a folder of the tests, before anything imports it
 from tests.flows.conftest import rig_path
 
 __all__ = ["rig_path"]
+
+PACKAGES = ("protocols", "rigs", "storage", "analysis", "flows")
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that `checkout` copies."""
+    from tests.docs.walk import run
+
+    folder = tmp_path_factory.mktemp("checkout")
+    for package in PACKAGES:  # with what is compiled already
+        shutil.copytree(ROOT / package, folder / package)
+    line = "sliplab collect protocols/pilot.yaml --rig rehearsal --store data --trials 2"
+    done = run(line, folder)
+    assert done.code == 0, done.said
+    return folder
+
+
+@pytest.fixture
+def checkout(prepared: Path, tmp_path: Path) -> Path:
+    """The packages and a store `data` that holds two trials of the pilot."""
+    folder = tmp_path / "checkout"
+    shutil.copytree(prepared, folder)
+    (folder / "docs").symlink_to(ROOT / "docs")
+    return folder

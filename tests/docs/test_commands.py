@@ -28,7 +28,9 @@ MAKEFILES = {"docs/sync-box.md": "rigs/firmware/Makefile"}
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_every_printed_command_is_one_that_there_is(page: Path) -> None:
     wrong = [
-        f"{command}: {fault}" for command in commands(page) if (fault := _fault(command)) is not None
+        f"{command}: {fault}"
+        for command in commands(page)
+        if (fault := _fault(command)) is not None
     ]
     assert not wrong, "\n".join(wrong)
 

@@ -1,4 +1,4 @@
-"""The printed commands that take no hardware and no minutes are run, on a store with one trial.
+"""The printed commands that take no hardware and no minutes are run, on a store with two trials.
 
 `test_commands.py` has looked at all of them; the tutorial runs those that train and evaluate.
 """
@@ -23,24 +23,20 @@ ELSEWHERE = ("--rig loopback", "--dask", "s3://", "--follow", "KIND", "lab-pickl
 """Needs a rig in real time, other machines or a running campaign, or stands for a word."""
 
 
-def test_cheap_commands_run_as_printed(tmp_path: Path) -> None:
-    for folder in ("protocols", "rigs", "docs"):
-        (tmp_path / folder).symlink_to(ROOT / folder)
-    (tmp_path / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
-    begun = "sliplab collect protocols/pilot.yaml --rig rehearsal --store data --trials 1"
-    assert run(begun, tmp_path).code == 0
+def test_cheap_commands_run_as_printed(checkout: Path) -> None:
+    (checkout / "lab.yaml").write_text(load_rig_file(Path("rehearsal"))[1])
     # what exchange.md takes in
-    assert run("sliplab export data pilot --format aedat4 --output recordings", tmp_path).code == 0
+    assert run("sliplab export data pilot --format aedat4 --output recordings", checkout).code == 0
 
     trials = [trial.id for trial in load_plan(ROOT / "protocols" / "pilot.yaml")]
     wanted = sorted(
-        {_filled(command, tmp_path, trials) for page in PAGES for command in commands(page)} - {""},
+        {_filled(command, checkout, trials) for page in PAGES for command in commands(page)} - {""},
         key=lambda line: (_place(line), line),
     )
     assert len(wanted) > 25
     failed = []
     for line in wanted:
-        done = run(line, tmp_path)
+        done = run(line, checkout)
         if done.code != 0:
             failed.append(f"{line}: exit {done.code}\n{done.out}{done.said}")
     assert not failed, "\n".join(failed)

@@ -107,7 +107,7 @@ def _compare(shown: list[str], done: Done, place: str, *, digits: bool) -> None:
     left = [line for line in _lines(shown, digits) if line not in said]
     if not left:
         return
-    pattern = "\n".join(".*" if line == "..." else re.escape(line) for line in left)
+    pattern = "\n".join(re.escape(line).replace(r"\.\.\.", ".*") for line in left)
     printed = "\n".join(_lines(done.out.splitlines(), digits))
     assert re.fullmatch(pattern, printed, re.DOTALL), (
         f"{place} shows\n" + "\n".join(left) + "\nand printed\n" + printed + "\n" + done.said
