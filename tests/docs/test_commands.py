@@ -17,7 +17,7 @@ from typer.exceptions import TyperException
 
 from flows.cli import app
 from tests.conftest import ROOT
-from tests.docs.blocks import PAGES, Command, commands
+from tests.docs.blocks import PAGES, Command, blocks, commands
 
 ROOT_COMMAND: Any = typer.main.get_command(app)
 NUMBERS = {"N": "1", "P": "8000", "S": "1", "MS": "1"}
@@ -39,9 +39,9 @@ def _fault(command: Command) -> str | None:
     name, *rest = command.words
     if name == "make":
         return _make_fault(command.page, rest)
-    if name == "python":
-        return _python_fault(rest)
-    return _sliplab_fault(rest, command.fenced)
+    if name == "python" and rest[:2] != ["-m", "flows"]:
+        return _python_fault(command.page, rest)
+    return _sliplab_fault(rest[2:] if name == "python" else rest, command.fenced)
 
 
 def _sliplab_fault(words: Sequence[str], whole: bool) -> str | None:
@@ -67,9 +67,10 @@ def _sliplab_fault(words: Sequence[str], whole: bool) -> str | None:
     return None
 
 
-def _python_fault(words: Sequence[str]) -> str | None:
+def _python_fault(page: Path, words: Sequence[str]) -> str | None:
     if words[:1] != ["-m"]:
-        return None if (ROOT / words[0]).is_file() else "no such file"
+        written = {block.title for block in blocks(page)}
+        return None if words[0] in written or (ROOT / words[0]).is_file() else "no such file"
     module, rest = words[1], list(words[2:])
     if module == "benchmarks" and rest and not rest[0].startswith("-") and rest[0] != "NAME":
         if not (ROOT / "benchmarks" / f"{rest[0]}.py").is_file():
@@ -109,8 +110,9 @@ def test_wrong_commands_are_found(line: str, fault: str) -> None:
 
 
 def test_wrong_modules_and_targets_are_found() -> None:
-    assert _python_fault(["-m", "benchmarks", "nothing"]) == "no benchmark nothing"
-    assert _python_fault(["-m", "tests.nothing"]) == "no such module"
-    assert _python_fault(["-m", "tests.fuzz", "--fils", "3"]) == "no option --fils"
-    assert _python_fault(["docs/nothing.py"]) == "no such file"
-    assert _make_fault(ROOT / "README.md", ["nothing"]) == "no target nothing in Makefile"
+    page = ROOT / "README.md"
+    assert _python_fault(page, ["-m", "benchmarks", "nothing"]) == "no benchmark nothing"
+    assert _python_fault(page, ["-m", "tests.nothing"]) == "no such module"
+    assert _python_fault(page, ["-m", "tests.fuzz", "--fils", "3"]) == "no option --fils"
+    assert _python_fault(page, ["docs/nothing.py"]) == "no such file"
+    assert _make_fault(page, ["nothing"]) == "no target nothing in Makefile"

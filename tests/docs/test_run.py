@@ -1,6 +1,7 @@
 """The printed commands that take no hardware and no minutes are run, on a store with two trials.
 
-`test_commands.py` has looked at all of them; the tutorial runs those that train and evaluate.
+`test_commands.py` has looked at all of them; those of the tutorial and the how-to guides are run
+in their own order.
 """
 
 from __future__ import annotations
@@ -60,11 +61,12 @@ def _filled(command: Command, folder: Path, trials: list[str]) -> str:
         return ""
     if not command.fenced and not any(word.isupper() or "/" in word for word in words):
         return ""  # named in prose, without what it works on
-    if words[-1] == "--why" or command.page.name == "tutorial.md":
+    walked = command.page.name == "tutorial.md" or command.page.parent.name == "howto"
+    if words[-1] == "--why" or walked:
         return ""
     names = {
         "PROTOCOL": "protocols/pilot.yaml",
-        "FILE": "rehearsal" if words[0] == "rigs" else "protocols/pilot.yaml",
+        "FILE": {"rigs": "rehearsal", "plan": "protocols/pilot.yaml"}.get(words[0], "file.json"),
         "FILE.pdf": "board.pdf",
         "RIG": "rehearsal",
         "STORE": "data",
