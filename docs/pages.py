@@ -5,6 +5,7 @@ The command line, the keys of protocol and rig files, and the list of decisions.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from mkdocs.structure.files import File, Files
 from schema_tables import tables
 
 DOCS = Path(__file__).parent
+_ITEM = re.compile(r"(- |1\. )\S")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -34,6 +36,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, make in pages.items():
         files.append(File.generated(config, name, content=make()))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Begin a list where GitHub begins one: this Markdown wants an empty line before it."""
+    lines: list[str] = []
+    fenced = listed = False
+    for line in markdown.split("\n"):
+        fenced ^= line.lstrip().startswith("```")
+        begins = not fenced and _ITEM.match(line) is not None
+        if begins and not listed and lines and lines[-1].strip():
+            lines.append("")
+        listed = (listed or begins) and bool(line.strip())
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _records() -> list[Path]:
