@@ -75,14 +75,14 @@ def protocol_file() -> str:
 Every key that a protocol may have. [Write a protocol](../howto/write-a-protocol.md) says how they
 go together, and how an editor completes and checks them, by [its schema](../schema/protocol.json).
 
-{tables(schema, schema["$defs"])}"""
+{tables(schema, schema["definitions"])}"""
 
 
 def rig_file() -> str:
     """Every key of a rig file."""
     from flows.schema import file_schema
 
-    models = file_schema("rig")["$defs"]
+    models = file_schema("rig")["definitions"]
     return f"""# Rig files
 
 Every key that a rig file may have. A file that begins with `extends: OTHER.yaml` has those that

@@ -45,7 +45,7 @@ def _models_in(part: Schema, path: str, models: dict[str, Schema]) -> Iterator[t
     """The models that stand in a field, each with the place it has in the file."""
     if "$ref" in part:
         yield path, models[part["$ref"].rsplit("/", 1)[1]]
-    arms = [arm for word in ("anyOf", "oneOf") for arm in part.get(word, [])]
+    arms = [arm for word in ("anyOf", "oneOf", "allOf") for arm in part.get(word, [])]
     several = sum("$ref" in arm for arm in arms) > 1
     for arm in arms:
         for place, model in _models_in(arm, path, models):
@@ -80,11 +80,9 @@ def _value(part: Schema, path: str, models: dict[str, Schema]) -> str:
     if "anyOf" in part:
         return " or ".join(dict.fromkeys(_value(arm, path, models) for arm in part["anyOf"]))
     kind = part.get("type", "")
-    if kind == "array" and "prefixItems" in part:
-        inner = " or ".join(
-            dict.fromkeys(_value(item, path, models) for item in part["prefixItems"])
-        )
-        return f"list of {len(part['prefixItems'])}: {inner}"
+    if kind == "array" and isinstance(part.get("items"), list):
+        inner = " or ".join(dict.fromkeys(_value(item, path, models) for item in part["items"]))
+        return f"list of {len(part['items'])}: {inner}"
     if kind == "array":
         return f"list of: {_value(part.get('items', {}), path, models)}"
     if kind == "object":

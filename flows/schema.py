@@ -2,7 +2,7 @@
 
 They are made from the models that read the files, so they know the same keys. They know less than
 `sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level breaks,
-stands in the models alone.
+stands in the models alone. They are of draft 7, the newest that the YAML language server knows.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from rigs.rig_inheritance import KEY
 
 Kind = Literal["protocol", "rig"]
 Schema = dict[str, Any]
+_DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"
 
 
@@ -41,7 +42,7 @@ class _Described(GenerateJsonSchema):
 
 
 def file_schema(kind: Kind) -> Schema:
-    """The JSON Schema (2020-12) of a protocol file or a rig file, as plain data."""
+    """The JSON Schema (draft 7) of a protocol file or a rig file, as plain data."""
     return _protocol_schema() if kind == "protocol" else _rig_schema()
 
 
@@ -52,7 +53,7 @@ def _protocol_schema() -> Schema:
 def _rig_schema() -> Schema:
     """A file with `extends` may leave out what it takes over, at any depth."""
     whole = _made(RigFile)
-    models: Schema = {**whole.pop("$defs"), "RigFile": whole}
+    models: Schema = {**whole.pop("definitions"), "RigFile": whole}
     parts = {f"{name}{_PART}": _partial(model) for name, model in models.items()}
     parts[f"RigFile{_PART}"]["properties"][KEY] = {
         "type": "string",
@@ -62,25 +63,28 @@ def _rig_schema() -> Schema:
     schema = {
         "type": "object",
         "if": {"required": [KEY]},
-        "then": {"$ref": f"#/$defs/RigFile{_PART}"},
-        "else": {"$ref": "#/$defs/RigFile"},
-        "$defs": models | parts,
+        "then": {"$ref": f"#/definitions/RigFile{_PART}"},
+        "else": {"$ref": "#/definitions/RigFile"},
+        "definitions": models | parts,
     }
     return _finished(schema, "A rig file of SlipLab")
 
 
 def _made(model: type[BaseModel]) -> Schema:
-    return model.model_json_schema(schema_generator=_Described, ref_template="#/$defs/{model}")
+    made = model.model_json_schema(
+        schema_generator=_Described, ref_template="#/definitions/{model}"
+    )
+    made["definitions"] = made.pop("$defs")
+    plain: Schema = _plain(made)
+    return plain
 
 
 def _finished(schema: Schema, title: str) -> Schema:
-    plain: Schema = _plain(schema)
-    plain.pop("title", None)
-    return {"$schema": GenerateJsonSchema.schema_dialect, "title": title, **plain}
+    return {"$schema": _DIALECT, **schema, "title": title}
 
 
 def _plain(part: Any) -> Any:
-    """Without what other formats than JSON Schema know, and whole sections as defaults."""
+    """In the words of draft 7, without whole sections as defaults."""
     if isinstance(part, list):
         return [_plain(item) for item in part]
     if not isinstance(part, dict):
@@ -88,6 +92,10 @@ def _plain(part: Any) -> Any:
     left = {key: _plain(value) for key, value in part.items() if key != "discriminator"}
     if isinstance(left.get("default"), dict):
         left.pop("default")
+    if "prefixItems" in left:
+        left |= {"items": left.pop("prefixItems"), "additionalItems": False}
+    if "$ref" in left and len(left) > 1:  # else what stands beside it would not count
+        left["allOf"] = [{"$ref": left.pop("$ref")}]
     return left
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
+from tests.docs.blocks import blocks
 from tests.docs.walk import walk
 
 GUIDES = sorted((ROOT / "docs" / "howto").glob("[a-z]*-*.md"))
@@ -15,6 +16,21 @@ GUIDES = sorted((ROOT / "docs" / "howto").glob("[a-z]*-*.md"))
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
 def test_the_guide_works_as_printed(guide: Path, checkout: Path) -> None:
     assert walk(guide, checkout) >= 1
+
+
+@pytest.mark.parametrize("page", ["protocols", "storage"])
+def test_the_references_examples_run(
+    page: str, checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(checkout)
+    examples = [
+        block
+        for block in blocks(ROOT / "docs" / "reference" / f"{page}.md")
+        if block.language == "python"
+    ]
+    assert examples
+    for example in examples:
+        exec(compile(example.text, f"{page}.md", "exec"), {})
 
 
 def test_there_is_a_guide_for_each_question() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from jsonschema import Draft202012Validator
+from jsonschema import Draft7Validator
 
 from flows.schema import Kind, file_schema
 from protocols.errors import InputError
@@ -27,7 +27,7 @@ FILES: list[tuple[Kind, Path]] = [
 ]
 MODELS: dict[Kind, type[StrictModel]] = {"protocol": Protocol, "rig": RigFile}
 KINDS: tuple[Kind, ...] = ("protocol", "rig")
-CHECKERS = {kind: Draft202012Validator(file_schema(kind)) for kind in KINDS}
+CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
 
 
 def _read(path: Path) -> Any:
@@ -46,7 +46,7 @@ def _plain(part: Any) -> Any:
 @pytest.mark.parametrize("kind", KINDS)
 def test_schemas_are_schemas_and_published_as_they_are(kind: Kind) -> None:
     made = file_schema(kind)
-    Draft202012Validator.check_schema(made)
+    Draft7Validator.check_schema(made)
     published = (ROOT / "docs" / "schema" / f"{kind}.json").read_text()
     assert published == json_text(made), f"run: sliplab schema {kind} --out docs/schema/{kind}.json"
 
@@ -180,7 +180,7 @@ def test_only_a_file_that_extends_may_leave_keys_out() -> None:
 
 def test_keys_are_explained() -> None:
     """An editor shows what stands below a field in the models, by the key a file has."""
-    models = file_schema("protocol")["$defs"]
+    models = file_schema("protocol")["definitions"]
     told = models["Training"]["properties"]["patience"]["description"]
     assert told.startswith("Epochs without a better validation accuracy")
     assert models["Range"]["properties"].keys() == {"from", "to", "step"}

@@ -71,6 +71,7 @@ def walk(page: Path, folder: Path) -> int:
     A block with a title is a file, or (``diff``) a change to one. A console block is run, and what
     it shows is held against what is printed: ``...`` stands for anything, and after
     ``<!-- test: digits -->`` numbers may differ. ``<!-- test: skip -->`` leaves a block out.
+    ``/SHARED/`` is a folder in `folder`.
     """
     count = 0
     for block in blocks(page):
@@ -80,6 +81,7 @@ def walk(page: Path, folder: Path) -> int:
             _write(folder / block.title, block)
         elif block.language == "console":
             for number, line, shown in steps(block):
+                line = line.replace("/SHARED/", f"{folder}/shared/")
                 done = run(re.sub(r"\s#( .*)?$", "", line), folder)
                 place = f"{page.name}:{number}: {line}"
                 wanted = 2 if any(text.startswith("error:") for text in shown) else 0
