@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, NullLocator
 
 from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
 
@@ -60,6 +61,9 @@ def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated:
             axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
             if panel.log_x:
                 axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter("{x:g}")
+                axes.xaxis.set_minor_locator(NullLocator())
             axes.margins(0.06)
         handles, names = grid.flat[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=8)

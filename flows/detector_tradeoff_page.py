@@ -39,21 +39,26 @@ PANELS = (
         "mean_ms", "false_early_either", "mean incipient latency (ms)", "false early trials (%)"
     ),
     Panel(
-        "synaptic_operations_per_s", "strict", "synaptic operations a second",
+        "synaptic_operations_per_s", "strict", "synaptic operations/s (million)",
         "strict accuracy (%)", True,
     ),
     Panel(
-        "synaptic_operations_per_s", "mean_ms", "synaptic operations a second",
+        "synaptic_operations_per_s", "mean_ms", "synaptic operations/s (million)",
         "mean incipient latency (ms)", True,
     ),
     Panel(
-        "us_per_s", "p95_ms", "computing time (µs a second, one thread)",
+        "us_per_s", "p95_ms", "computing time (ms a second, one thread)",
         "95th percentile latency (ms)", True,
     ),
-    Panel("us_per_s", "missed_either", "computing time (µs a second, one thread)",
+    Panel("us_per_s", "missed_either", "computing time (ms a second, one thread)",
           "missed trials (%)", True),
 )  # fmt: skip
-SHARES = ("strict", "false_early_either", "missed_either")
+DRAWN = {
+    **dict.fromkeys(("strict", "false_early_either", "missed_either"), 100.0),
+    "us_per_s": 1e-3,
+    "synaptic_operations_per_s": 1e-6,
+}
+"""By what figures are multiplied in the plots."""
 
 
 def render(result: Mapping[str, Any]) -> str:
@@ -164,9 +169,9 @@ def _short_list(result: Mapping[str, Any]) -> Section:
 def _plots(result: Mapping[str, Any]) -> Section:
     def values(row: Row) -> dict[str, float | None]:
         found = {name: objective(row, name) for name in OBJECTIVES}
-        for name in SHARES:
+        for name, scale in DRAWN.items():
             value = found[name]
-            found[name] = None if value is None else 100 * value
+            found[name] = None if value is None else scale * value
         return found
 
     points = [Point(values(row), row["front"], row["paper"]) for row in result["rows"]]

@@ -27,7 +27,7 @@ MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(2.0))
 LOOSE = 0.1
 """Share of validation trials that the looser choice may leave false early, for either onset."""
-RULES = ("paper's", "chosen", f"chosen, {LOOSE:.0%}")
+RULES = ("paper's", "chosen", f"chosen, {100 * LOOSE:g} %")
 """The paper's pair; that of validation trials at the protocol's share, and at the looser one."""
 
 OBJECTIVES = {
