@@ -13,6 +13,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
     "#0072B2",
@@ -22,6 +23,8 @@ BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
     "#CC79A7",
     "#666666",
 )
+_DPI = 150
+"""Of what is rasterised."""
 STYLE = {
     "font.size": 9,
     "font.family": "DejaVu Sans",
@@ -32,7 +35,6 @@ STYLE = {
     "legend.frameon": False,
     "svg.hashsalt": "sliplab",
     "svg.fonttype": "none",
-    "savefig.dpi": 150,
     "figure.constrained_layout.use": True,
 }
 
@@ -42,7 +44,9 @@ def svg_text(figure: Any, simulated: bool) -> str:
     if simulated:
         figure.suptitle("simulated", x=0.995, ha="right", fontsize=8, color=GREY, style="italic")
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    figure.set_dpi(_DPI)
+    # savefig would give the same, and draw everything twice
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     plt.close(figure)
     text = buffer.getvalue()
     return text[text.index("<svg") :]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
 from analysis.figures_conditions import WIDTH
@@ -147,6 +147,7 @@ def label_uncertainty(
         grid[0][-1].set_xlabel("width of its 95 % interval (ms)")
         for axes in grid[0]:
             axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())  # laying out empty texts takes long
             axes.set_ylim(0, 103)
             axes.axvline(10, color=GREY, lw=0.8, ls=":")
             axes.annotate(

@@ -187,7 +187,7 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     assert "incipient detected late" in table.rows[0][1]
     assert "gross missed" in table.rows[0][1]
     command = f"sliplab view {store.folder.resolve()} a=1,r=1 --campaign {row['campaign']}"
-    assert table.rows[0][-1] == command  # two campaigns have this trial
+    assert table.rows[0][0] == command  # two campaigns have this trial
     assert found.text[0].startswith("2 of 3 judged trials failed")
     many = section(store, {"trials": [row] * (MOST + 1)})
     assert len(many.tables[0].rows) == MOST
