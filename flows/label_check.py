@@ -16,7 +16,7 @@ from analysis import labelling
 from flows.campaigns import collected
 from flows.collect import collect
 from flows.label import label
-from flows.label_errors import rules_compared
+from flows.label_errors import CHECK, rules_compared
 from flows.orders import Order, make_order
 from protocols.yaml_file import parse_yaml
 from rigs.rig_inheritance import rig_yaml
@@ -24,14 +24,13 @@ from storage.derived import Derived, make_key
 from storage.files import write_text
 from storage.store import Store
 
-STEP = "label-check"
 VERSION = 1
 TRIALS = 60
 
 
 def folder_of(order: Order) -> Path:
     """The store with the video."""
-    return order.store / STEP
+    return order.store / CHECK
 
 
 def video_order(order: Order, trials: int) -> Order:
@@ -67,16 +66,10 @@ def check_labels(order: Order, trials: int = TRIALS) -> dict[str, Any]:
     campaigns = collected(store, [video.campaign])
     label(store, campaigns)
     made_of = [recording.checksum for _, recording in campaigns[0].trials]
-    key = make_key(STEP, VERSION, [made_of, labelling.VERSION], None)
-    kept = Derived.of(Store.open(order.store), STEP)
-    stale = not kept.fresh(STEP, key)
+    key = make_key(CHECK, VERSION, [made_of, labelling.VERSION], None)
+    kept = Derived.of(Store.open(order.store), CHECK)
+    stale = not kept.fresh(CHECK, key)
     if stale:
         figures = rules_compared(store, campaigns)
-        kept.write(STEP, key, {"trials": len(made_of), "simulated": True, "rules_ms": figures})
-    return {"step": STEP, "done": taken or int(stale), "fresh": len(made_of) - taken}
-
-
-def read_check(store: Store) -> dict[str, Any] | None:
-    """The figures of the last check; None where there was none."""
-    kept = Derived.of(store, STEP)
-    return kept.read(STEP) if kept.key(STEP) is not None else None
+        kept.write(CHECK, key, {"trials": len(made_of), "simulated": True, "rules_ms": figures})
+    return {"step": CHECK, "done": taken or int(stale), "fresh": len(made_of) - taken}

@@ -12,6 +12,8 @@ from storage.derived import Derived
 from storage.store import Store
 
 KINDS = ("incipient", "gross")
+CHECK = "label-check"
+"""The step of `flows.label_check`, and where its own store stands."""
 _TRUTH = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
@@ -110,3 +112,9 @@ def _cases(store: Store, campaigns: list[Collected]) -> Any:
                 for kind in KINDS:
                     true = None if truth is None else truth.get(keys[kind])
                     yield rule, kind, label, true[centre] if isinstance(true, list) else true
+
+
+def read_check(store: Store) -> dict[str, Any] | None:
+    """The figures of the last check; None where there was none."""
+    kept = Derived.of(store, CHECK)
+    return kept.read(CHECK) if kept.key(CHECK) is not None else None

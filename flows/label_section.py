@@ -56,6 +56,8 @@ def section(
             f"{number(papillae['median_abs'], 2, 'ms')} off in the median, and its 95 % interval "
             f"holds the truth in {percent(papillae['coverage'])} of them."
         )
+    if (check := summary["labels"]["check"]) is not None:
+        said.append(_checked(check))
     columns = (
         "difference", "onset", "trials", "median (ms)", "median distance (ms)", "largest (ms)"
     )  # fmt: skip
@@ -64,6 +66,22 @@ def section(
         said,
         [_figure(store, campaigns, simulated)],
         [Table(columns, rows, "One frame is 10 ms."), *_doubted(store, campaigns)],
+    )
+
+
+def _checked(check: dict[str, Any]) -> str:
+    """What video does to the labels of trials that were taken as tracks."""
+    rules = check["rules_ms"]
+    paper, papillae = rules["paper"], rules["papillae"]
+    far = {kind: number(paper[kind]["median_abs"], 2, "ms") for kind in KINDS}
+    return (
+        f"{check['trials']} slides were taken again on the same simulated rig with the video drawn "
+        f"and tracked: there the paper's rule is {far['incipient']} (incipient) and {far['gross']} "
+        f"(gross) off the true crossing in the median, at most "
+        f"{number(paper['incipient']['max_abs'], 1, 'ms')} and "
+        f"{number(paper['gross']['max_abs'], 1, 'ms')}; the change point of {papillae['n']} papilla "
+        f"slips is {number(papillae['median_abs'], 2, 'ms')} off, and its interval holds the truth "
+        f"in {percent(papillae['coverage'])} of them."
     )
 
 

@@ -14,7 +14,7 @@ from prefect import flow
 
 from analysis import model_file
 from analysis import report as page
-from flows import evaluate, sections, timing
+from flows import evaluate, label_errors, sections, timing
 from flows import report_against_page as against_page
 from flows.campaigns import Collected
 from flows.orchestration import Parcel, run
@@ -58,7 +58,8 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
     clocks = (report_folder(store) / CLOCKS).exists()
     # commands in the page name the store's folder
     where = str(store.folder.resolve())
-    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store), where]
+    checked = Derived.of(store, label_errors.CHECK).key(label_errors.CHECK)
+    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store), checked, where]
     return make_key(STEP, VERSION, inputs, None)
 
 

@@ -14,6 +14,7 @@ from flows.collect import collect
 from flows.evaluate import evaluate
 from flows.label import label
 from flows.label_check import check_labels
+from flows.label_errors import CHECK
 from flows.orders import Order
 from flows.report import report
 from flows.study_ledger import Ledger, Row
@@ -67,7 +68,7 @@ def study(orders: list[Order], check: int = 0) -> Outcome:
     run("sync", lambda: sync(store, campaigns), "trials")
     run("label", lambda: label(store, campaigns), "trials")
     if check:
-        run(label_check.STEP, lambda: check_labels(orders[0], check), "trials")
+        run(CHECK, lambda: check_labels(orders[0], check), "trials")
     run("train", lambda: train(store, campaigns), "networks")
     run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
     run("report", lambda: report(store, campaigns), "pages")
@@ -88,7 +89,7 @@ def expected(orders: list[Order], check: int) -> dict[str, float]:
         seconds[f"collect {order.campaign}"] = taken
     seconds["sync"], seconds["label"] = SYNC_S * trials, labelled
     if check:
-        seconds[label_check.STEP] = (COLLECT_S["video"] + LABEL_S["video"]) * check
+        seconds[CHECK] = (COLLECT_S["video"] + LABEL_S["video"]) * check
     seconds["train"] = _training_s(orders)
     return {**seconds, "evaluate": EVALUATE_S, "report": REPORT_S}
 

@@ -10,6 +10,7 @@ from flows import timing
 from flows.campaign_section import reference_rows, wear
 from flows.campaigns import Collected, training_campaigns
 from flows.estimate import plan_bytes
+from flows.label_errors import read_check
 from flows.report_trials import accounted, intervals, told
 from flows.window_baselines import EVALUATION, beside
 from flows.window_scores import window_intervals
@@ -77,6 +78,7 @@ def make_summary(
             "rules_ms": evaluation["label_rules_ms"],
             "source": _sources(campaigns),
             "reviewed": evaluation.get("reviewed"),
+            "check": read_check(store),
         },
         "detection": evaluation["detection"],
         "choices": evaluation["choices"],

@@ -20,7 +20,8 @@ from flows import trial_work, window_baselines, window_checks
 from flows.campaigns import collected, training_campaigns
 from flows.collect import collect
 from flows.evaluate import evaluate
-from flows.label_check import check_labels, folder_of, read_check, wanted
+from flows.label_check import check_labels, folder_of, wanted
+from flows.label_errors import read_check
 from flows.orders import Order, make_order
 from flows.report import read_summary, report
 from flows.reviewed import Labels
