@@ -79,8 +79,8 @@ def _checked(check: dict[str, Any]) -> str:
         f"and tracked: there the paper's rule is {far['incipient']} (incipient) and {far['gross']} "
         f"(gross) off the true crossing in the median, at most "
         f"{number(paper['incipient']['max_abs'], 1, 'ms')} and "
-        f"{number(paper['gross']['max_abs'], 1, 'ms')}; the change point of {papillae['n']} papilla "
-        f"slips is {number(papillae['median_abs'], 2, 'ms')} off, and its interval holds the truth "
+        f"{number(paper['gross']['max_abs'], 1, 'ms')}; the change point of {papillae['n']} "
+        f"papilla slips is {number(papillae['median_abs'], 2, 'ms')} off, and its interval holds the truth "
         f"in {percent(papillae['coverage'])} of them."
     )
 
