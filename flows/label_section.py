@@ -80,8 +80,8 @@ def _checked(check: dict[str, Any]) -> str:
         f"(gross) off the true crossing in the median, at most "
         f"{number(paper['incipient']['max_abs'], 1, 'ms')} and "
         f"{number(paper['gross']['max_abs'], 1, 'ms')}; the change point of {papillae['n']} "
-        f"papilla slips is {number(papillae['median_abs'], 2, 'ms')} off, and its interval holds the truth "
-        f"in {percent(papillae['coverage'])} of them."
+        f"papilla slips is {number(papillae['median_abs'], 2, 'ms')} off, and its interval holds "
+        f"the truth in {percent(papillae['coverage'])} of them."
     )
 
 
