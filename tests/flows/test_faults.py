@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from flows.__main__ import main
 from flows.session import Session
 from rigs.capabilities import ArmFault, RigError
 from storage.files import disk_full, read_json, write_json
 from storage.store import Campaign, Store, StoreError
 from storage.verify import verify
+from tests.flows.test_cli import sliplab
 from tests.flows.test_session import checksums, session, short, take_all
 
 TRACKS = {"level": "tracks"}
@@ -107,21 +107,15 @@ def test_a_full_disk_is_known_through_what_it_caused() -> None:
     assert not disk_full(None)
 
 
-def test_collect_says_which_disk_is_full_and_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_collect_says_which_disk_is_full_and_goes_on(tmp_path: Path) -> None:
     _, campaign = begin(tmp_path, [{"kind": "disk_full", "trial": 2, "at_s": 0.7}])
     store = tmp_path / "store"
-    files = {"--rig": tmp_path / "rig.yaml", "--store": store}
-    options = [str(part) for option in files.items() for part in option]
-    monkeypatch.setattr("sys.argv", ["sliplab", "collect", str(tmp_path / "p.yaml"), *options])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    said = capfd.readouterr().err
+    protocol, rig = tmp_path / "p.yaml", tmp_path / "rig.yaml"
+    ended = sliplab("collect", protocol, "--rig", rig, "--store", store)
+    assert ended.returncode == 1
     # a terminal's lines break anywhere
-    assert f"error:{store}/campaigns/tiny:itsdiskisfull" in "".join(said.split())
-    assert "Traceback" not in said
+    assert f"error:{store}/campaigns/tiny:itsdiskisfull" in "".join(ended.stderr.split())
+    assert "Traceback" not in ended.stderr
     committed = list((campaign.folder / "trials").iterdir())
     times = {path: path.stat().st_mtime_ns for path in committed}
     assert len(committed) == 1
