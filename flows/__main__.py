@@ -10,14 +10,14 @@ from pathlib import Path
 import typer
 from typer.exceptions import TyperException
 
-from flows import console, stopping
-from flows.cli import app
+from flows import console, garbage, stopping
 from protocols.errors import InputError
 from storage.errors import StoreError, disk_error
 
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
+    garbage.seldom()
     with stopping.signals():
         code = _run()
     sys.exit(code)
@@ -25,6 +25,8 @@ def main() -> None:
 
 def _run() -> int:
     try:
+        from flows.cli import app
+
         code = app(standalone_mode=False)
         if code == console.INTERRUPTED:
             return _interrupted()

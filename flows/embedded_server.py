@@ -24,6 +24,8 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+from flows import garbage
+
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 LEAN = {
@@ -146,6 +148,7 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     """Be the server until told to end, or until the parent dies."""
     if not die_with(parent):
         return  # it died before it could be watched
+    garbage.seldom()
     import uvicorn
     from prefect.server.api.server import create_app
 
