@@ -21,6 +21,7 @@ from flows.cli_common import (
 from flows.cli_control import register as register_control
 from flows.cli_detect import register as register_detect
 from flows.cli_exchange import register as register_exchange
+from flows.cli_guesses import register as register_guesses
 from flows.cli_models import register as register_models
 from flows.cli_review import register as register_review
 from flows.cli_rigs import rigs
@@ -148,6 +149,7 @@ def collect(
 
 cli_steps.register(app)
 register_tradeoff(app)
+register_guesses(app)
 cli_chain.register(app)
 cli_store.register(app)
 cli_remote.register(app)

@@ -14,7 +14,7 @@ from prefect.cache_policies import NO_CACHE
 from flows import console, stopping
 from flows.boundary import carry_out, refuse_paused
 from flows.orchestration import Parcel, run
-from flows.orders import Order, campaign_counts, check_disk, pending_trials
+from flows.orders import Order, campaign_counts, check_disk
 from flows.remaining import Remaining
 from flows.session import Session
 from flows.showing import shown
@@ -86,7 +86,7 @@ def collect(order: Order) -> dict[str, Any]:
     if control.open_requests(store):  # whoever asked was killed before it was done
         with owned(store):
             carry_out(store)
-    if pending_trials(order.plan, store.campaign(order.campaign)):
+    if order.wanted(store.campaign(order.campaign)):
         check_disk([order])
         return run(collect_flow, Parcel(order))
     return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

@@ -10,8 +10,6 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from analysis.dataset import SampleSet
-from analysis.detection import detect
-from analysis.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
 from analysis.smoothing_choice import settled
 from flows import counting
 from flows.campaigns import Collected, training_campaigns
@@ -24,6 +22,7 @@ from flows.reviewed import Labels
 from flows.samples import load_samples
 from flows.timing import timed
 from flows.train import Model, training_settings, wanted_models
+from flows.trial_scores import score_row, summaries
 from flows.window_scores import key_inputs, score_windows
 from protocols import Trial
 from protocols.settings import Detection
@@ -132,7 +131,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "seed": job.model.seed,
         "windows": score_windows(job, train, test),
         "trials": rows,
-        "experiments": _summaries(rows),
+        "experiments": summaries(rows),
         "label_error_ms": label_errors(job.store, job.campaigns),
         "label_rules_ms": rules_compared(job.store, job.campaigns),
         "reviewed": job.labels.states(job.campaigns),
@@ -147,31 +146,11 @@ def _score_trials(job: Job, detection: dict[str, Detection]) -> list[dict[str, A
     """One row a trial: onsets, detections, latency."""
     rows = []
     for item, trial, recording, _ in job.trials:
+        found = trial_counts(job.store, item.name, trial.id, detection[item.name])
         label = job.labels.read(item, recording)
-        settings = detection[item.name]
-        found = trial_counts(job.store, item.name, trial.id, settings)
-        detections = detect(found["counts"], found["end_ns"], settings)
-        row: dict[str, Any] = {
-            "campaign": item.name,
-            "experiment": item.experiment,
-            "trial": trial.id,
-            "condition": item.plan.describe(trial),
-            "incipient_ns": label["incipient_ns"],
-            "gross_ns": label["gross_ns"],
-            "detected_incipient_ns": detections.incipient_ns,
-            "detected_gross_ns": detections.gross_ns,
-            "latency": None,
-        }
-        if label["incipient_ns"] is not None and label["gross_ns"] is not None:
-            row["latency"] = asdict(
-                score_trial(
-                    detections,
-                    label["incipient_ns"],
-                    label["gross_ns"],
-                    round(settings.false_early_ms * 1e6),
-                )
-            )
-        rows.append(row)
+        rows.append(
+            score_row(item, trial, label, found["counts"], found["end_ns"], detection[item.name])
+        )
     return rows
 
 
@@ -181,21 +160,6 @@ def trial_counts(
     """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
     step = COUNTS if settings.stride_ms is None else heard_step(settings.stride_ms)
     return Derived.of(store, step, campaign).arrays(trial_id)
-
-
-def _summaries(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Latency and lead by experiment."""
-    result = {}
-    for experiment in ("kinematic", "gravity", "disturbance"):
-        ours = [row for row in rows if row["experiment"] == experiment]
-        scored = [TrialLatency(**row["latency"]) for row in ours if row["latency"] is not None]
-        result[experiment] = {
-            "trials": len(ours),
-            "without_onsets": len(ours) - len(scored),
-            "latency_ms": summarise_latency(scored),
-            "lead_ms": summarise_lead(scored),
-        }
-    return result
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)

@@ -44,10 +44,13 @@ class Order:
     """Trials that were asked for at most."""
     until: float | None = None
     """When the rig has to be free again, seconds since 1970; None for no such time."""
+    only: frozenset[str] | None = None
+    """Ids of the trials that may be taken; None for all."""
 
     def wanted(self, campaign: Campaign) -> list[Trial]:
         """Trials to take now, in the plan's order."""
-        return pending_trials(self.plan, campaign)[: self.most]
+        pending = pending_trials(self.plan, campaign)
+        return [t for t in pending if self.only is None or t.id in self.only][: self.most]
 
 
 def make_order(

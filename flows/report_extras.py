@@ -1,13 +1,14 @@
 """Results of other programs that the report takes up where they stand in the store.
 
     STORE/derived/generalisation/results.json   python -m benchmarks.generalisation
+    STORE/derived/guesses/results.json          sliplab guesses
     STORE/derived/tradeoff/tradeoff.json        sliplab tradeoff --scene
     STORE/derived/tradeoff/labels.json          python -m benchmarks labels --json
     STORE/derived/tradeoff/labels_truth.json    python -m benchmarks labels_truth --json
     STORE/report/detector_tradeoff.json         sliplab tradeoff --detector
 
-They take hours, so the report never makes them: it shows what is there, and says how to make what
-is not. None of them is checked for being fresh; what they were made of is theirs to say.
+They take minutes to hours, so the report never makes them: it shows what is there, and says how to
+make what is not. None of them is checked for being fresh; what they were made of is theirs to say.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ Json = dict[str, Any]
 
 FILES = {
     "generalisation": "derived/generalisation/results.json",
+    "guesses": "derived/guesses/results.json",
     "scene": "derived/tradeoff/tradeoff.json",
     "labels": "derived/tradeoff/labels.json",
     "labels_truth": "derived/tradeoff/labels_truth.json",
@@ -31,6 +33,7 @@ FILES = {
 
 COMMANDS = {
     "generalisation": "python -m benchmarks.generalisation {store} --out {folder}",
+    "guesses": "sliplab guesses {store}",
     "scene": "sliplab tradeoff --scene PROTOCOL --out {folder}",
     "labels": "python -m benchmarks labels --json > {file}",
     "labels_truth": "python -m benchmarks labels_truth --json > {file}",

@@ -13,6 +13,7 @@ from flows import (
     clock_words,
     detector_section,
     failures_section,
+    guesses_section,
     label_section,
     latency_section,
     others_section,
@@ -104,6 +105,7 @@ def make_sections(material: Material) -> list[Section]:
         label_section.section(store, campaigns, summary, simulated),
         clock_section.section(store, campaigns, summary, simulated),
         others_section.skins(store, extras.get("generalisation"), summary, simulated),
+        guesses_section.section(store, extras.get("guesses")) if simulated else None,
         others_section.tradeoff(store, extras),
         results.provenance(summary),
     ]

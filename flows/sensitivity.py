@@ -99,14 +99,14 @@ def measure_sensitivity(
     base = _outcome(_Job(rig, plan, trials), advance)
     jobs = {(OTHER_SEED, 0): _Job(rig, plan, trials, other_seed=True)}
     for name in CONTACT + CAMERA:
-        value = _value(rig.scene, name)
+        value = value_of(rig.scene, name)
         for k, factor in enumerate((1.0 - CHANGE, 1.0 + CHANGE)):
             if not value:
                 continue  # a rigid base, or something switched off
             new = value * factor
             if name.endswith("poisson_ratio"):
                 new = min(new, LARGEST_POISSON)
-            other = changed(rig, _nested(name, new))
+            other = changed(rig, nested(name, new))
             onsets = base.onsets_s if name in CAMERA else None
             jobs[name, k] = _Job(other, plan, trials, known_s=onsets)
     if each is None:
@@ -117,7 +117,7 @@ def measure_sensitivity(
     rows = [
         {
             "parameter": name,
-            "value": _value(rig.scene, name),
+            "value": value_of(rig.scene, name),
             "change": [changes.get((name, k)) for k in range(2)],
         }
         for name in CONTACT + CAMERA
@@ -213,16 +213,18 @@ def _mean(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(there.mean()) if len(there) else None
 
 
-def _value(mock: MockSettings, name: str) -> float | None:
+def value_of(mock: MockSettings, name: str) -> float | None:
+    """A setting of a simulated rig by its dotted name."""
     value: Any = mock
     for part in name.split("."):
         value = getattr(value, part)
     return None if value is None else float(value)
 
 
-def _nested(name: str, value: float) -> dict[str, Any]:
+def nested(name: str, value: float) -> dict[str, Any]:
+    """A value by its dotted name as mappings in each other."""
     *above, last = name.split(".")
-    nested: dict[str, Any] = {last: value}
+    found: dict[str, Any] = {last: value}
     for part in reversed(above):
-        nested = {part: nested}
-    return nested
+        found = {part: found}
+    return found

@@ -109,4 +109,6 @@ def _training_s(orders: list[Order]) -> float:
 
 
 def _tell(tell: Callable[[str, bool], None], done: int, of: str) -> None:
+    if done == 1:
+        of = of.replace("s", "", 1)  # the one of the noun
     tell(f"{done} {of}" if done else "nothing to do", bool(done))

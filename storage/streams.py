@@ -150,32 +150,11 @@ class Sink(Protocol):
 class Unheeded:
     """A sink that lets every stream go; what wants some of them takes those."""
 
-    def add_events(self, chunk: EventChunk) -> None:
+    def _let_go(self, chunk: Any) -> None:
         """Not kept."""
 
-    def add_event_pulses(self, chunk: PulseChunk) -> None:
-        """Not kept."""
-
-    def add_arm_pulses(self, chunk: PulseChunk) -> None:
-        """Not kept."""
-
-    def add_sync_pulses(self, chunk: PulseChunk) -> None:
-        """Not kept."""
-
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Not kept."""
-
-    def add_box_reads(self, chunk: ClockReads) -> None:
-        """Not kept."""
-
-    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
-        """Not kept."""
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Not kept."""
-
-    def add_frames(self, chunk: FrameChunk) -> None:
-        """Not kept."""
+    add_events = add_event_pulses = add_arm_pulses = add_sync_pulses = _let_go
+    add_exposures = add_box_reads = add_frame_camera_reads = add_poses = add_frames = _let_go
 
 
 Json = dict[str, Any]

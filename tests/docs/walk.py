@@ -5,8 +5,6 @@ Commands run in this process, which has loaded the libraries and has a Prefect s
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 import re
 import shlex
@@ -18,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from flows import console
-from flows.__main__ import main
+from tests.command_line import here
 from tests.conftest import ROOT
 from tests.docs.blocks import Block, blocks, steps
 
@@ -49,20 +47,10 @@ def run(line: str, folder: Path) -> Done:
 
 
 def _sliplab(words: list[str], folder: Path) -> Done:
-    out, said = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", words)
         patch.setattr(console.results, "width", WIDTH)
-        patch.chdir(folder)
-        with (
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(said),
-            pytest.raises(SystemExit) as ended,
-        ):
-            main()
-    code = ended.value.code
-    assert isinstance(code, int)
-    return Done(code, out.getvalue(), said.getvalue())
+        done = here(*words[1:], cwd=folder)
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 def walk(page: Path, folder: Path) -> int:

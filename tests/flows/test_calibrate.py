@@ -26,8 +26,8 @@ from rigs.plate_frame import PlateFrame
 from rigs.rig import Rig, StopRequested
 from rigs.rig_file import load_rig_file
 from rigs.teaching import Creep
+from tests.command_line import sliplab
 from tests.conftest import ROOT
-from tests.flows.test_cli import sliplab
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 QUICK = Creep(clearance_mm=2.5, search_mm=2.0)

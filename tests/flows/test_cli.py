@@ -3,56 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flows.__main__ import main
 from storage.files import read_json
 from storage.store import Store
 from storage.verify import verify
+from tests.command_line import SECRET, SLIPLAB, here, sliplab, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-
-SECRET = "marked-secret-51b2"
-SLIPLAB = [sys.executable, "-m", "flows"]
-
-
-def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    environment.pop("PREFECT_HOME", None)
-    environment |= dict.fromkeys(("PREFECT_API_KEY", "AWS_SECRET_ACCESS_KEY"), SECRET)
-    return subprocess.run(
-        [*SLIPLAB, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True,
-        text=True, timeout=300,
-    )  # fmt: skip
-
-
-def here(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The same in this process, which has loaded everything and has a server already."""
-    words = ["sliplab", *map(str, arguments)]
-    out, said = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", words)
-        patch.chdir(ROOT)
-        with (
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(said),
-            pytest.raises(SystemExit) as ended,
-        ):
-            main()
-    code = ended.value.code
-    assert isinstance(code, int)
-    return subprocess.CompletedProcess(words, code, out.getvalue(), said.getvalue())
 
 
 @pytest.mark.parametrize(("name", "count"), [("kinematic", 864), ("gravity", 180)])
@@ -130,17 +95,6 @@ def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:
     assert {"arm", "clock: events", "clock: arm", "region", "space"} <= names
     (camera,) = (item for item in found["checks"] if item["name"] == "outside camera")
     assert camera["finding"] == "simulated video, 720 x 720 px"
-
-
-def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:
-    """Until `condition()` holds; fails when the process ends first or time is up."""
-    assert callable(condition)
-    end = time.monotonic() + limit_s
-    while not condition():
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=0.01)
-        assert process.poll() is None, "ended before it could be stopped"
-        assert time.monotonic() < end, "never came that far"
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,9 @@ from storage.lock import exclusive
 from storage.process import this_process
 from storage.store import Store
 from storage.verify import verify
+from tests.command_line import SLIPLAB, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.test_cli import SLIPLAB, here, wait_for
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 

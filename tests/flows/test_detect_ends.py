@@ -18,6 +18,7 @@ from protocols import InputError, load_plan
 from rigs.capabilities import RigError
 from rigs.rig import Rig, StopRequested
 from rigs.rig_file import RigFile
+from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
 from tests.flows.detecting import (
@@ -29,7 +30,6 @@ from tests.flows.detecting import (
     slip_when_busy,
     stands_clear,
 )
-from tests.flows.test_cli import here
 
 
 @pytest.fixture(scope="module")

@@ -27,9 +27,9 @@ from protocols.settings import Detection, Network, Windows
 from storage.derived import Derived
 from storage.errors import StoreError
 from storage.store import Store
+from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.reviewable import Reviewable, label
-from tests.flows.test_cli import here
 
 ASK = Ask(samples=40, epochs=2, trials=2, seeds=2, stride_ms=15)
 AXES = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(0.5, 1.0))

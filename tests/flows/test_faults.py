@@ -15,7 +15,7 @@ from rigs.capabilities import ArmFault, RigError
 from storage.files import disk_full, read_json, write_json
 from storage.store import Campaign, Store, StoreError
 from storage.verify import verify
-from tests.flows.test_cli import sliplab
+from tests.command_line import sliplab
 from tests.flows.test_session import checksums, session, short, take_all
 
 TRACKS = {"level": "tracks"}

@@ -29,8 +29,8 @@ from flows.tradeoff_page import ERRORS
 from storage.derived import Derived
 from storage.files import write_json
 from storage.store import Store, StoreError
+from tests.command_line import here
 from tests.flows.conftest import write
-from tests.flows.test_cli import here
 from tests.flows.test_session import short
 
 Json = dict[str, Any]

@@ -22,6 +22,15 @@ class Clock:
 EXPECTED = {"collect": 100.0, "label": 50.0, "train": 200.0}
 
 
+def spend(folder: Path, clock: Clock, seconds: float, worked: bool = True) -> Ledger:
+    """A ledger whose first step took that long."""
+    ledger = Ledger(folder, EXPECTED, clock)
+    with ledger.step("collect") as tell:
+        clock.now += seconds
+        tell("told", worked)
+    return ledger
+
+
 def test_a_study_from_its_beginning_to_its_end(tmp_path: Path) -> None:
     clock = Clock()
     ledger = Ledger(tmp_path, EXPECTED, clock)
@@ -36,7 +45,7 @@ def test_a_study_from_its_beginning_to_its_end(tmp_path: Path) -> None:
         tell("10 trials", True)
     with ledger.step("train") as tell:
         clock.now += 75.0
-        tell("1 networks", True)
+        tell("1 network", True)
     assert ledger.left_s() == 0.0
     rows = read(tmp_path)
     assert [row.state for row in rows] == [DONE] * 3
@@ -67,20 +76,13 @@ def test_a_step_that_was_stopped_adds_up(tmp_path: Path) -> None:
 def test_a_step_with_nothing_to_do_costs_nothing_and_keeps_what_it_cost(tmp_path: Path) -> None:
     clock = Clock()
     for worked in (True, False):
-        ledger = Ledger(tmp_path, EXPECTED, clock)
-        with ledger.step("collect") as tell:
-            clock.now += 40.0
-            tell("told", worked)
+        ledger = spend(tmp_path, clock, 40.0, worked)
         assert read(tmp_path)[0].seconds == 40.0
     assert ledger.left_s() == pytest.approx(250.0 * 0.4)
 
 
 def test_what_is_left_is_never_beyond_reason(tmp_path: Path) -> None:
-    clock = Clock()
-    ledger = Ledger(tmp_path, EXPECTED, clock)
-    with ledger.step("collect") as tell:
-        clock.now += 1e6
-        tell("told", True)
+    ledger = spend(tmp_path, Clock(), 1e6)
     assert ledger.left_s() == 5 * 250.0
 
 

@@ -1,0 +1,60 @@
+"""The command line as tests use it: in a process of its own, or in this one."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flows.__main__ import main
+from tests.conftest import ROOT
+
+SECRET = "marked-secret-51b2"
+"""In the environment of every command; must never be found in a store."""
+SLIPLAB = [sys.executable, "-m", "flows"]
+
+
+def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PREFECT_HOME", None)
+    environment |= dict.fromkeys(("PREFECT_API_KEY", "AWS_SECRET_ACCESS_KEY"), SECRET)
+    return subprocess.run(
+        [*SLIPLAB, *map(str, arguments)], cwd=cwd, env=environment, capture_output=True,
+        text=True, timeout=300,
+    )  # fmt: skip
+
+
+def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """The same in this process, which has loaded everything and has a server already."""
+    words = ["sliplab", *map(str, arguments)]
+    out, said = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", words)
+        patch.chdir(cwd)
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(said),
+            pytest.raises(SystemExit) as ended,
+        ):
+            main()
+    code = ended.value.code
+    assert isinstance(code, int)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), said.getvalue())
+
+
+def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:
+    """Until `condition()` holds; fails when the process ends first or time is up."""
+    assert callable(condition)
+    end = time.monotonic() + limit_s
+    while not condition():
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=0.01)
+        assert process.poll() is None, "ended before it could be stopped"
+        assert time.monotonic() < end, "never came that far"
