@@ -193,7 +193,7 @@ def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simu
             label="validation, strict",
         )
         right.set_ylabel("accuracy (share)")
-        right.set_ylim(0, 1)
+        right.set_ylim(right.get_ylim()[0], min(right.get_ylim()[1], 1.0))
         for axes in (left, right):
             axes.axvline(chosen, color=GREY, lw=0.8, ls="--")
             axes.set_xlabel("epoch")

@@ -45,6 +45,17 @@ class Table:
     caption: str = ""
     commands: Sequence[int] = ()
 
+    @property
+    def texts(self) -> set[int]:
+        """Columns of words, which read from the left; numbers stand below each other's ends."""
+        columns = (
+            [row[k] for row in self.rows if k < len(row) and row[k] not in ("", "–")]
+            for k in range(len(self.columns))
+        )
+        return {
+            k for k, cells in enumerate(columns) if cells and all(c[0].isalpha() for c in cells)
+        }
+
 
 @dataclass(frozen=True)
 class Link:

@@ -43,6 +43,7 @@ FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}
 
 _PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
 _LARGEST = Decimal("1e9")
+_DECIMALS = 40
 
 
 def canonical(value: Decimal) -> str:
@@ -55,7 +56,7 @@ def to_decimal(raw: object) -> Decimal:
     """A plain number as a finite decimal.
 
     Raises:
-        ValueError: not a number, not finite, or beyond 1e9 in size.
+        ValueError: not a number, not finite, beyond 1e9 in size, or of more than 40 decimals.
     """
     if isinstance(raw, bool) or not isinstance(raw, (int, float, str, Decimal)):
         raise ValueError("must be a number")
@@ -65,8 +66,11 @@ def to_decimal(raw: object) -> Decimal:
         raise ValueError("must be a number") from error
     if not value.is_finite():
         raise ValueError("must be a finite number")
-    if abs(value) > _LARGEST:
+    if value.copy_abs() > _LARGEST:  # abs() fails for 1e1000000
         raise ValueError("must be at most 1e9 in size")
+    exponent = value.as_tuple().exponent
+    if isinstance(exponent, int) and exponent < -_DECIMALS:  # all of them stand in ids
+        raise ValueError(f"must have at most {_DECIMALS} decimals")
     return value
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import threading
@@ -251,7 +252,9 @@ def read_json(path: Path) -> dict[str, Any]:
         ValueError: not JSON, or not an object; the message names the file.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
+        data = json.loads(
+            path.read_text(encoding="utf-8"), parse_constant=_no_number, parse_float=_finite
+        )
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not JSON: {error}") from None
     if not isinstance(data, dict):
@@ -261,6 +264,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def _no_number(text: str) -> None:
     raise ValueError(f"{text} is no number of JSON")
+
+
+def _finite(text: str) -> float:
+    """Digits that are beyond every float would become an infinity, which no JSON file may hold."""
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{text} is beyond what a number may be")
+    return value
 
 
 def sha256(path: Path) -> str:

@@ -116,3 +116,16 @@ def test_a_page_escapes_everything_but_its_figures() -> None:
     plain = render([], [], [Section("a", (), [Figure(SVG, "seen")])], simulated=False)
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]
+
+
+def test_words_read_from_the_left_and_commands_as_code() -> None:
+    table = Table(
+        ("trial", "cause", "lead (ms)", "none"),
+        [["a", "late", "12", ""], ["b", "", "–", "–"], ["c", "early", "-3", ""]],
+    )
+    assert table.texts == {0, 1}
+    page = render([], [], [Section("a", ["run `a <b>` or `c`"], tables=[table])], simulated=False)
+    assert "<p>run <code>a &lt;b&gt;</code> or <code>c</code></p>" in page
+    assert '<th class="text">cause</th><th>lead (ms)</th>' in page
+    assert '<td class="text">late</td><td>12</td>' in page
+    assert page.startswith("<!doctype html>")

@@ -56,6 +56,19 @@ def test_numbers_must_be_finite_numbers(raw: object) -> None:
         to_decimal(raw)
 
 
+@pytest.mark.parametrize("raw", ["1e1000000", "-1E+999999999999", Decimal("1e12")])
+def test_no_number_is_too_large_to_be_refused(raw: object) -> None:
+    with pytest.raises(ValueError, match="at most 1e9 in size"):
+        to_decimal(raw)
+
+
+@pytest.mark.parametrize("raw", ["1e-1000000", "-1e-41", "0E-99999999", 1e-300])
+def test_no_number_is_too_long_to_be_written(raw: object) -> None:
+    with pytest.raises(ValueError, match="at most 40 decimals"):
+        to_decimal(raw)
+    assert to_decimal("1e-40") > 0
+
+
 @given(decimals)
 def test_canonical_text_stands_for_one_value(value: Decimal) -> None:
     text = canonical(value)

@@ -41,3 +41,11 @@ def test_json_comes_back(tmp_path: Path) -> None:
 def test_json_has_no_word_for_these(bad: object) -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
         json_text(bad)
+
+
+@pytest.mark.parametrize("text", ["1e999", "-1e999", "NaN", "Infinity", "[1e400]"])
+def test_no_file_brings_in_what_no_file_may_hold(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'{{"a": {text}}}')
+    with pytest.raises(ValueError, match=r"a\.json: is not JSON: .*number"):
+        read_json(path)
