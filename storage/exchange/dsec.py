@@ -6,7 +6,7 @@ not here. `storage.rows` refuses the first; the second is held against the bytes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,8 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
         Wrong: it is damaged, or has another layout.
     """
     with _opened(path) as (file, rows):
-        columns = [rows(f"events/{key}") for key in "xypt"]
+        columns = {key: rows(f"events/{key}") for key in "xypt"}
+        _same_length(path, columns)
         offset = int(_whole(file.rows("t_offset").read())) if file.has("t_offset") else 0
         if not 0 <= offset < LATEST_US:
             raise Wrong(f"{path.name}: t_offset = {offset}: is no time")
@@ -49,7 +50,7 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
             triggers = Triggers(_whole(rows("triggers/t").read()), kinds)
             _rising(triggers)
         simulated = bool(file.attribute("simulated", 0))
-    count = len(columns[3])
+    count = len(columns["t"])
 
     def all_events() -> Iterator[EventChunk]:
         with _opened(path) as (_, again):
@@ -72,6 +73,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     """
     with _opened(path) as (_, rows):
         columns = {key: rows(f"events/{key}") for key in ("xs", "ys", "ps", "ts")}
+        _same_length(path, columns)
         if len(columns["ts"]) > _MOST_UNSORTED:
             raise Wrong(f"{path.name}: {len(columns['ts'])} events, too many to sort")
 
@@ -90,6 +92,14 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         name, path.name, all_events, "unknown; seconds as the file has them, rounded to us",
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
     )  # fmt: skip
+
+
+def _same_length(path: Path, columns: Mapping[str, Sized]) -> None:
+    """Refuse columns of which one is cut short: nobody knows which events it has lost."""
+    lengths = {key: len(column) for key, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{key} {count}" for key, count in lengths.items())
+        raise Wrong(f"{path.name}: its events' columns have different lengths: {told}")
 
 
 def is_lab_hdf5(path: Path) -> bool:

@@ -236,6 +236,16 @@ def test_the_labs_hdf5(tmp_path: Path) -> None:
     assert verify(made) == []
 
 
+def test_columns_of_different_lengths_are_refused(tmp_path: Path) -> None:
+    lab_hdf5(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        shorter = file["events/xs"][:-1]
+        del file["events/xs"]
+        file["events/xs"] = shorter
+    with pytest.raises(InputError, match=r"a\.h5: its events' columns .*: xs \d+, ys \d+"):
+        _import(tmp_path / "store", tmp_path / "a.h5")
+
+
 def test_labels_and_catalogue_as_tables(store: Store, tmp_path: Path) -> None:
     table = catalogue(store)
     for name in ("t.csv", "t.parquet"):
