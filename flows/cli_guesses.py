@@ -28,18 +28,24 @@ def guesses(
     store = Store.open(folder)
     prepare_store(folder)
     from flows.campaigns import collected
-    from flows.guess_changes import FIGURES
+    from flows.guess_changes import FIGURES, UNITS
     from flows.guesses import GUESSES, measure_guesses
 
     result = measure_guesses(store, collected(store, campaign), tuple(guess or GUESSES), trials)
     if as_json:
         console.print_json(result)
         return
-    columns = [f"{FIGURES[name]} ({'%' if name == 'strict' else 'ms'})" for name in FIGURES]
+    columns = [f"{FIGURES[name]} ({UNITS[name]})" for name in FIGURES]
     rows = []
     for name, found in result["settings"].items():
         shown = [
-            "-" if value is None else f"{100 * value:.1f}" if key == "strict" else f"{value:.0f}"
+            "-"
+            if value is None
+            else f"{100 * value:.1f}"
+            if key == "strict"
+            else f"{value:.3f}"
+            if UNITS[key] == "mm"
+            else f"{value:.0f}"
             for key, value in found.items()
         ]
         rows.append([name.removeprefix("scene.").removeprefix("event_camera."), *shown])

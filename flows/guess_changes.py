@@ -19,8 +19,11 @@ FIGURES = {
     "gross_ms": "gross latency",
     "gravity_lead_ms": "gravity lead",
     "disturbance_lead_ms": "disturbance lead",
+    "depth_zero_mm": "depth zero",
 }
-"""What is compared, and how it is called."""
+"""What is compared, and how it is called. Depth zero is what the rig found by touching the plate:
+it tells contact by events, so a guess of the camera moves it, and with it every depth."""
+UNITS = {name: "%" if name == "strict" else name.rsplit("_", 1)[1] for name in FIGURES}
 
 
 def figures(setting: Json) -> dict[str, float | None]:
@@ -56,8 +59,10 @@ def _values(setting: Json) -> dict[str, dict[str, float | None]]:
     found: dict[str, dict[str, float | None]] = {name: {} for name in FIGURES if name != "strict"}
     for row in setting["trials"]:
         latency = row["latency"] or {}
+        trial = f"{row['campaign']}/{row['trial']}"
+        found["depth_zero_mm"][trial] = row["depth_zero_mm"]
         for name, key in _keys(row["experiment"]):
-            found[name][f"{row['campaign']}/{row['trial']}"] = latency.get(key)
+            found[name][trial] = latency.get(key)
     return found
 
 

@@ -210,7 +210,8 @@ class Guesses:
             for trial, recording in item.of_split("test"):
                 counts, end_ns = self._hear(recording, self.detection[item.name])
                 told = labels.read(item, recording)
-                rows.append(score_row(item, trial, told, counts, end_ns, self.detection[item.name]))
+                row = score_row(item, trial, told, counts, end_ns, self.detection[item.name])
+                rows.append({**row, "depth_zero_mm": recording.record["depth_zero_mm"]})
         used = training_campaigns(campaigns)
         samples = load_samples(labels, used, "test")
         hits = window_groups.strict_hits(

@@ -6,7 +6,7 @@ from typing import Any
 
 from analysis.figures_changes import Changed, ChangePanel, lowered_and_raised
 from analysis.report import Figure, Section, Table, number, percent
-from flows.guess_changes import AS_IT_IS, FIGURES, changes, figures
+from flows.guess_changes import AS_IT_IS, FIGURES, UNITS, changes, figures
 from flows.report_extras import FILES, command
 from storage.errors import StoreError
 from storage.store import Store
@@ -15,7 +15,6 @@ Json = dict[str, Any]
 
 TITLE = "What the guesses of the scene decide"
 _DRAWN = ("strict", "incipient_ms", "gravity_lead_ms", "disturbance_lead_ms")
-_DIGITS = 0
 
 
 def section(store: Store, found: Json | None) -> Section:
@@ -72,7 +71,7 @@ def _made(found: Json) -> Section:
         _data(names, sides),
     )
     table = Table(
-        ("guess", *(f"{text} ({'%' if key == 'strict' else 'ms'})"
+        ("guess", *(f"{text} ({UNITS[key]})"
                     for key, text in FIGURES.items())),
         [[AS_IT_IS, *(_value(key, unchanged[key], unit=False) for key in FIGURES)],
          *([name, *(_both(key, name, unchanged[key], sides) for key in FIGURES)]
@@ -108,14 +107,18 @@ def _changed(
     return Changed(change, None if span is None else (scale * span[0], scale * span[1]))
 
 
+def _change_unit(key: str) -> str:
+    return "points" if key == "strict" else UNITS[key]
+
+
 def _label(key: str) -> str:
-    return f"{FIGURES[key]}\n({'points' if key == 'strict' else 'ms'})"
+    return f"{FIGURES[key]}\n({_change_unit(key)})"
 
 
 def _value(key: str, value: float | None, *, unit: bool = True) -> str:
     if key == "strict":
         return percent(value) if unit else number(None if value is None else 100 * value)
-    return number(value, _DIGITS, "ms" if unit else "")
+    return number(value, 3 if UNITS[key] == "mm" else 0, UNITS[key] if unit else "")
 
 
 def _both(key: str, name: str, base: float | None, sides: dict[str, Any]) -> str:
@@ -138,7 +141,7 @@ def _data(names: list[str], sides: dict[str, Any]) -> dict[str, list[object]]:
             data["factor"].append(word)
             for key in FIGURES:
                 found = sides[side].get(key, {}).get(name)
-                unit = "points" if key == "strict" else "ms"
+                unit = _change_unit(key)
                 low, high = (None, None) if found is None or found.span is None else found.span
                 for heading, value in (
                     (f"change of {FIGURES[key]} ({unit})", None if found is None else found.change),

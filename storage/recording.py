@@ -203,9 +203,13 @@ class Recording:
         """The map from a device's clock (``events``, ``frames``, ``arm``) to the time line.
 
         Raises:
-            KeyError: the trial has no such clock.
+            StoreError: the trial has no such clock.
         """
-        return ClockMap.from_json(self.clocks[device]["map"])
+        known = self.clocks
+        if device not in known:
+            names = ", ".join(sorted(known)) or "none"
+            raise StoreError(f"{self.folder}: the trial has no clock '{device}'; it has: {names}")
+        return ClockMap.from_json(known[device]["map"])
 
     def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
         """Events between two times of the time line, on the camera's own clock."""

@@ -96,6 +96,17 @@ def test_a_record_without_steps_has_no_phases(made: Campaign) -> None:
         recording.step("slide")
 
 
+def test_a_trial_without_a_clock_says_which_it_has(made: Campaign) -> None:
+    folder = made.folder / "trials" / "t"
+    whole = (folder / "record.json").read_bytes()
+    data = json.loads(whole)
+    data["clocks"].pop("frames", None)
+    recording = _with(folder, json.dumps(data).encode())
+    with pytest.raises(StoreError, match=r"no clock 'frames'; it has: .*events"):
+        recording.frame_times()
+    _with(folder, whole)
+
+
 @pytest.mark.parametrize(
     "name", ["../x", "/etc/passwd", "a/b", "", ".", "..", "a\0b", "C:\\x", ".x", "x" * 200]
 )
