@@ -119,12 +119,14 @@ def trained_net(
     test: SparseWindows,
     epochs: int = EPOCHS,
     on_epoch: Callable[[int, float], None] | None = None,
+    mirror: bool = True,
 ) -> tuple[Votes, dict[str, Any]]:
     """Train one of `KINDS`, keep its best epoch by validation accuracy, vote on test samples.
 
     Args:
         epochs: at most; it ends `PATIENCE` epochs after the best.
         on_epoch: called with each epoch and its validation accuracy.
+        mirror: windows are mirrored at random, as the spiking network's are.
 
     Returns:
         logits float32 (n, 3), and what it was: epochs, weights, multiply-adds a window.
@@ -143,7 +145,7 @@ def trained_net(
     done = 0
     while done < epochs and (best is None or done - best.epoch < PATIENCE):
         done += 1
-        _one_epoch(net, optimizer, train, np.random.default_rng([_SEED, done]))
+        _one_epoch(net, optimizer, train, np.random.default_rng([_SEED, done]), mirror)
         votes = _votes(net, validation.windows)
         strict = metrics.accuracy(votes, validation.y).strict or 0.0
         loss = float(
@@ -168,14 +170,21 @@ def trained_net(
 
 
 def _one_epoch(
-    net: nn.Module, optimizer: torch.optim.Optimizer, train: SampleSet, rng: np.random.Generator
+    net: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    train: SampleSet,
+    rng: np.random.Generator,
+    mirror: bool,
 ) -> None:
     net.train()
     order = rng.permutation(len(train))
+    windows = train.windows
+    if mirror:
+        windows = windows.mirrored(rng.integers(0, 4, len(train), np.uint8))
     for start in range(0, len(order), BATCH):
         rows = order[start : start + BATCH]
         loss = nn.functional.cross_entropy(
-            net(_dense(train.windows.take(rows))), torch.from_numpy(train.y[rows])
+            net(_dense(windows.take(rows))), torch.from_numpy(train.y[rows])
         )
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped

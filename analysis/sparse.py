@@ -76,6 +76,26 @@ class SparseWindows:
         entries = np.arange(offsets[-1]) + np.repeat(begin - offsets[:-1], sizes)
         return SparseWindows(self.shape, offsets, self.cell[entries], self.count[entries])
 
+    def mirrored(self, how: npt.NDArray[np.integer[Any]]) -> SparseWindows:
+        """Each sample as it is (0), its columns (1), its rows (2) or both (3) in reverse order.
+
+        Args:
+            how: (n,), 0 to 3.
+
+        Raises:
+            ValueError: another number of samples, or no such mirror.
+        """
+        if how.shape != (len(self),) or (len(how) and not 0 <= how.min() <= how.max() <= 3):
+            raise ValueError(f"{how.shape} mirrors of 0 to 3 for {len(self)} samples")
+        steps, *plane = self.shape
+        cells = np.arange(math.prod(plane), dtype=np.uint32).reshape(plane)
+        places = np.stack([
+            cells, cells[:, :, ::-1], cells[:, ::-1], cells[:, ::-1, ::-1]
+        ]).reshape(4, -1)  # fmt: skip
+        cell, count = self.cell.copy(), self.count.copy()
+        _mirror(how.astype(np.uint8), places, self.offsets, steps, cell, count)
+        return SparseWindows(self.shape, self.offsets, cell, count)
+
     @staticmethod
     def join(parts: list[SparseWindows], shape: tuple[int, int, int, int]) -> SparseWindows:
         """All parts' samples in order; works for none."""
@@ -115,3 +135,21 @@ def _list(flat: Any, offsets: Any, cell: Any, count: Any) -> None:
                 cell[at] = j
                 count[at] = flat[i, j]
                 at += 1
+
+
+@njit(cache=True, nogil=True)
+def _mirror(how: Any, places: Any, offsets: Any, steps: Any, cell: Any, count: Any) -> None:
+    """Entries of a step are put in order again by insertion: there are some ten of them."""
+    for i in range(how.size):
+        if how[i] == 0:
+            continue
+        place = places[how[i]]
+        for t in range(i * steps, (i + 1) * steps):
+            low = offsets[t]
+            for k in range(low, offsets[t + 1]):
+                new, many = place[cell[k]], count[k]
+                j = k
+                while j > low and cell[j - 1] > new:
+                    cell[j], count[j] = cell[j - 1], count[j - 1]
+                    j -= 1
+                cell[j], count[j] = new, many

@@ -150,8 +150,12 @@ def fit(
         while not run.ended:
             started = time.perf_counter()
             epoch = len(run.history) + 1
-            order = np.random.default_rng([seed, epoch]).permutation(len(train))
-            loss, counts, rates = run.one_epoch(train, train_y, order, pool)
+            rng = np.random.default_rng([seed, epoch])
+            order = rng.permutation(len(train))
+            seen = train
+            if training.mirror:
+                seen = train.mirrored(rng.integers(0, 4, len(train), np.uint8))
+            loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
             record = _record(epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain)
             run.keep(record)

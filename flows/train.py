@@ -27,7 +27,7 @@ from storage.store import Store, StoreError
 if TYPE_CHECKING:
     from flows.cluster import Cluster
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from storage.store import Store
 STEP = "baselines"
 EVALUATION = "evaluation"
 """Step and name of what it is compared with (`flows.evaluate`, which Prefect needs)."""
-VERSION = 1
+VERSION = 2
 
 NAMES: dict[str, Any] = {
     "logistic_cells": RIDGE,

@@ -111,11 +111,14 @@ class Training(StrictModel):
 
     epochs: int = Field(default=12, ge=1, le=10_000)
     batch: int = Field(default=32, ge=1, le=4096)
-    learning_rate: float = Field(default=2e-3, gt=0, le=1)
+    learning_rate: float = Field(default=4e-3, gt=0, le=1)
     schedule: Literal["constant", "cosine"] = "cosine"
     """Of the learning rate over the epochs."""
     gain: float = Field(default=0.25, gt=0, le=10)
     """What a spike counts in the cross-entropy. Less of it asks for counts further apart."""
+    mirror: bool = True
+    """Each epoch shows each training window as it is, or mirrored along one side or both, drawn
+    anew: a slide to the left is as good as one to the right."""
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[int, ...] = (0,)
