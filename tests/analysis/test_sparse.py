@@ -33,6 +33,27 @@ def test_dense_there_and_back(x: np.ndarray, data: st.DataObject) -> None:
     np.testing.assert_array_equal(joined.dense(), np.concatenate([x, x[::-1]]))
 
 
+@given(dense, st.data())
+def test_mirrored_is_reversed(x: np.ndarray, data: st.DataObject) -> None:
+    found = SparseWindows.of(x)
+    how = data.draw(hnp.arrays(np.uint8, len(x), elements=st.integers(0, 3)))
+    expected = [one[..., :: (-1 if k & 2 else 1), :: (-1 if k & 1 else 1)]
+                for one, k in zip(x, how, strict=True)]  # fmt: skip
+    mirrored = found.mirrored(how)
+    np.testing.assert_array_equal(mirrored.dense(), np.reshape(expected, x.shape))
+    again = SparseWindows.of(mirrored.dense())  # entries stand in order, as they are listed
+    np.testing.assert_array_equal(mirrored.cell, again.cell)
+    np.testing.assert_array_equal(mirrored.count, again.count)
+    np.testing.assert_array_equal(mirrored.mirrored(how).dense(), x)
+    np.testing.assert_array_equal(found.dense(), x)
+
+
+@pytest.mark.parametrize("how", [[0], [0, 4], [-1, 0], [0, 0, 0]])
+def test_there_are_four_ways_to_see_a_sample(how: list[int]) -> None:
+    with pytest.raises(ValueError, match="mirrors of 0 to 3 for 2 samples"):
+        SparseWindows.of(np.zeros((2, 1, 1, 3, 3), np.uint8)).mirrored(np.array(how))
+
+
 def test_what_is_no_sample_is_refused() -> None:
     with pytest.raises(ValueError, match="expected uint8"):
         SparseWindows.of(np.zeros((1, 2, 3), np.uint8))

@@ -25,7 +25,7 @@ from protocols.settings import Network, Training, Windows
 NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
 WINDOWS = Windows(length_ms=12, crop_px=160)  # (12, 1, 8, 8)
 TRAINING = Training(
-    epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0
+    epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0, mirror=False
 )
 
 
@@ -203,6 +203,21 @@ def test_the_rate_falls_along_half_a_cosine() -> None:
     assert 0 < rates[-1] < 3e-4
     assert rates == sorted(rates, reverse=True)
     assert {learning_rate(TRAINING, done) for done in range(5)} == {TRAINING.learning_rate}
+
+
+def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) -> None:
+    """Edges stand on the right of every training window; here they stand on the left."""
+    x, y = TEST[0][..., ::-1], TEST[1]
+    mirrored = run(mirror=True, epochs=10, patience=10)
+    plain, both = (
+        metrics.accuracy(predict_counts(net, np.ascontiguousarray(x)), y).strict
+        for net in (fitted, mirrored)
+    )
+    assert plain is not None
+    assert both is not None
+    assert both > plain + 0.1
+    again = run(mirror=True, epochs=10, patience=10)
+    assert again.history == mirrored.history
 
 
 def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:

@@ -24,7 +24,9 @@ from protocols.settings import Network, Training, Windows
 
 NETWORK = Network(conv1_channels=2, conv2_channels=2, hidden=8, conv1_kernel=3)
 WINDOWS = Windows(length_ms=6, crop_px=80)  # (6, 1, 4, 4)
-HOW = Training(epochs=8, batch=16, learning_rate=2e-2, patience=8, schedule="constant", gain=1.0)
+HOW = Training(
+    epochs=8, batch=16, learning_rate=2e-2, patience=8, schedule="constant", gain=1.0, mirror=False
+)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -47,9 +47,7 @@ def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: Store) -> None:
         for row in kept(store)[AS_IT_IS]["trials"]
     ]
     assert len(again) == 4
-    assert sorted(again, key=lambda row: row["trial"]) == sorted(
-        ours, key=lambda row: row["trial"]
-    )
+    assert sorted(again, key=lambda row: row["trial"]) == sorted(ours, key=lambda row: row["trial"])
 
 
 def test_a_change_is_seen_and_compared_trial_by_trial(store: Store) -> None:
