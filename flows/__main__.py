@@ -52,7 +52,8 @@ def _explain(error: Exception) -> int:
     if isinstance(error, typer.Abort):
         return _interrupted()
     if isinstance(error, TyperException):
-        console.say(f"error: {error.format_message()} (see --help)")
+        if message := error.format_message():  # without a command its help has been printed
+            console.say(f"error: {message} (see --help)")
         return console.WRONG_INPUT
     if (
         isinstance(error, OSError)

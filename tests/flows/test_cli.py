@@ -97,6 +97,15 @@ def test_check_looks_and_moves_nothing(tmp_path: Path) -> None:
     assert camera["finding"] == "simulated video, 720 x 720 px"
 
 
+def test_without_a_command_there_is_help_and_no_empty_error() -> None:
+    done = here()
+    assert (done.returncode, done.stderr) == (2, "")
+    assert "collect" in done.stdout
+    wrong = here("colect")
+    assert wrong.returncode == 2
+    assert "No such command 'colect'" in wrong.stderr
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Checksums of the small campaign's trials, collected in one go."""
