@@ -1,7 +1,5 @@
 """Trees and ordinary networks learn what can be learned, repeat, and say what they cost."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -12,15 +10,9 @@ from analysis.dataset import SampleSet
 from analysis.metrics import accuracy
 from analysis.sparse import SparseWindows
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SHAPE = (6, 2, 5, 5)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def events(n: int, seed: int) -> SampleSet:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,15 +24,9 @@ from analysis.training import EpochRecord, Fitted
 from protocols.settings import Network, Training, Windows
 from tests.analysis.test_spiking import FULL, SMALL, TINY, sparse
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 onnx = pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> Fitted:

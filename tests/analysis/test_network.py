@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -20,17 +19,10 @@ from analysis.network import (
 )
 from protocols.settings import Network, Windows
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = Network(conv1_channels=2, conv2_channels=4, hidden=8)
 WINDOWS = Windows(length_ms=10, crop_px=120)  # (10, 1, 6, 6)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """These nets are too small to share: beside other work, waiting threads cost the most."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def sparse(n: int, windows: Windows, seed: int, share: float = 0.2) -> np.ndarray:

@@ -1,6 +1,5 @@
 """The event-driven network gives Sinabs' spikes exactly, whole, step by step and in any company."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -26,18 +25,11 @@ from analysis.sparse import SparseWindows
 from analysis.spiking import Engine, torch_weights
 from protocols.settings import Network, Windows
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = Network(conv1_channels=3, conv2_channels=4, hidden=9)
 TINY = Windows(length_ms=10, crop_px=120)
 FULL = Windows()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """These nets are too small to share: beside other work, waiting threads cost the most."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def put(net: nn.Sequential, values: list[np.ndarray]) -> nn.Sequential:

@@ -2,7 +2,6 @@
 
 import pickle
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,20 +21,13 @@ from analysis.training import (
 )
 from protocols.settings import Network, Training, Windows
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
 WINDOWS = Windows(length_ms=12, crop_px=160)  # (12, 1, 8, 8)
 TRAINING = Training(
     epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0, mirror=False
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """These nets are too small to share: beside other work, waiting threads cost the most."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def windows_like(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

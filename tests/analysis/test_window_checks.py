@@ -1,10 +1,7 @@
 """The checks pass where all is well, and fail loudly where somebody cheats."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
-import torch
 
 from analysis import metrics
 from analysis.metrics import CLASSES, Scores, score
@@ -22,19 +19,13 @@ from analysis.window_checks import (
 )
 from protocols.settings import Network, Training, Windows
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 NETWORK = Network(conv1_channels=2, conv2_channels=2, hidden=8, conv1_kernel=3)
 WINDOWS = Windows(length_ms=6, crop_px=80)  # (6, 1, 4, 4)
 HOW = Training(
     epochs=8, batch=16, learning_rate=2e-2, patience=8, schedule="constant", gain=1.0, mirror=False
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def places(n: int, seed: int) -> Part:

@@ -10,7 +10,7 @@ from storage.decisions import SKIPPED, again, skip, skipped
 from storage.files import read_json
 from storage.store import Store, StoreError
 from storage.verify import verify
-from tests.storage.trials import FRAME, campaign, commit, fill, record
+from tests.storage.trials import campaign, commit, fail
 
 BY = {"who": "anna", "when": "2026-01-02T03:04:05+00:00", "why": "skin was dirty"}
 
@@ -33,10 +33,7 @@ def test_a_committed_trial_that_is_wanted_again_is_kept_aside(tmp_path: Path) ->
 def test_failed_attempts_are_forgiven_once_and_stay(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     for attempt in range(2):
-        writer = where.begin("t", FRAME, 100)
-        fill(writer)
-        cause = {"cause": "gate: frames_lost = 3", "trial": "t", "attempt": attempt}
-        writer.set_aside(where.quarantine_path("t"), record("t"), {}, cause)
+        fail(where, "t", attempt)
     assert again(where, ["t"], BY) == {
         "t": "2 failed attempts count no longer; will be taken again"
     }

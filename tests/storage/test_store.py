@@ -10,7 +10,7 @@ from storage.lock import Locked, exclusive
 from storage.recording import Recording
 from storage.store import Store, StoreError
 from storage.verify import verify
-from tests.storage.trials import FRAME, campaign, commit, fill, record
+from tests.storage.trials import FRAME, campaign, commit, fail, fill, record
 
 
 def test_a_committed_trial_reads_as_it_was_written(tmp_path: Path) -> None:
@@ -59,10 +59,7 @@ def test_what_was_not_committed_is_quarantined_with_its_cause(tmp_path: Path) ->
 def test_a_failed_attempt_keeps_its_data_and_counts(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     for attempt in range(2):
-        writer = where.begin("t", FRAME, 100)
-        fill(writer)
-        cause = {"cause": "gate: frames_lost = 3", "trial": "t", "attempt": attempt}
-        writer.set_aside(where.quarantine_path("t"), record("t"), {}, cause)
+        fail(where, "t", attempt)
     assert where.failed_attempts() == {"t": 2}
     assert (where.folder / "quarantine" / "t.2" / "data.h5").exists()
 

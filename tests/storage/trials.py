@@ -92,3 +92,11 @@ def commit(where: Campaign, trial: str, **changes: Any) -> Path:
     writer = where.begin(trial, FRAME, 100)
     fill(writer)
     return writer.commit(record(trial, **changes), {"host": "test"})
+
+
+def fail(where: Campaign, trial: str, attempt: int) -> None:
+    """An attempt that a gate set aside."""
+    writer = where.begin(trial, FRAME, 100)
+    fill(writer)
+    cause = {"cause": "gate: frames_lost = 3", "trial": trial, "attempt": attempt}
+    writer.set_aside(where.quarantine_path(trial), record(trial), {}, cause)
