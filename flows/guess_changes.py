@@ -23,6 +23,22 @@ FIGURES = {
 }
 """What is compared, and how it is called. Depth zero is what the rig found by touching the plate:
 it tells contact by events, so a guess of the camera moves it, and with it every depth."""
+NAMES = {
+    "scene.friction.path_variation": "friction's variation on its path",
+    "scene.friction.correlation_mm": "length of that variation",
+    "scene.friction.papilla_scatter": "friction's scatter by papilla",
+    "scene.friction.kinetic": "friction",
+    "scene.skin.youngs_modulus_mpa": "Young's modulus of the skin",
+    "scene.skin.base_normal_n_per_m": "stiffness of its base, along",
+    "event_camera.shift_mm_per_n": "image's shift by force",
+    "event_camera.growth_mm_per_n": "image's growth by force",
+    "event_camera.radius_mm": "radius of the markers",
+    "event_camera.contrast": "contrast of the markers",
+    "event_camera.threshold": "threshold of events",
+    "event_camera.noise_hz": "noise of events",
+}
+"""The guesses in words: the three families of decision 12 that decide accuracy, and whatever moves
+an onset or a rate by a tenth (its table)."""
 UNITS = {name: "%" if name == "strict" else name.rsplit("_", 1)[1] for name in FIGURES}
 
 

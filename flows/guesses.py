@@ -24,7 +24,7 @@ from flows import console, evaluate
 from flows.campaigns import Collected, collected, training_campaigns
 from flows.collect import collect
 from flows.evaluate import choose_model
-from flows.guess_changes import AS_IT_IS, figures
+from flows.guess_changes import AS_IT_IS, NAMES, figures
 from flows.label import label
 from flows.orders import Order, make_order
 from flows.reviewed import Labels
@@ -47,15 +47,8 @@ from storage.store import Store, StoreError
 
 STEP, FILE, VERSION = "guesses", "results.json", 1
 TRIALS = 20
-GUESSES = (
-    "scene.friction.path_variation", "scene.friction.correlation_mm",
-    "scene.friction.papilla_scatter", "scene.friction.kinetic",
-    "scene.skin.youngs_modulus_mpa", "scene.skin.base_normal_n_per_m",
-    "event_camera.shift_mm_per_n", "event_camera.growth_mm_per_n", "event_camera.radius_mm",
-    "event_camera.contrast", "event_camera.threshold", "event_camera.noise_hz",
-)  # fmt: skip
-"""The three families of guesses of decision 12 that decide accuracy, and whatever moves an onset or
-a rate by a tenth (its table)."""
+GUESSES = tuple(NAMES)
+"""What is tried unless others are named."""
 
 Json = dict[str, Any]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from analysis.figures_changes import Changed, ChangePanel, lowered_and_raised
 from analysis.report import Figure, Section, Table, number, percent
-from flows.guess_changes import AS_IT_IS, FIGURES, UNITS, changes, figures
+from flows.guess_changes import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
 from flows.report_extras import FILES, command
 from storage.errors import StoreError
 from storage.store import Store
@@ -84,7 +84,8 @@ def _made(found: Json) -> Section:
             "No number of the scene was changed after its freeze, and none is known of a real "
             f"skin. These are its guesses, each {share:.0f} % down and up: {trials} test trials "
             "spread over their conditions were taken again with the same seeds, labelled anew and "
-            "judged by this network and these detection settings."
+            "judged by this network and these detection settings. The rig finds depth zero by "
+            "touching, which it tells by events: what changes these moves every depth, too."
         ],
         [picture],
         [table],
@@ -92,7 +93,7 @@ def _made(found: Json) -> Section:
 
 
 def _short(name: str) -> str:
-    return name.split(".")[-1]
+    return NAMES.get(name, name.split(".")[-1])
 
 
 def _scale(key: str) -> float:

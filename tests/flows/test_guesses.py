@@ -111,7 +111,7 @@ def test_the_report_shows_them(store: Store) -> None:
     report(store, collected(store))
     page = (store.folder / "report" / "index.html").read_text()
     assert guesses_section.TITLE in page
-    assert "contrast" in page
+    assert "contrast of the markers" in page
     data = (store.folder / "report/data/guesses.csv").read_text().splitlines()
     assert data[0].startswith("simulated,guess") or "guess" in data[0]
     assert len(data) == 3
