@@ -21,6 +21,7 @@ PACKAGES = (
     "sliplab", "numpy", "scipy", "numba", "h5py", "hdf5plugin", "av",
     "opencv-contrib-python-headless", "torch", "sinabs", "prefect",
     "pypylon", "dv-processing", "bluesky", "pandas", "pyarrow",
+    "snntorch", "spikingjelly", "norse", "tonic",
 )  # fmt: skip
 
 Figures = dict[str, float]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import measure
+from benchmarks import kept, measure
 from benchmarks.trials import stretch
 
 TINY: dict[str, dict[str, Any]] = {
@@ -106,18 +107,36 @@ def test_ratios_are_of_pairs() -> None:
     }
 
 
-def test_the_page_has_every_figure_once() -> None:
-    one = {
-        "name": "scene",
-        "figures": {"a_ms": 1.25, "a_ms_min": 1.0, "a_ms_max": 2.0, "b_mb": 1234.5, "c_ms": None},
-        "versions": {"python": "3"},
-        "machine": {"cpu": "some", "cores": 2, "memory_gb": 8.0, "os": "an OS"},
-        "seed": 1,
-    }
-    page = command.markdown([one], "2026-01-01")
-    assert "| a_ms | 1.25 | 1 to 2 |" in page
-    assert "| b_mb | 1,234 |  |" in page
-    assert "| c_ms | - |  |" in page
+def a_result(name: str, day: str, **figures: float | None) -> dict[str, Any]:
+    machine = {"cpu": "some", "cores": 2, "memory_gb": 8.0, "os": "an OS"}
+    return {
+        "name": name, "figures": figures, "versions": {"python": "3"}, "machine": machine,
+        "seed": 1, "day": day,
+    }  # fmt: skip
+
+
+def test_the_page_has_every_figure_once(tmp_path: Path) -> None:
+    names = ("storage", "scene", "clocks")
+    folder, page = tmp_path / "results", tmp_path / "RESULTS.md"
+    first = a_result(
+        "scene", "2026-01-01", a_ms=1.25, a_ms_min=1.0, a_ms_max=2.0, b_mb=1234.5, c_ms=None
+    )
+    kept.keep(first, names, folder, page)
+    kept.keep(a_result("storage", "2026-01-02", d=1.0), names, folder, page)
+    kept.keep(a_result("clocks", "2026-01-01", e=5.0), names, folder, page)
+    text = page.read_text()
+    assert "| a_ms | 1.25 | 1 to 2 |" in text
+    assert "| b_mb | 1,234 |  |" in text
+    assert "| c_ms | - |  |" in text
+    assert [line for line in text.splitlines() if line.startswith("## ")] == [
+        "## storage", "## scene", "## clocks",
+    ]  # fmt: skip
+    assert "**Run 1**: 2026-01-02, some, 2 cores" in text
+    assert "**Run 2**: 2026-01-01, some, 2 cores" in text
+    assert text.index("As run 2.") > text.index("## clocks")
+    kept.keep(a_result("scene", "2026-01-03", a_ms=1.0), names, folder, page)
+    assert "| a_ms | 1 |  |" in page.read_text()
+    assert "b_mb" not in page.read_text()
 
 
 def test_an_unknown_name_is_refused(
