@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import RUNS
-from storage.files import read_json, write_json, write_text
+from storage.files import read_json, write_text
 
 FOLDER = Path(__file__).with_name("results")
 PAGE = Path(__file__).with_name("RESULTS.md")
@@ -21,7 +21,8 @@ Result = dict[str, Any]
 def keep(result: Result, names: Sequence[str], folder: Path = FOLDER, page: Path = PAGE) -> None:
     """Keep a result in the place of its last, and write the page anew, in the order of `names`."""
     folder.mkdir(exist_ok=True)
-    write_json(folder / f"{result['name']}.json", result)
+    # not sorted: figures stand in the order that their benchmark gives them
+    write_text(folder / f"{result['name']}.json", json.dumps(result, indent=1) + "\n")
     there = [folder / f"{name}.json" for name in names]
     write_text(page, markdown([read_json(path) for path in there if path.exists()]))
 
