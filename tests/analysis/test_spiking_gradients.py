@@ -12,9 +12,9 @@ from analysis.sparse import SparseWindows
 from analysis.spiking import Job, Trainer, WindowLoss, torch_weights
 from analysis.spiking_gradients import _through
 from protocols.settings import Network, Windows
-from tests.analysis.test_spiking import FULL, SMALL, TINY, gridded, one_thread, put, sparse
+from tests.analysis.test_spiking import FULL, SMALL, TINY, gridded, put, sparse
 
-__all__ = ["one_thread"]
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 CONSTANTS = np.array([1, 0.5, 1], np.float32)
 """Threshold, width and scale of the surrogate."""

@@ -72,7 +72,7 @@ def test_a_benchmark_gives_what_is_promised(
     assert command.main() == 0
     (line,) = capsys.readouterr().out.splitlines()
     found = json.loads(line)
-    assert set(found) == {"name", "figures", "versions", "machine", "seed"}
+    assert set(found) == {"name", "figures", "versions", "machine", "seed", "day"}
     assert found["name"] == name
     assert found["figures"].keys() >= PROMISED[name]
     for figure, value in found["figures"].items():
