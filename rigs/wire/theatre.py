@@ -75,6 +75,7 @@ class Theatre:
         clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
         plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self._arm_clock = clocks.arm
+        self._arm_by_host = arm.driver == "abb_socket"
         self._path = MotionPath(plane, start_pose(settings), clocks.arm)
         self.world = World(settings, self._path, run_on=True)
         self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
@@ -181,10 +182,13 @@ class Theatre:
         self._stamps_us.clear()
 
     def truth(self, reference_arm_ns: int) -> dict[str, Any]:
-        """What really happened after that moment of the arm controller's clock."""
+        """What really happened after that moment of the clock that the arm's times are told by."""
         self.turn()
-        true_ns = self._arm_clock.to_device(reference_arm_ns) - self.world.past_ns
-        return truth_of(self.world, self._box.clock, true_ns)
+        if self._arm_by_host:
+            total_ns = reference_arm_ns - self._origin_ns
+        else:
+            total_ns = self._arm_clock.to_device(reference_arm_ns)
+        return truth_of(self.world, self._box.clock, total_ns - self.world.past_ns)
 
     def sent(self) -> Counter[str]:
         """What was sent since the trial began, by stream; pulses of the box since its last ARM."""

@@ -139,3 +139,7 @@ def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> 
     gates = recording.record["quality"]["gates"]
     assert gates["sync_uncertainty_arm_s"]["grade"] == "host time"
     assert gates["sync_uncertainty_frames_s"]["grade"] == "hardware trigger"
+    # what is true is told from when this slide was asked for, by whatever clock the arm has
+    truth = recording.simulation_truth()
+    assert truth is not None
+    assert -50_000_000 < recording.step("slide")[0] - truth["reference_ns"] < 1_000_000_000
