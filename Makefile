@@ -18,11 +18,7 @@ demo: $(DONE)
 
 test: $(DONE)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime and not long'
-	@mkdir -p build; \
-	$(BIN)/python -m pytest -m 'realtime and not long' tests/rigs >build/realtime.log 2>&1 & \
-	rigs=$$!; $(BIN)/python -m pytest -m 'realtime and not long' --ignore=tests/rigs; others=$$?; \
-	wait $$rigs; of_rigs=$$?; cat build/realtime.log; exit $$((others + of_rigs))
-
+	$(BIN)/python -m pytest -m 'realtime and not long'
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)
