@@ -136,7 +136,7 @@ class Stream:
             self._state, self._scratch, self._fired,
         )  # fmt: skip
         fires = np.zeros(len(CLASSES), np.bool_)
-        fires[self._scratch[3][-1][:n]] = True
+        fires[self._scratch[1][-1][:n]] = True
         return fires
 
     def reset(self) -> None:
@@ -244,19 +244,21 @@ class Trainer:
         except IndexError:
             layout = self.layout
             sizes = [len(rest) for rest in layout.rest]
-            _, c1, kernel, _ = layout.shapes[1]
+            one, two = (table.target for table in layout.tables[:2])
+            above = [table.target.places for table in layout.tables[1:]]
+            kernel = layout.shapes[1][2]
             kept = (
                 tuple(np.empty((self.steps, size), np.float32) for size in sizes),
                 tuple(np.empty(self.steps * size, np.uint64) for size in sizes),
                 tuple(np.empty(self.steps + 1, np.uint64) for size in sizes),
             )
             planes = (
-                tuple(np.zeros((self.steps, size), np.float32) for size in sizes[1:]),
+                tuple(np.zeros((self.steps, places), np.float32) for places in above),
                 np.zeros(max(sizes), np.float32),
                 np.zeros(sizes[0], np.float32),
-                np.zeros((layout.tables[1].target.full ** 2, c1 * kernel * kernel), np.float32),
+                np.zeros((two.full**2, one.depth * kernel * kernel), np.float32),
             )
-            row = np.zeros(sizes[-1], np.float32)
+            row = np.zeros(above[-1], np.float32)
             return layout.state(), layout.scratch(), kept, planes, row
 
     def give_back(self, memory: tuple[Any, Any, Any, Any, F32]) -> None:

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from analysis.lanes import LANES, add, add_times
 from analysis.spiking_kernels import fire, scatter, scatter_counts
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
-_U0, _U1, _U2, _U3 = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+_U0, _LANES = np.uint64(0), np.uint64(LANES)
 _AT_ONCE = 4
 """Steps that one product of matrices takes: few enough for the library not to ask other threads."""
 
@@ -41,15 +42,15 @@ def forward_kept(
     """One window forward, with what the way back needs.
 
     Args:
-        spans: of each layer uint64 (n, 2), where its neurons lie; multiples of 8.
+        spans: of each layer uint64 (n, 2), where its neurons lie; see `fire`.
         potentials: of each layer float32 (steps, neurons), filled with u inside the spans.
         lists: of each layer, filled with its spikes, one step after the other.
         ends: of each layer uint64 (steps + 1,), filled with where a step's spikes end.
         out: int64 (3,), grows by the output spikes.
         the rest: see `analysis.spiking_kernels`.
     """
-    reach, weights, stride_w, stride = layers
-    currents, fired, words, _, _, _ = scratch
+    reach, weights, shape = layers
+    currents = scratch[0]
     last = len(state) - 1
     for k in range(len(state)):
         state[k][:] = rest[k]
@@ -57,20 +58,19 @@ def forward_kept(
     for t in range(steps):
         at = row * steps + t
         scatter_counts(
-            cell, count, offsets[at], offsets[at + 1], reach[0], weights[0], stride_w[0],
-            stride[0], currents[0],
-        )  # fmt: skip
+            cell, count, offsets[at], offsets[at + 1], reach[0], weights[0], shape[0], currents[0]
+        )
         for k in range(len(state)):
             if k > 0:
                 scatter(
                     lists[k - 1], ends[k - 1][t], ends[k - 1][t + 1], reach[k], weights[k],
-                    stride_w[k], stride[k], currents[k],
+                    shape[k], currents[k],
                 )  # fmt: skip
             n = ends[k][t]
             for i in range(spans[k].shape[0]):
                 n = fire(
-                    currents[k], state[k], potentials[k][t], threshold, fired, words,
-                    spans[k][i, 0], spans[k][i, 1], lists[k], n,
+                    currents[k], state[k], potentials[k][t], threshold, spans[k][i, 0],
+                    spans[k][i, 1], lists[k], n,
                 )  # fmt: skip
             ends[k][t + 1] = n
     for e in range(ends[last][steps]):
@@ -117,15 +117,18 @@ def _through(
 def _back_in_time(
     g: Any, u: Any, start: int, threshold: Any, width: Any, scale: Any, du: Any
 ) -> None:
-    """The gradient by a layer's spikes in `g` (steps, m) becomes dL/du; `du` (m,) is scratch."""
-    n = np.uint64(u.shape[1])
+    """The gradient by a layer's spikes in `g` (steps, m) becomes dL/du; `du` (m,) is scratch.
+
+    Of the potentials (steps, ...) the first m of a step are meant.
+    """
+    n = np.uint64(g.shape[1])
     du[:] = _F0
     for t in range(u.shape[0] - 1, start - 1, -1):
         _through(g[t], u[t], threshold, width, scale, du, _U0, n)
         g[t] = du
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _spread(taps: Any, pixels: Any, rows: int, stride: Any, g: Any) -> None:
     """Gradient by the spikes of layer 1: what every pixel's taps add up to.
 
@@ -142,33 +145,34 @@ def _spread(taps: Any, pixels: Any, rows: int, stride: Any, g: Any) -> None:
         of = taps[pixels[i, 0]]
         at, k = np.uint64(pixels[i, 1]), _U0
         for _ in range(rows):
-            for j in range(run):
-                g[at + j] += of[k + j]
+            for j in range(_U0, run, _LANES):
+                add(g, at + j, of, k + j)
             k += run
             at += stride
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _gather(
-    sources: Any, counts: Any, begin: Any, end: Any, reach: Any, du: Any, stride_w: Any,
-    stride: Any, grad: Any,
-) -> None:  # fmt: skip
+    sources: Any, counts: Any, begin: Any, end: Any, reach: Any, du: Any, shape: Any, grad: Any
+) -> None:
     """What a source adds to currents, the gradient by its weights gets from them."""
+    stride_w, stride, runs, length = shape
     for e in range(begin, end):
-        s = sources[e]
-        at, w = np.uint64(reach[s, 0]), np.uint64(reach[s, 1])
-        length = np.uint64(reach[s, 3])
+        at, w = np.uint64(reach[sources[e], 0]), np.uint64(reach[sources[e], 1])
         amount = _F1 if counts is None else np.float32(counts[e])
-        for _ in range(reach[s, 2]):
-            for j in range(length):
-                grad[w + j] += amount * du[at + j]
+        for _ in range(runs):
+            for j in range(_U0, length, _LANES):
+                if counts is None:
+                    add(grad, w + j, du, at + j)
+                else:
+                    add_times(grad, w + j, du, at + j, amount)
             at += stride
             w += stride_w
 
 
 @njit(cache=True, nogil=True)
 def backward(
-    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, spans: Any, back: Any,
+    cell: Any, count: Any, offsets: Any, row: int, steps: int, layers: Any, back: Any,
     constants: Any, potentials: Any, lists: Any, ends: Any, by_count: Any, planes: Any,
     grads: Any,
 ) -> None:  # fmt: skip
@@ -178,9 +182,9 @@ def backward(
     first, whose planes are large, step by step, while a step's planes are in the cache.
 
     Args:
-        spans: see `forward_kept`.
-        back: (pixels, weights (channels of layer 2, taps) and kernel rows of layer 2, weights of
-            layer 3 (H, F), of layer 4 (3, H), rows of zeros below).
+        back: (where layer 1's neurons lie, uint64 (n, 2); pixels, weights (channels of layer 2,
+            taps) and kernel rows of layer 2; weights of layer 3 (H, F), of layer 4 (3, H); all
+            filled up with zeros).
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
         by_count: float32, gradient by the window's output counts, zero beyond the three.
@@ -188,8 +192,8 @@ def backward(
             gradient by the spikes of layer 1, taps of a step).
         grads: of each layer, in the packed order.
     """
-    reach, _, stride_w, stride = layers
-    pixels, back2, rows, back3, back4 = back
+    reach, _, shape = layers
+    runs, pixels, back2, rows, back3, back4 = back
     threshold, width, scale = constants
     above, du, g, taps = planes
     du2, du3, du4 = above
@@ -209,21 +213,16 @@ def backward(
     du[:] = _F0
     for t in range(steps - 1, start - 1, -1):
         np.dot(du2[t, : taps.shape[0] * channels].reshape((-1, channels)), back2, taps)
-        _spread(taps, pixels, rows, stride[0], g)
-        for i in range(spans[0].shape[0]):
-            _through(
-                g, potentials[0][t], threshold, width, scale, du, spans[0][i, 0], spans[0][i, 1]
-            )
+        _spread(taps, pixels, rows, shape[0][1], g)
+        for i in range(runs.shape[0]):
+            _through(g, potentials[0][t], threshold, width, scale, du, runs[i, 0], runs[i, 1])
         for k in range(1, len(grads)):
             _gather(
                 lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], above[k - 1][t],
-                stride_w[k], stride[k], grads[k],
+                shape[k], grads[k],
             )  # fmt: skip
         at = row * steps + t
-        _gather(
-            cell, count, offsets[at], offsets[at + 1], reach[0], du, stride_w[0], stride[0],
-            grads[0],
-        )  # fmt: skip
+        _gather(cell, count, offsets[at], offsets[at + 1], reach[0], du, shape[0], grads[0])
 
 
 @njit(cache=True, nogil=True)
@@ -264,7 +263,7 @@ def windows_loss(
             by_count[k] = np.float32(gain * math.exp(gain * (out[i, k] - most)) / total)
         by_count[labels[i]] -= np.float32(gain)
         backward(
-            cell, count, offsets, rows[i], steps, layers, spans, back, constants, potentials,
+            cell, count, offsets, rows[i], steps, layers, back, constants, potentials,
             lists, ends, by_count, planes, grads,
         )  # fmt: skip
     return loss

@@ -14,13 +14,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from analysis.lanes import BLOCK, LANES
+
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]
 U32 = npt.NDArray[np.uint32]
 U64 = npt.NDArray[np.uint64]
 
-LANES = 8
-"""Planes hold a multiple of so many neurons, because spikes are looked for eight at a time."""
+
+def whole(count: int, of: int) -> int:
+    """The least multiple of `of` that is not below `count`."""
+    return -(-count // of) * of
 
 
 @dataclass(frozen=True)
@@ -40,22 +44,32 @@ class Plane:
     full: int
 
     @property
+    def depth(self) -> int:
+        """Places of a pixel: its neurons, filled up to whole vectors."""
+        return whole(self.channels, LANES)
+
+    @property
+    def places(self) -> int:
+        """Places of all pixels, with the border."""
+        return self.full * self.full * self.depth
+
+    @property
     def size(self) -> int:
-        """Neurons with the border, a multiple of `LANES`."""
-        return -(-self.full * self.full * self.channels // LANES) * LANES
+        """The same up to a multiple of `BLOCK`, because so many neurons take a step at once."""
+        return whole(self.places, BLOCK)
 
     def index(self) -> I64:
         """Places of the neurons proper, int64 (side, side, channels)."""
         line = np.arange(self.pad, self.pad + self.side)
         pixel = line[:, None] * self.full + line
-        return pixel[:, :, None] * self.channels + np.arange(self.channels)
+        return pixel[:, :, None] * self.depth + np.arange(self.channels)
 
-    def spans(self) -> U64:
-        """Uint64 (n, 2): runs of neurons that hold all proper ones, bounds multiples of `LANES`."""
+    def spans(self, of: int) -> U64:
+        """Uint64 (n, 2): runs of neurons that hold all proper ones, bounds multiples of `of`."""
         index = self.index().reshape(self.side, -1)
         found: list[list[int]] = []
         for first, last in zip(index[:, 0].tolist(), index[:, -1].tolist(), strict=True):
-            begin, end = first // LANES * LANES, -(-(last + 1) // LANES) * LANES
+            begin, end = first // of * of, whole(last + 1, of)
             if found and begin <= found[-1][1]:
                 found[-1][1] = end
             else:
@@ -74,8 +88,9 @@ class Table:
     """What the sources of a layer reach, and where its weights are packed.
 
     Attributes:
-        reach: uint32 (sources, 4), see `analysis.spiking_kernels.scatter`.
+        reach: uint32 (sources, 2), see `analysis.spiking_kernels`.
         stride_w, stride: from a run to the next among weights and among currents.
+        runs, length: how many runs a source has, and weights of one.
         order: int64, for each packed weight its place in torch's flattened weight; -1 for none.
         target: the neurons.
     """
@@ -83,8 +98,15 @@ class Table:
     reach: U32
     stride_w: int
     stride: int
+    runs: int
+    length: int
     order: I64
     target: Plane
+
+    @property
+    def shape(self) -> tuple[np.uint64, ...]:
+        """What `analysis.spiking_kernels` calls the shape of a layer."""
+        return tuple(map(np.uint64, (self.stride_w, self.stride, self.runs, self.length)))
 
     def pack(self, weight: F32) -> F32:
         """A weight of torch's shape, packed."""
@@ -104,7 +126,7 @@ class Table:
         return places
 
 
-def first_convolution(channels: int, cells: int, c1: int, kernel: int, plane: Plane) -> Table:
+def first_convolution(channels: int, cells: int, kernel: int, plane: Plane) -> Table:
     """From the input's cells (channel, y, x); torch's weight is (c1, channels, kernel, kernel).
 
     A unit at (y, x) reaches outputs y + kernel // 2 - d by tap d, for each d: in the order of
@@ -112,16 +134,17 @@ def first_convolution(channels: int, cells: int, c1: int, kernel: int, plane: Pl
     """
     p = kernel // 2
     taps = np.arange(kernel)[::-1]
-    o = np.arange(c1)[None, None, None, :]
+    o = np.arange(plane.depth)[None, None, None, :]
     i = np.arange(channels)[:, None, None, None]
     order = ((o * channels + i) * kernel + taps[None, :, None, None]) * kernel
-    order = order + taps[None, None, :, None]
-    reach = np.zeros((channels, cells, cells, 4), np.uint32)
+    order = np.where(o < plane.channels, order + taps[None, None, :, None], -1)
+    reach = np.zeros((channels, cells, cells, 2), np.uint32)
     line = np.arange(cells) + plane.pad - p
-    reach[..., 0] = (line[:, None] * plane.full + line) * c1
-    reach[..., 1] = i[:, :, :, 0] * kernel * kernel * c1
-    reach[..., 2], reach[..., 3] = kernel, kernel * c1
-    return Table(reach.reshape(-1, 4), kernel * c1, plane.full * c1, order.ravel(), plane)
+    length = kernel * plane.depth
+    reach[..., 0] = (line[:, None] * plane.full + line) * plane.depth
+    reach[..., 1] = i[:, :, :, 0] * kernel * length
+    stride = plane.full * plane.depth
+    return Table(reach.reshape(-1, 2), length, stride, kernel, length, order.ravel(), plane)
 
 
 def strided_taps(kernel: int) -> tuple[list[list[int]], list[int]]:
@@ -140,7 +163,8 @@ def strided_plane(cells: int, c2: int, kernel: int) -> Plane:
     taps, first = strided_taps(kernel)
     side = (cells + 1) // 2
     pad = max(0, *(-at for at in first))
-    ends = [y // 2 + first[y % 2] + len(taps[y % 2]) for y in range(cells)]
+    most = max(map(len, taps))  # those that there are not are filled up with zeros
+    ends = [y // 2 + first[y % 2] + most for y in range(cells)]
     return Plane(side, c2, pad, pad + max(side, *ends))
 
 
@@ -149,26 +173,23 @@ def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
     taps, first = strided_taps(kernel)
     c1, c2 = below.channels, plane.channels
     most = max(map(len, taps))
-    order = np.full((c1, 2, 2, most, most, c2), -1, np.int64)
+    order = np.full((c1, 2, 2, most, most, plane.depth), -1, np.int64)
     i, o = np.arange(c1)[:, None], np.arange(c2)[None, :]
     for py in (0, 1):
         for px in (0, 1):
             for a, dy in enumerate(taps[py]):
                 for b, dx in enumerate(taps[px]):
-                    order[:, py, px, a, b] = ((o * c1 + i) * kernel + dy) * kernel + dx
-    reach = np.zeros((below.size, 4), np.uint32)
+                    order[:, py, px, a, b, :c2] = ((o * c1 + i) * kernel + dy) * kernel + dx
+    reach = np.zeros((below.size, 2), np.uint32)
     line = np.arange(below.side)
     parity = line % 2
     at = line // 2 + np.array(first)[parity] + plane.pad
-    many = np.array([len(of) for of in taps])[parity]
     index = below.index()
-    reach[index, 0] = ((at[:, None] * plane.full + at) * c2)[:, :, None]
-    block = most * most * c2
+    reach[index, 0] = ((at[:, None] * plane.full + at) * plane.depth)[:, :, None]
+    length = most * plane.depth
+    block = most * length
     reach[index, 1] = ((np.arange(c1) * 2 + parity[:, None, None]) * 2 + parity[:, None]) * block
-    reach[index, 2] = many[:, None, None]
-    reach[index, 3] = many[None, :, None] * c2
-    reach[reach[:, 3] == 0, 2] = 0
-    return Table(reach, most * c2, plane.full * c2, order.ravel(), plane)
+    return Table(reach, length, plane.full * plane.depth, most, length, order.ravel(), plane)
 
 
 def full_layer(below: Plane, n: int) -> Table:
@@ -176,12 +197,11 @@ def full_layer(below: Plane, n: int) -> Table:
     plane = Plane(1, n, 0, 1)
     index = below.index()
     sources = index.transpose(2, 0, 1).ravel()  # in the order in which torch flattens
-    order = np.full((below.size, n), -1, np.int64)
-    order[sources] = np.arange(n)[None, :] * sources.size + np.arange(sources.size)[:, None]
-    reach = np.zeros((below.size, 4), np.uint32)
-    reach[:, 1] = np.arange(below.size) * n
-    reach[sources, 2], reach[:, 3] = 1, n
-    return Table(reach, n, n, order.ravel(), plane)
+    order = np.full((below.size, plane.depth), -1, np.int64)
+    order[sources, :n] = np.arange(n)[None, :] * sources.size + np.arange(sources.size)[:, None]
+    reach = np.zeros((below.size, 2), np.uint32)
+    reach[:, 1] = np.arange(below.size) * plane.depth
+    return Table(reach, plane.depth, plane.depth, 1, plane.depth, order.ravel(), plane)
 
 
 def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
@@ -193,15 +213,15 @@ def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
     here = (line[:, None] + plane.pad) * plane.full + line + plane.pad
     there = 2 * line + below.pad - kernel // 2
     under = there[:, None] * below.full + there
-    pixels = np.stack([here, under * below.channels], axis=-1)
+    pixels = np.stack([here, under * below.depth], axis=-1)
     return pixels.reshape(-1, 2).astype(np.uint32)
 
 
-def _rows(matrix: F32, many: int) -> F32:
-    """A matrix with rows of zeros below, for neurons that fill up the lanes."""
-    rows = np.zeros((many, matrix.shape[1]), np.float32)
-    rows[: len(matrix)] = matrix
-    return rows
+def _filled(values: F32, *shape: int) -> F32:
+    """The same with zeros behind along each axis, for neurons that fill up the lanes."""
+    filled = np.zeros(shape, np.float32)
+    filled[tuple(map(slice, values.shape))] = values
+    return filled
 
 
 class Layout:
@@ -215,14 +235,14 @@ class Layout:
         two = strided_plane(cells, c2, k2)
         three = full_layer(two, hidden)
         self.tables = (
-            first_convolution(channels, cells, c1, k1, one),
+            first_convolution(channels, cells, k1, one),
             second_convolution(one, k2, two),
             three,
             full_layer(three.target, out),
         )
         planes = [table.target for table in self.tables]
         self.rest = tuple(plane.rest() for plane in planes)
-        self.spans = tuple(plane.spans() for plane in planes)
+        self.spans = tuple(plane.spans(BLOCK) for plane in planes)
         self.neurons = tuple(plane.side * plane.side * plane.channels for plane in planes)
 
     def layers(self, weights: list[F32]) -> tuple[Any, ...]:
@@ -230,22 +250,23 @@ class Layout:
         return (
             tuple(table.reach for table in self.tables),
             tuple(table.pack(w) for table, w in zip(self.tables, weights, strict=True)),
-            tuple(np.uint64(table.stride_w) for table in self.tables),
-            tuple(np.uint64(table.stride) for table in self.tables),
+            tuple(table.shape for table in self.tables),
         )
 
     def back(self, weights: list[F32]) -> tuple[Any, ...]:
         """What `analysis.spiking_gradients.backward` takes for them."""
-        c2, _, kernel, _ = self.shapes[1]
+        kernel = self.shapes[1][2]
         one, two, three, four = (table.target for table in self.tables)
+        of2 = weights[1].transpose(0, 2, 3, 1)
         of3 = self.tables[2].pack(weights[2]).reshape(two.size, -1)
         of4 = self.tables[3].pack(weights[3]).reshape(three.size, -1)
         return (
+            one.spans(LANES),
             strided_back(one, kernel, two),
-            np.ascontiguousarray(weights[1].transpose(0, 2, 3, 1)).reshape(c2, -1),
+            _filled(of2, two.depth, kernel, kernel, one.depth).reshape(two.depth, -1),
             kernel,
-            _rows(of3.T, three.size),
-            _rows(of4.T, four.size),
+            _filled(of3.T[:, : two.places], three.places, two.places),
+            _filled(of4.T[:, : three.places], four.places, three.places),
         )
 
     def unpack(self, grads: Sequence[F32]) -> list[F32]:
@@ -262,12 +283,9 @@ class Layout:
     def scratch(self) -> tuple[Any, ...]:
         """Memory for one thread; see `analysis.spiking_kernels.step`."""
         sizes = [len(rest) for rest in self.rest]
-        fired = np.zeros(max(sizes), np.uint8)
         rows = self.tables[0].target.full
         return (
             tuple(np.zeros(size, np.float32) for size in sizes),
-            fired,
-            fired.view(np.uint64),
             tuple(np.zeros(size, np.uint64) for size in sizes),
             np.zeros(rows, np.uint64),
             np.zeros(rows, np.uint64),
