@@ -23,6 +23,8 @@ BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
     "#CC79A7",
     "#666666",
 )
+WIDTH = 6.4
+"""Inches: what still can be read when a telephone shrinks it."""
 _DPI = 150
 """Of what is rasterised."""
 STYLE = {

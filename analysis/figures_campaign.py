@@ -8,8 +8,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
-from analysis.figures_conditions import WIDTH
+from analysis.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, WIDTH, svg_text
 
 DENSE = 250
 """From this many marks on they are drawn as pixels, not as shapes."""

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 
-from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
+from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
 
-WIDTH = 6.4
 _ROW, _AROUND = 0.3, 1.5
 _APART = 0.16
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 import matplotlib.pyplot as plt
 import numpy as np
 
-from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
+from analysis.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
 from analysis.intervals import interval
 
-WIDTH = 6.4
-"""Inches: what still can be read when a telephone shrinks it."""
 _ROW, _AROUND = 0.26, 1.25
 _SEED = 0
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.figure_style import BLUE, GREY, RED, STYLE, svg_text
-from analysis.figures_conditions import WIDTH
+from analysis.figure_style import BLUE, GREY, RED, STYLE, WIDTH, svg_text
 
 
 @dataclass(frozen=True)
