@@ -64,8 +64,10 @@ def activity(net: nn.Sequential, x: npt.NDArray[np.uint8], batch: int = 64) -> A
                 layer = layers[weighted]
                 if isinstance(layer, nn.Linear):
                     at = at.flatten(1)
-                    operations[weighted] += float(at.sum(dtype=torch.float64)) * layer.out_features
-                    dense[weighted] = steps * layer.in_features * layer.out_features
+                    # a bias counts as one synapse that is active in every step
+                    total = float(at.sum(dtype=torch.float64)) + len(at)
+                    operations[weighted] += total * layer.out_features
+                    dense[weighted] = steps * (layer.in_features + 1) * layer.out_features
                 else:
                     ones = torch.ones_like(layer.weight[:1])
                     reached = nn.functional.conv2d(

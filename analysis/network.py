@@ -25,6 +25,13 @@ from protocols.settings import Network, Windows
 WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 """Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""
 
+BIASED = ("fc1", "fc2")
+"""Those of them with a bias as well: a current that their neurons get in every step."""
+
+FIRST_BIAS = {"fc1": (-0.5, 0.5), "fc2": (0.3, 0.3)}
+"""Between which values biases begin, in thresholds a step. Half of the hidden neurons fire by
+themselves, so that events can also silence; all outputs do, so that none is out of reach."""
+
 SPIKING = ("iaf1", "iaf2", "iaf3", "iaf4")
 """Names of the spiking layers, one after each layer of `WEIGHTED`."""
 
@@ -36,8 +43,9 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
     """A network with fresh weights: conv, conv of stride 2, two fully connected, IAF after each.
 
     Time is folded into the batch: the modules take (n * steps, channels, cells, cells) float32
-    and give (n * steps, 3) spikes. There are no biases. Weights are torch's default draw times
-    ``settings.weight_scale``; torch's global random state is left as it was.
+    and give (n * steps, 3) spikes. Weights are torch's default draw times
+    ``settings.weight_scale``; biases begin at `FIRST_BIAS`, and the convolutions have none
+    (docs/decisions/0054). torch's global random state is left as it was.
 
     Args:
         settings: channels, kernels, hidden neurons, weight scale.
@@ -59,8 +67,10 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             padding=k2 // 2,
             bias=False,
         )
-        fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden, bias=False)
-        fc2 = nn.Linear(settings.hidden, len(CLASSES), bias=False)
+        fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden)
+        fc2 = nn.Linear(settings.hidden, len(CLASSES))
+        for name, layer in (("fc1", fc1), ("fc2", fc2)):
+            nn.init.uniform_(layer.bias, *FIRST_BIAS[name])
     layers: tuple[Any, ...] = (conv1, conv2, fc1, fc2)
     with torch.no_grad():
         for layer, scale in zip(layers, settings.weight_scale, strict=True):
@@ -91,9 +101,19 @@ def _iaf(steps: int) -> IAFSqueeze:
     )
 
 
+def parameters(net: nn.Sequential) -> dict[str, nn.Parameter]:
+    """Weights and biases by name (``conv1.weight`` ...), in the order of the layers."""
+    return {
+        f"{layer}.{kind}": getattr(getattr(net, layer), kind)
+        for layer in WEIGHTED
+        for kind in ("weight", "bias")
+        if kind == "weight" or layer in BIASED
+    }
+
+
 def weights(net: nn.Sequential) -> dict[str, torch.Tensor]:
-    """Copies of the weights by name (``conv1.weight`` ...), without neuron states."""
-    return {f"{n}.weight": getattr(net, n).weight.detach().clone() for n in WEIGHTED}
+    """Copies of the same, without gradients."""
+    return {name: value.detach().clone() for name, value in parameters(net).items()}
 
 
 def set_weights(net: nn.Sequential, values: dict[str, torch.Tensor]) -> None:
@@ -102,7 +122,7 @@ def set_weights(net: nn.Sequential, values: dict[str, torch.Tensor]) -> None:
     Raises:
         ValueError: a weight is missing or too many, or has another shape.
     """
-    expected = {f"{n}.weight": getattr(net, n).weight for n in WEIGHTED}
+    expected = parameters(net)
     if set(values) != set(expected):
         raise ValueError(f"weights {sorted(values)}; expected {sorted(expected)}")
     with torch.no_grad():
@@ -166,8 +186,35 @@ EXACT = 2**24
 """Whole multiples of a grid below it are exact in float32, and so are their sums."""
 
 
+def matrices(net: nn.Sequential) -> list[npt.NDArray[np.float32]]:
+    """Copies of each layer's weights in torch's shape, a bias as one column more.
+
+    A bias is the weight of a source that fires in every step.
+    """
+    found = []
+    for name in WEIGHTED:
+        layer = getattr(net, name)
+        value = layer.weight.detach().numpy()
+        if name in BIASED:
+            value = np.column_stack([value, layer.bias.detach().numpy()])
+        found.append(np.array(value, np.float32))
+    return found
+
+
+def by_parameter(values: list[npt.NDArray[np.float32]]) -> dict[str, torch.Tensor]:
+    """The same, as `parameters` names them."""
+    found = {}
+    for name, value in zip(WEIGHTED, values, strict=True):
+        if name in BIASED:
+            found[f"{name}.weight"] = torch.from_numpy(np.ascontiguousarray(value[:, :-1]))
+            found[f"{name}.bias"] = torch.from_numpy(np.ascontiguousarray(value[:, -1]))
+        else:
+            found[f"{name}.weight"] = torch.from_numpy(value)
+    return found
+
+
 def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float32]]:
-    """Weights of each layer at the nearest points of its grid.
+    """Weights and biases (`matrices`) of each layer at the nearest points of its grid.
 
     On the grid every current is a whole multiple of it. Below `EXACT` multiples, 8192 thresholds
     in the first layer and 1024 in the others, float32 holds each partial sum exactly: then Sinabs,

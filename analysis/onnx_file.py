@@ -18,7 +18,7 @@ import numpy.typing as npt
 from torch import nn
 
 from analysis.metrics import CLASSES
-from analysis.network import SPIKING, WEIGHTED, spike_counts
+from analysis.network import SPIKING, WEIGHTED, parameters, spike_counts
 from protocols.settings import Windows
 
 OPSET = 17
@@ -55,8 +55,8 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
         helper.make_node("Transpose", ["floats"], ["by_step"], perm=[1, 0, 2, 3, 4]),
     ]
     constants = [
-        numpy_helper.from_array(layers[name].weight.detach().numpy(), f"{name}.weight")
-        for name in WEIGHTED
+        numpy_helper.from_array(value.detach().numpy(), name)
+        for name, value in parameters(net).items()
     ]
     states = [*SPIKING, "sum"]
     for name in states:
@@ -174,7 +174,8 @@ def _step_nodes(helper: Any, layers: dict[str, Any]) -> list[Any]:
             if len(nodes) and weighted == "fc1":
                 nodes.append(helper.make_node("Flatten", [at], ["flat"], axis=1))
                 at = "flat"
-            nodes.append(helper.make_node("Gemm", [at, weight], [f"{weighted}.current"], transB=1))
+            given = [at, weight, f"{weighted}.bias"]
+            nodes.append(helper.make_node("Gemm", given, [f"{weighted}.current"], transB=1))
         u, fired, at = f"{spiking}.u", f"{spiking}.fired", f"{spiking}.spikes"
         nodes += [
             helper.make_node("Add", [f"{spiking}.in", f"{weighted}.current"], [u]),

@@ -1,13 +1,14 @@
 """The network in the chip's numbers: 8-bit weights, whole thresholds, and what that changes.
 
-Each layer has one scale. It is the largest whole number that keeps the layer's weights within 8
-bits, and because the threshold is 1 it is the threshold too: exactly, without rounding. Every
-potential is then a whole number, which float32 adds without error: what is computed here is what an
-integer machine computes.
+Each layer has one scale. It is the largest whole number that keeps the layer's weights and biases
+within 8 bits, and because the threshold is 1 it is the threshold too: exactly, without rounding.
+Every potential is then a whole number, which float32 adds without error: what is computed here is
+what an integer machine computes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from numba import njit
 from torch import nn
 
 from analysis.metrics import winners
-from analysis.network import SPIKING, WEIGHTED, build, set_weights
+from analysis.network import SPIKING, WEIGHTED, build, parameters, set_weights
 from analysis.speck import STATE_BITS, WEIGHT_BITS
 from analysis.training import Fitted
 
@@ -35,7 +36,7 @@ class Quantised:
     """A network in whole numbers.
 
     Attributes:
-        weights: int8 by name of the layer, in torch's layout.
+        weights: int8, weights and biases in torch's layout and by torch's names.
         thresholds: whole thresholds of the spiking layers by name.
         scales: by which weights and threshold of a layer were multiplied.
     """
@@ -47,25 +48,33 @@ class Quantised:
     def rounding(self, net: nn.Sequential) -> dict[str, float]:
         """RMS of what rounding changed in each layer, as a share of the RMS of its weights."""
         found = {}
-        for name, whole in self.weights.items():
-            real = _weight(net, name)
+        for name in WEIGHTED:
+            real = _numbers(net, name)
+            whole = np.concatenate([w.ravel() for k, w in self.weights.items() if _of(name, k)])
             off = whole / self.scales[name] - real
             found[name] = float(np.sqrt((off**2).mean() / (real**2).mean()))
         return found
+
+    def times(self, factors: Mapping[str, int]) -> dict[str, torch.Tensor]:
+        """The whole numbers of each layer by so many, as `analysis.network.set_weights` takes."""
+        return {
+            key: torch.from_numpy(whole.astype(np.float32) * factors[key.split(".")[0]])
+            for key, whole in self.weights.items()
+        }
 
 
 def quantise(net: nn.Sequential) -> Quantised:
     """Whole numbers for a network from `analysis.network.build`.
 
     Raises:
-        ValueError: a layer without any weight, or with weights of which one outgrows the
+        ValueError: a layer of zeros, or with weights of which one outgrows the
             threshold so far that no whole threshold is left.
     """
     low, high = -(1 << WEIGHT_BITS - 1), (1 << WEIGHT_BITS - 1) - 1
     whole: dict[str, I8] = {}
     scales, thresholds = {}, {}
     for name, spiking in zip(WEIGHTED, SPIKING, strict=True):
-        real = _weight(net, name)
+        real = _numbers(net, name)
         limits = [high / real.max()] if real.max() > 0 else []
         limits += [low / real.min()] if real.min() < 0 else []
         if not limits:
@@ -76,17 +85,17 @@ def quantise(net: nn.Sequential) -> Quantised:
             raise ValueError(f"{name}: a weight is over {high} times the threshold")
         scales[name] = scale
         thresholds[spiking] = round(scale * threshold)
-        whole[name] = np.clip(np.rint(real * scale), low, high).astype(np.int8)
+        for key, value in parameters(net).items():
+            if _of(name, key):
+                each = np.rint(value.detach().double().numpy() * scale)
+                whole[key] = np.clip(each, low, high).astype(np.int8)
     return Quantised(whole, thresholds, scales)
 
 
 def quantised_net(fitted: Fitted, found: Quantised) -> nn.Sequential:
     """The network in whole numbers, as Sinabs modules; `chip_run` runs it."""
     net = build(fitted.network, fitted.windows, fitted.seed)
-    set_weights(
-        net,
-        {f"{n}.weight": torch.from_numpy(w.astype(np.float32)) for n, w in found.weights.items()},
-    )
+    set_weights(net, found.times(dict.fromkeys(WEIGHTED, 1)))
     for name, threshold in found.thresholds.items():
         whole = nn.Parameter(torch.tensor(float(threshold)), requires_grad=False)
         getattr(net, name).spike_threshold = whole
@@ -190,6 +199,12 @@ def compare(real: Counts, whole: Counts, margin: float) -> dict[str, Any]:
     }
 
 
-def _weight(net: nn.Sequential, name: str) -> npt.NDArray[np.float64]:
-    layer: Any = getattr(net, name)
-    return np.asarray(layer.weight.detach().numpy(), np.float64)
+def _numbers(net: nn.Sequential, layer: str) -> npt.NDArray[np.float64]:
+    """All weights and biases of a layer, float64, in a row."""
+    values = [v.detach().numpy().ravel() for k, v in parameters(net).items() if _of(layer, k)]
+    return np.concatenate(values).astype(np.float64)
+
+
+def _of(layer: str, key: str) -> bool:
+    """Whether a weight by its name in torch is this layer's."""
+    return key.split(".")[0] == layer

@@ -52,11 +52,7 @@ def common_net(fitted: Fitted, found: Quantised) -> nn.Sequential:
     """
     threshold, multiples = common_threshold([found.thresholds[name] for name in SPIKING])
     net = build(fitted.network, fitted.windows, fitted.seed)
-    whole = {
-        f"{name}.weight": torch.from_numpy(found.weights[name].astype(np.float32) * times)
-        for name, times in zip(WEIGHTED, multiples, strict=True)
-    }
-    set_weights(net, whole)
+    set_weights(net, found.times(dict(zip(WEIGHTED, multiples, strict=True))))
     for name in SPIKING:
         one = nn.Parameter(torch.tensor(float(threshold)), requires_grad=False)
         getattr(net, name).spike_threshold = one

@@ -11,6 +11,7 @@ from analysis.speck import KI
 NOT_SHOWN = (
     "The chip has no time steps: it looks at a neuron's threshold after every spike, where this "
     "looks once a millisecond.",
+    "The chip adds biases (fc1, fc2) by its leak clock: it must tick once a step.",
     "The chip does not reset its neurons between windows; the program that reads it has to.",
     "Routing, delays and lost spikes of the chip are not in here, and no chip has seen this file.",
 )

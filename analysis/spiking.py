@@ -20,7 +20,7 @@ from torch import nn
 
 from analysis import spiking_gradients, spiking_kernels
 from analysis.metrics import CLASSES
-from analysis.network import SPIKING, WEIGHTED, check_samples
+from analysis.network import SPIKING, check_samples, matrices
 from analysis.sparse import SparseWindows
 from analysis.spiking_layout import Layout
 
@@ -47,7 +47,7 @@ class Engine:
         self._net = net
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.threshold, _, _ = neuron(net)
-        weights = torch_weights(net)
+        weights = matrices(net)
         self._layout = Layout(tuple(w.shape for w in weights), cells)
         self._layers = self._layout.layers(weights)
         self.shape = (self.steps, weights[0].shape[1], cells, cells)
@@ -222,9 +222,9 @@ class Trainer:
     def __init__(self, net: nn.Sequential, cells: int) -> None:
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.constants = neuron(net)
-        self.layout = Layout(tuple(w.shape for w in torch_weights(net)), cells)
+        self.layout = Layout(tuple(w.shape for w in matrices(net)), cells)
         self._idle: list[Any] = []
-        self.take(torch_weights(net))
+        self.take(matrices(net))
 
     def take(self, weights: list[F32]) -> None:
         """Use these weights from now on."""
@@ -279,11 +279,6 @@ def side_by_side(
     with ThreadPoolExecutor(count) as pool:
         for _ in pool.map(work, items):
             pass
-
-
-def torch_weights(net: nn.Sequential) -> list[F32]:
-    """Copies of a network's weights, in order."""
-    return [np.array(_layer(net, n).weight.detach().numpy(), np.float32) for n in WEIGHTED]
 
 
 def neuron(net: nn.Sequential) -> tuple[np.float32, np.float32, np.float32]:

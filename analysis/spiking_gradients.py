@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from analysis.lanes import LANES, add, add_times
-from analysis.spiking_kernels import fire, scatter, scatter_counts
+from analysis.spiking_kernels import add_bias, fire, scatter, scatter_counts
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 _U0, _LANES = np.uint64(0), np.uint64(LANES)
@@ -49,7 +49,7 @@ def forward_kept(
         out: int64 (3,), grows by the output spikes.
         the rest: see `analysis.spiking_kernels`.
     """
-    reach, weights, shape = layers
+    reach, weights, shape, bias = layers
     currents = scratch[0]
     last = len(state) - 1
     for k in range(len(state)):
@@ -66,6 +66,7 @@ def forward_kept(
                     lists[k - 1], ends[k - 1][t], ends[k - 1][t + 1], reach[k], weights[k],
                     shape[k], currents[k],
                 )  # fmt: skip
+                add_bias(bias[k], weights[k], shape[k][3], currents[k])
             n = ends[k][t]
             for i in range(spans[k].shape[0]):
                 n = fire(
@@ -192,7 +193,7 @@ def backward(
             gradient by the spikes of layer 1, taps of a step).
         grads: of each layer, in the packed order.
     """
-    reach, _, shape = layers
+    reach, _, shape, bias = layers
     runs, pixels, back2, rows, back3, back4 = back
     threshold, width, scale = constants
     above, du, g, taps = planes
@@ -201,11 +202,20 @@ def backward(
     start = 0
     while start < steps and offsets[row * steps + start] == offsets[row * steps + start + 1]:
         start += 1
-    for t in range(start, steps):
+    for t in range(steps):
         du4[t] = by_count
-    _back_in_time(du4, potentials[3], start, threshold, width, scale, du[: du4.shape[1]])
+    _back_in_time(du4, potentials[3], 0, threshold, width, scale, du[: du4.shape[1]])
     np.dot(du4, back4, du3)
-    _back_in_time(du3, potentials[2], start, threshold, width, scale, du[: du3.shape[1]])
+    _back_in_time(du3, potentials[2], 0, threshold, width, scale, du[: du3.shape[1]])
+    for k in range(2, len(grads)):
+        for t in range(steps):
+            _gather(
+                lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], above[k - 1][t],
+                shape[k], grads[k],
+            )  # fmt: skip
+            if bias[k] >= 0:
+                for j in range(_U0, shape[k][3], _LANES):
+                    add(grads[k], np.uint64(bias[k]) + j, above[k - 1][t], j)
     for t in range(start, steps, _AT_ONCE):
         until = min(t + _AT_ONCE, steps)
         np.dot(du3[t:until], back3, du2[t:until])
@@ -216,11 +226,7 @@ def backward(
         _spread(taps, pixels, rows, shape[0][1], g)
         for i in range(runs.shape[0]):
             _through(g, potentials[0][t], threshold, width, scale, du, runs[i, 0], runs[i, 1])
-        for k in range(1, len(grads)):
-            _gather(
-                lists[k - 1], None, ends[k - 1][t], ends[k - 1][t + 1], reach[k], above[k - 1][t],
-                shape[k], grads[k],
-            )  # fmt: skip
+        _gather(lists[0], None, ends[0][t], ends[0][t + 1], reach[1], du2[t], shape[1], grads[1])
         at = row * steps + t
         _gather(cell, count, offsets[at], offsets[at + 1], reach[0], du, shape[0], grads[0])
 

@@ -13,6 +13,7 @@ step together, in vector lanes. `analysis.spiking_layout` makes the layout:
 - ``shape``: of a layer, from a run to the next among weights and among currents, how many runs a
   source has and how long they are. All sources of a layer have the same, filled up with weights
   of zero: a processor that can foresee each loop's end is twice as fast.
+- ``bias``: where a layer's biases begin among its weights, or -1: currents of every step.
 
 A neuron's step is u = v + I; it fires where u - threshold >= 0; then v = 0, else u: in float32 and
 in this order, as Sinabs has it. Indices are unsigned: a signed one may count from the end, and a
@@ -72,6 +73,14 @@ def scatter(
 
 
 @njit(cache=True, nogil=True)
+def add_bias(bias: int, weights: Any, length: Any, current: Any) -> None:
+    """Currents [0, length) grow by the biases; not at all where `bias` is below 0."""
+    if bias >= 0:
+        for j in range(_U0, length, _LANES):
+            add(current, j, weights, np.uint64(bias) + j)
+
+
+@njit(cache=True, nogil=True)
 def fire(
     current: Any, v: Any, potential: Any, threshold: Any, begin: Any, end: Any, spikes: Any, n: Any
 ) -> Any:
@@ -109,7 +118,7 @@ def step(
 
     Args:
         cell, count: non-empty cells and their counts; those at [begin, end) are now.
-        layers: (reach, weights, shape) of each layer, as three tuples.
+        layers: (reach, weights, shape, bias) of each layer, as four tuples.
         state: potentials of each layer, changed.
         scratch: (currents, spikes, low, high); currents are zero before and after.
         fired_by: int64 (layers,), grows by the spikes of each layer.
@@ -117,11 +126,9 @@ def step(
     Returns:
         how many output neurons fired; which ones, the first places of the last list of spikes say.
     """
-    reach, weights, shape = layers
+    reach, weights, shape, bias = layers
     currents, spikes, low, high = scratch
-    if begin == end:
-        return _U0
-    rows = low.size
+    rows = low.size if begin < end else 0
     _, stride, runs, length = shape[0]
     for y in range(rows):
         low[y], high[y] = np.uint64(currents[0].size), _U0
@@ -143,9 +150,10 @@ def step(
             n = fire(currents[0], state[0], None, threshold, first, done, spikes[0], n)
     fired_by[0] += np.int64(n)
     for k in range(1, len(currents)):
-        if n == _U0:
-            return _U0
+        if n == _U0 and bias[k] < 0:
+            continue
         scatter(spikes[k - 1], _U0, n, reach[k], weights[k], shape[k], currents[k])
+        add_bias(bias[k], weights[k], shape[k][3], currents[k])
         n = fire(
             currents[k], state[k], None, threshold, _U0, np.uint64(currents[k].size), spikes[k],
             _U0,

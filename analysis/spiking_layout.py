@@ -91,7 +91,10 @@ class Table:
         reach: uint32 (sources, 2), see `analysis.spiking_kernels`.
         stride_w, stride: from a run to the next among weights and among currents.
         runs, length: how many runs a source has, and weights of one.
-        order: int64, for each packed weight its place in torch's flattened weight; -1 for none.
+        order: int64, for each packed weight its place in the layer's flattened matrix
+            (`analysis.network.matrices`); -1 for none.
+        bias: where the biases begin among the packed weights, one for each neuron of the
+            target; -1 for none.
         target: the neurons.
     """
 
@@ -102,6 +105,7 @@ class Table:
     length: int
     order: I64
     target: Plane
+    bias: int = -1
 
     @property
     def shape(self) -> tuple[np.uint64, ...]:
@@ -109,17 +113,17 @@ class Table:
         return tuple(map(np.uint64, (self.stride_w, self.stride, self.runs, self.length)))
 
     def pack(self, weight: F32) -> F32:
-        """A weight of torch's shape, packed."""
+        """A layer's matrix, packed."""
         flat = np.append(weight.ravel(), np.float32(0.0))
         return np.ascontiguousarray(flat[self.order])
 
     def unpack(self, packed: F32, shape: tuple[int, ...]) -> F32:
-        """What was summed up by packed weight, in torch's shape."""
+        """What was summed up by packed weight, in the matrix's shape."""
         return packed[self.back].reshape(shape)
 
     @cached_property
     def back(self) -> I64:
-        """For each of torch's weights its place among the packed."""
+        """For each weight of the matrix its place among the packed."""
         there = np.flatnonzero(self.order >= 0)
         places = np.empty(there.size, np.int64)
         places[self.order[there]] = there
@@ -193,15 +197,18 @@ def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
 
 
 def full_layer(below: Plane, n: int) -> Table:
-    """From all of a layer; torch's weight is (n, channels * side * side), channels first."""
+    """From all of a layer; the matrix is (n, channels * side * side + 1), channels first."""
     plane = Plane(1, n, 0, 1)
     index = below.index()
     sources = index.transpose(2, 0, 1).ravel()  # in the order in which torch flattens
-    order = np.full((below.size, plane.depth), -1, np.int64)
-    order[sources, :n] = np.arange(n)[None, :] * sources.size + np.arange(sources.size)[:, None]
+    order = np.full((below.size + 1, plane.depth), -1, np.int64)
+    row = np.arange(n) * (sources.size + 1)
+    order[sources, :n] = row + np.arange(sources.size)[:, None]
+    order[-1, :n] = row + sources.size
     reach = np.zeros((below.size, 2), np.uint32)
     reach[:, 1] = np.arange(below.size) * plane.depth
-    return Table(reach, plane.depth, plane.depth, 1, plane.depth, order.ravel(), plane)
+    bias = below.size * plane.depth
+    return Table(reach, plane.depth, plane.depth, 1, plane.depth, order.ravel(), plane, bias)
 
 
 def strided_back(below: Plane, kernel: int, plane: Plane) -> U32:
@@ -225,7 +232,7 @@ def _filled(values: F32, *shape: int) -> F32:
 
 
 class Layout:
-    """Tables of a network, by the shapes of its weights and the cells along a sample's side."""
+    """Tables of a network, by the shapes of its matrices and the cells along a sample's side."""
 
     def __init__(self, shapes: tuple[tuple[int, ...], ...], cells: int) -> None:
         (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (out, _) = shapes
@@ -246,11 +253,12 @@ class Layout:
         self.neurons = tuple(plane.side * plane.side * plane.channels for plane in planes)
 
     def layers(self, weights: list[F32]) -> tuple[Any, ...]:
-        """What the kernels take for a network's weights in torch's shapes."""
+        """What the kernels take for a network's matrices."""
         return (
             tuple(table.reach for table in self.tables),
             tuple(table.pack(w) for table, w in zip(self.tables, weights, strict=True)),
             tuple(table.shape for table in self.tables),
+            tuple(table.bias for table in self.tables),
         )
 
     def back(self, weights: list[F32]) -> tuple[Any, ...]:
@@ -258,8 +266,8 @@ class Layout:
         kernel = self.shapes[1][2]
         one, two, three, four = (table.target for table in self.tables)
         of2 = weights[1].transpose(0, 2, 3, 1)
-        of3 = self.tables[2].pack(weights[2]).reshape(two.size, -1)
-        of4 = self.tables[3].pack(weights[3]).reshape(three.size, -1)
+        of3 = self.tables[2].pack(weights[2]).reshape(two.size + 1, -1)
+        of4 = self.tables[3].pack(weights[3]).reshape(three.size + 1, -1)
         return (
             one.spans(LANES),
             strided_back(one, kernel, two),
@@ -270,7 +278,7 @@ class Layout:
         )
 
     def unpack(self, grads: Sequence[F32]) -> list[F32]:
-        """Gradients by packed weights, in torch's shapes."""
+        """Gradients by packed weights, in the matrices' shapes."""
         return [
             table.unpack(grad, shape)
             for table, grad, shape in zip(self.tables, grads, self.shapes, strict=True)

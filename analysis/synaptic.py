@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from analysis.network import SPIKING, WEIGHTED
+from analysis.network import BIASED, SPIKING, WEIGHTED
 from analysis.sparse import SparseWindows
 from analysis.spiking import Trainer, side_by_side
 from analysis.spiking_gradients import forward_kept
@@ -130,9 +130,14 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | N
     operations = done.sum(axis=0)
     operations[0] = int((synapses[0][x.cell] * x.count).sum())
     spikes, n = fired.sum(axis=0), len(x)
+    biases = {name: trainer.layout.neurons[WEIGHTED.index(name)] for name in BIASED}
+    always = {name: biases.get(name, 0) * trainer.steps for name in WEIGHTED}
     return Work(
-        synaptic={name: int(operations[k]) / n for k, name in enumerate(WEIGHTED)},
-        dense={name: int(synapses[k].sum()) * trainer.steps for k, name in enumerate(WEIGHTED)},
+        synaptic={name: int(operations[k]) / n + always[name] for k, name in enumerate(WEIGHTED)},
+        dense={
+            name: int(synapses[k].sum()) * trainer.steps + always[name]
+            for k, name in enumerate(WEIGHTED)
+        },
         spikes={name: int(spikes[k]) / n for k, name in enumerate(SPIKING)},
         rates={
             name: int(spikes[k]) / (n * trainer.steps * trainer.layout.neurons[k])

@@ -26,9 +26,18 @@ from scipy.special import log_softmax
 from torch import nn
 
 from analysis import metrics
-from analysis.network import SPIKING, WEIGHTED, build, on_grid, set_weights, weights
+from analysis.network import (
+    SPIKING,
+    build,
+    by_parameter,
+    matrices,
+    on_grid,
+    parameters,
+    set_weights,
+    weights,
+)
 from analysis.sparse import SparseWindows
-from analysis.spiking import Engine, Job, Samples, Trainer, WindowLoss, torch_weights
+from analysis.spiking import Engine, Job, Samples, Trainer, WindowLoss
 from protocols.settings import Network, Training, Windows
 
 MICRO_BATCH = 4
@@ -121,8 +130,8 @@ def fit(
     validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
     ``training.patience`` epochs in a row were no better. It uses as many threads as torch may.
 
-    There are no biases, so a window without any event gives no spike whatever is learned: it is a
-    tie, and wrong by strict accuracy.
+    A window without any event gets what the biases alone give; where that is no spike, or a tie,
+    it is wrong by strict accuracy.
 
     Args:
         train_x, val_x: event counts uint8 (n, steps, channels, cells, cells), or sparse.
@@ -221,8 +230,10 @@ class _Run:
         self.fine = build(network, windows, seed)
         self.trained = build(network, windows, seed)
         """Has the fine weights at their points of the grid, between epochs."""
-        self.parameters = [getattr(self.fine, name).weight for name in WEIGHTED]
-        self.optimizer = torch.optim.Adam(self.parameters, training.learning_rate, fused=True)
+        self.parameters = parameters(self.fine)
+        self.optimizer = torch.optim.Adam(
+            self.parameters.values(), training.learning_rate, fused=True
+        )
         self.trainer = Trainer(self.trained, windows.cells)
         self.history: list[EpochRecord] = []
         self.seconds: list[float] = []
@@ -233,14 +244,11 @@ class _Run:
 
     def to_grid(self) -> None:
         """Let the spikes be those of the fine weights as they are now."""
-        self.trainer.take(on_grid(torch_weights(self.fine)))
+        self.trainer.take(on_grid(matrices(self.fine)))
 
     def settle(self) -> None:
         """Let `trained` have the weights that the spikes are of."""
-        with torch.no_grad():
-            values = on_grid(torch_weights(self.fine))
-            for name, value in zip(WEIGHTED, values, strict=True):
-                getattr(self.trained, name).weight.copy_(torch.from_numpy(value))
+        set_weights(self.trained, by_parameter(on_grid(matrices(self.fine))))
 
     @property
     def ended(self) -> bool:
@@ -259,8 +267,7 @@ class _Run:
         bits on any number of threads.
         """
         batch = self.training.batch
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(self.training, len(self.history))
+        steps = math.ceil(len(x) / batch)
 
         def compute(rows: metrics.IntArray) -> _Part:
             job = Job(self.trainer, x, rows, y[rows], self.training.gain)
@@ -285,8 +292,10 @@ class _Run:
                 for each in zip(*(part.gradients for part in parts), strict=True)
             ]
             total = self.trainer.layout.unpack(sums)
-            for parameter, gradient in zip(self.parameters, total, strict=True):
-                parameter.grad = torch.from_numpy(gradient) / len(chosen)
+            for name, gradient in by_parameter(total).items():
+                self.parameters[name].grad = gradient / len(chosen)
+            for group in self.optimizer.param_groups:
+                group["lr"] = learning_rate(self.training, len(self.history), start // batch, steps)
             self.optimizer.step()
             self.to_grid()
         self.settle()
@@ -331,15 +340,20 @@ class _Run:
         self.settle()
 
 
-def learning_rate(training: Training, done: int) -> float:
-    """Of the epoch after `done` epochs.
+def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
+    """Of a step in the epoch after `done` epochs.
 
     Constant, or falling from the full rate to nothing along half a cosine over all epochs
-    (Loshchilov and Hutter, 2017, without restarts).
+    (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a line.
+
+    Args:
+        step, steps: done in this epoch, and all of an epoch.
     """
+    rising = training.warm_up * training.epochs * steps
+    rate = training.learning_rate * min(1.0, (done * steps + step + 1) / max(rising, 1.0))
     if training.schedule == "constant":
-        return training.learning_rate
-    return training.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done / training.epochs))
+        return rate
+    return rate * 0.5 * (1.0 + math.cos(math.pi * done / training.epochs))
 
 
 def _record(

@@ -21,9 +21,17 @@ import torch
 from torch import nn
 
 from analysis.dataset import SampleSet
-from analysis.network import WEIGHTED, build, on_grid, reset_states, spike_counts
+from analysis.network import (
+    build,
+    by_parameter,
+    matrices,
+    on_grid,
+    reset_states,
+    set_weights,
+    spike_counts,
+)
 from analysis.sparse import SparseWindows
-from analysis.spiking import Engine, torch_weights
+from analysis.spiking import Engine
 from analysis.training import fit
 from analysis.windows import bin_events, list_events
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
@@ -63,9 +71,7 @@ def measure(windows: int = 384, singles: int = 100, runs: int = RUNS) -> Figures
 def gridded(settings: Windows, seed: int) -> nn.Sequential:
     """A fresh network with its weights on the grid."""
     net = build(Network(), settings, seed)
-    with torch.no_grad():
-        for name, value in zip(WEIGHTED, on_grid(torch_weights(net)), strict=True):
-            getattr(net, name).weight.copy_(torch.from_numpy(value))
+    set_weights(net, by_parameter(on_grid(matrices(net))))
     return net
 
 

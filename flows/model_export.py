@@ -20,6 +20,7 @@ from analysis import metrics, training
 from analysis.activity import activity
 from analysis.dataset import SampleSet
 from analysis.model_card import SplitResult, card_markdown, model_card
+from analysis.network import SPIKING, WEIGHTED
 from analysis.quantised import Quantised, chip_run, compare, quantise, quantised_net
 from analysis.speck import speck_fit
 from analysis.speck_page import speck_markdown
@@ -139,7 +140,7 @@ def export_model(
 
 
 def _weights_file(whole: Quantised) -> bytes:
-    """The whole weights as NumPy's archive, int8 by layer; the same bytes for the same weights."""
+    """The whole weights and biases as NumPy's archive, int8; the same bytes for the same ones."""
     buffer = io.BytesIO()
     arrays: dict[str, Any] = dict(whole.weights)
     np.savez(buffer, **arrays)
@@ -209,7 +210,7 @@ def _speck(
             "potential": list(ran.potentials[spiking]),
             "saturated": ran.saturated[spiking],
         }
-        for name, spiking in zip(whole.weights, whole.thresholds, strict=True)
+        for name, spiking in zip(WEIGHTED, SPIKING, strict=True)
     }
     accuracy = {
         name: vars(metrics.accuracy(each, seen.y, margin))

@@ -27,7 +27,7 @@ from storage.store import Store, StoreError
 if TYPE_CHECKING:
     from flows.cluster import Cluster
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,9 @@ class Training(StrictModel):
     learning_rate: float = Field(default=4e-3, gt=0, le=1)
     schedule: Literal["constant", "cosine"] = "cosine"
     """Of the learning rate over the epochs."""
+    warm_up: float = Field(default=0.02, ge=0, le=1)
+    """Share of all steps over which the learning rate rises from nothing: a neuron that a first
+    large step puts far below its threshold never learns again."""
     gain: float = Field(default=0.25, gt=0, le=10)
     """What a spike counts in the cross-entropy. Less of it asks for counts further apart."""
     mirror: bool = True

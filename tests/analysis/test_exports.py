@@ -16,13 +16,22 @@ from torch import nn
 
 from analysis.activity import activity
 from analysis.model_card import SplitResult, card_markdown, model_card
-from analysis.network import SPIKING, WEIGHTED, build, reset_states, spike_counts, weights
+from analysis.network import (
+    BIASED,
+    SPIKING,
+    WEIGHTED,
+    build,
+    parameters,
+    reset_states,
+    spike_counts,
+    weights,
+)
 from analysis.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from analysis.quantised import LOWEST, chip_run, compare, quantise, quantised_net
 from analysis.speck import CORES, KI, speck_fit
-from analysis.training import EpochRecord, Fitted
+from analysis.training import EpochRecord, Fitted, restore
 from protocols.settings import Network, Training, Windows
-from tests.analysis.test_spiking import FULL, SMALL, TINY, sparse
+from tests.analysis.test_spiking import FULL, SMALL, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -31,7 +40,7 @@ onnx = pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])
 
 def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> Fitted:
     record = EpochRecord(1, 1.0, 0.3, 1.0, 0.3, 0.3, 0.3, dict.fromkeys(SPIKING, 0.1))
-    state = weights(build(network, windows, seed))
+    state = weights(biased(build(network, windows, seed), seed))
     return Fitted(state, network, windows, Training(epochs=1), seed, (record,), 1, ())
 
 
@@ -48,7 +57,7 @@ def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> 
     ],
 )
 def test_the_graph_counts_as_sinabs_does(network: Network, windows: Windows) -> None:
-    net = build(network, windows, 1)
+    net = biased(build(network, windows, 1), 1)
     x = sparse(20, windows, 1, 0.1)
     data = to_onnx(net, windows, {"classes": "a"})
     assert check_onnx(data, net, x) == 20
@@ -57,7 +66,8 @@ def test_the_graph_counts_as_sinabs_does(network: Network, windows: Windows) -> 
     model = onnx.load_from_string(data)
     assert [op.op_type for op in model.graph.node].count("Scan") == 1  # all of time is inside
     assert model.metadata_props[0].key == "classes"
-    assert to_onnx(build(network, windows, 1), windows, {"classes": "a"}) == data
+    again = biased(build(network, windows, 1), 1)
+    assert to_onnx(again, windows, {"classes": "a"}) == data
 
 
 def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:
@@ -65,6 +75,9 @@ def test_a_graph_that_counts_otherwise_is_not_let_through() -> None:
     x = sparse(20, TINY, 1, 0.3)
     with pytest.raises(OnnxDiffers, match=r"of 20 windows have other counts; window \d+: Sinabs"):
         check_onnx(to_onnx(build(SMALL, TINY, 2), TINY, {}), net, x)
+    with torch.no_grad():
+        for name in BIASED:
+            parameters(net)[f"{name}.bias"].zero_()
     with pytest.raises(OnnxDiffers, match="silent in all 20 windows"):
         check_onnx(to_onnx(net, TINY, {}), net, np.zeros_like(x))
 
@@ -134,23 +147,24 @@ def test_memories_are_those_that_sinabs_reckons(
 
 
 def test_weights_and_threshold_are_whole_and_in_range() -> None:
-    net = build(Network(), FULL, 3)
+    net = biased(build(Network(), FULL, 3), 3)
     found = quantise(net)
     for name, spiking in zip(WEIGHTED, SPIKING, strict=True):
-        whole = found.weights[name]
-        assert whole.dtype == np.int8
+        parts = {k: w for k, w in found.weights.items() if k.startswith(name)}
+        assert len(parts) == 1 + (name in BIASED)
         # as large as a whole threshold lets them be
-        assert max(int(whole.max()), -int(whole.min())) >= 120
+        assert max(np.abs(whole.astype(int)).max() for whole in parts.values()) >= 120
         assert found.thresholds[spiking] == found.scales[name]
-        layer: Any = getattr(net, name)
-        real = layer.weight.detach().numpy().astype(np.float64)
-        assert np.abs(whole / found.scales[name] - real).max() <= 0.5001 / found.scales[name]
+        for key, whole in parts.items():
+            assert whole.dtype == np.int8
+            real = parameters(net)[key].detach().numpy().astype(np.float64)
+            assert np.abs(whole / found.scales[name] - real).max() <= 0.5001 / found.scales[name]
     assert all(0 < share < 0.05 for share in found.rounding(net).values())
 
 
 def test_the_chips_arithmetic_is_the_networks_in_whole_numbers() -> None:
     one = fitted(Network(), FULL, 3)
-    whole = quantised_net(one, quantise(build(Network(), FULL, 3)))
+    whole = quantised_net(one, quantise(restore(one)))
     x = sparse(24, FULL, 3, 0.03)
     ran = chip_run(whole, x)
     assert not any(ran.saturated.values())
@@ -199,6 +213,7 @@ def test_what_cannot_be_quantised_is_refused() -> None:
     layer: Any = net.fc2
     with torch.no_grad():
         layer.weight.fill_(0.0)
+        layer.bias.fill_(0.0)
     with pytest.raises(ValueError, match="fc2: all weights are zero"):
         quantise(net)
     with torch.no_grad():
@@ -246,8 +261,8 @@ def test_synaptic_operations_are_counted_one_by_one() -> None:
         layer: Any = getattr(net, name)
         total, dense = 0.0, 0
         if name.startswith("fc"):
-            total = float(at.sum()) * layer.out_features
-            dense = 10 * layer.in_features * layer.out_features
+            total = (float(at.sum()) + 30) * layer.out_features  # a bias in each of 30 steps
+            dense = 10 * (layer.in_features + 1) * layer.out_features
         else:
             (k, _), (s, _), (p, _) = layer.kernel_size, layer.stride, layer.padding
             outputs = range((6 + 2 * p - k) // s + 1)

@@ -9,6 +9,8 @@ import torch
 from sinabs.utils import validate_memory_mapping_speck
 
 from analysis.network import (
+    BIASED,
+    FIRST_BIAS,
     SPIKING,
     WEIGHTED,
     build,
@@ -62,9 +64,11 @@ def test_default_sizes_fit_the_chip() -> None:
         "conv1.weight": (8, 1, 5, 5),
         "conv2.weight": (16, 8, 3, 3),
         "fc1.weight": (32, 1600),
+        "fc1.bias": (32,),
         "fc2.weight": (3, 32),
+        "fc2.bias": (3,),
     }
-    assert all(getattr(net, name).bias is None for name in WEIGHTED)
+    assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(BIASED)
     # on the chip a fully connected layer is a convolution over all of its input
     for ins, outs, kernel, stride, padding, side in (
         (1, 8, 5, 1, 2, 20), (8, 16, 3, 2, 1, 20), (16, 32, 10, 1, 0, 10), (32, 3, 1, 1, 0, 1),
@@ -101,7 +105,9 @@ def test_a_seed_decides_the_weights_and_nothing_else_random() -> None:
     assert torch.equal(torch.rand(1), expected)
     second, other = weights(build(SMALL, WINDOWS, 3)), weights(build(SMALL, WINDOWS, 4))
     assert all(torch.equal(first[n], second[n]) for n in first)
-    assert not any(torch.equal(first[n], other[n]) for n in first)
+    assert [n for n in first if torch.equal(first[n], other[n])] == ["fc2.bias"]
+    for name, (low, high) in FIRST_BIAS.items():
+        assert ((first[f"{name}.bias"] >= low) & (first[f"{name}.bias"] <= high)).all()
 
 
 def test_weight_scale_belongs_to_its_layer() -> None:

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.network import WEIGHTED, build, reset_states
+from analysis.network import BIASED, WEIGHTED, build, matrices, parameters, reset_states
 from analysis.sparse import SparseWindows
-from analysis.spiking import Job, Trainer, WindowLoss, torch_weights
+from analysis.spiking import Job, Trainer, WindowLoss
 from analysis.spiking_gradients import _through
 from protocols.settings import Network, Windows
 from tests.analysis.test_spiking import FULL, SMALL, TINY, gridded, put, sparse
@@ -30,7 +30,14 @@ def by_sinabs(
     reset_states(net)
     out = net(torch.from_numpy(x.astype(np.float32)).flatten(0, 1)).unflatten(0, (len(x), -1))
     loss = nn.functional.cross_entropy(gain * out.sum(dim=1), y)
-    return list(torch.autograd.grad(loss, [getattr(net, name).weight for name in WEIGHTED]))
+    wanted = parameters(net)
+    grads = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values())), strict=True))
+    return [
+        torch.column_stack([grads[f"{name}.weight"], grads[f"{name}.bias"]])
+        if name in BIASED
+        else grads[f"{name}.weight"]
+        for name in WEIGHTED
+    ]
 
 
 def by_events(
@@ -59,13 +66,13 @@ class _Spike(torch.autograd.Function):
 
 def in_double(net: nn.Sequential, x: np.ndarray, y: torch.Tensor) -> list[torch.Tensor]:
     """The definition in float64, one step of time after the other."""
-    weights = [torch.from_numpy(w).double().requires_grad_() for w in torch_weights(net)]
+    weights = [torch.from_numpy(w).double().requires_grad_() for w in matrices(net)]
     w1, w2, w3, w4 = weights
     layers = [
         lambda v: nn.functional.conv2d(v, w1, padding=w1.shape[-1] // 2),
         lambda v: nn.functional.conv2d(v, w2, stride=2, padding=w2.shape[-1] // 2),
-        lambda v: v.flatten(1) @ w3.T,
-        lambda v: v @ w4.T,
+        lambda v: v.flatten(1) @ w3[:, :-1].T + w3[:, -1],
+        lambda v: v @ w4[:, :-1].T + w4[:, -1],
     ]
     states: list[torch.Tensor | float] = [0.0] * 4
     out = torch.zeros(len(x), 3, dtype=torch.float64)
@@ -94,8 +101,10 @@ def test_gradients_are_sinabs_own(windows: Windows, share: float) -> None:
         x = sparse(6, windows, seed, share)
         y = torch.tensor([0, 1, 2, 0, 1, 2])
         _, fast = by_events(net, x, y, windows.cells)
-        assert max(off(fast, by_sinabs(net, x, y))) <= 1e-6
         assert max(off(fast, in_double(net, x, y))) <= 1e-6
+        # Sinabs' own are rounded too: 0.9e-6 off in windows of three times the usual events
+        allowed = 2e-6 if windows is FULL and share > 0.01 else 1e-6
+        assert max(off(fast, by_sinabs(net, x, y))) <= allowed
 
 
 def test_where_sums_cancel_the_error_is_that_of_float32() -> None:
@@ -131,12 +140,14 @@ def test_the_gain_of_the_loss() -> None:
     assert max(off(fast, by_sinabs(net, x, y, gain=0.5))) <= 1e-6
 
 
-def test_windows_without_events_give_none() -> None:
+def test_windows_without_events_teach_the_biases_alone() -> None:
     net = gridded(SMALL, TINY, 0)
-    x = np.zeros((2, 10, 1, 6, 6), np.uint8)
-    out, grads = by_events(net, x, torch.tensor([0, 1]), TINY.cells)
-    assert not out.any()
-    assert not any(grad.any() for grad in grads)
+    x, y = np.zeros((2, 10, 1, 6, 6), np.uint8), torch.tensor([0, 1])
+    _, grads = by_events(net, x, y, TINY.cells)
+    assert not any(grad.any() for grad in grads[:2])
+    assert not any(grad[:, :-1].any() for grad in grads[2:3])
+    assert all(grad[:, -1].any() for grad in grads[2:])
+    assert max(off(grads[2:], in_double(net, x, y)[2:])) <= 1e-6
 
 
 def test_gradient_of_one_neuron_in_closed_form() -> None:
@@ -177,6 +188,6 @@ def test_a_step_down_the_gradient_lowers_the_loss() -> None:
     for _ in range(30):
         out, grads = by_events(net, x, y, TINY.cells)
         losses.append(nn.functional.cross_entropy(out.double(), y).item())
-        values = torch_weights(net)
+        values = matrices(net)
         put(net, [w - 0.05 * g for w, g in zip(values, grads, strict=True)])
     assert min(losses[20:]) < losses[0] - 0.1

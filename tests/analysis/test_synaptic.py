@@ -5,9 +5,17 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.network import SPIKING, WEIGHTED, build, on_grid, reset_states, set_weights, weights
+from analysis.network import (
+    SPIKING,
+    WEIGHTED,
+    build,
+    by_parameter,
+    matrices,
+    on_grid,
+    reset_states,
+    set_weights,
+)
 from analysis.sparse import SparseWindows
-from analysis.spiking import torch_weights
 from analysis.synaptic import count_work, reached
 from analysis.training import Fitted
 from protocols.settings import Network, Training, Windows
@@ -17,8 +25,10 @@ WINDOWS = Windows(length_ms=8, crop_px=140, polarity="both")  # (8, 2, 7, 7): an
 
 def untrained(network: Network, windows: Windows) -> Fitted:
     net = build(network, windows, 3)
-    values = on_grid(torch_weights(net))
-    state = dict(zip(weights(net), map(torch.from_numpy, values), strict=True))
+    values = matrices(net)
+    for value in values[2:]:
+        value[:, -1] = np.random.default_rng(0).normal(0.02, 0.05, len(value))
+    state = by_parameter(on_grid(values))
     return Fitted(state, network, windows, Training(), 3, (), 1, ())
 
 
@@ -53,7 +63,8 @@ def test_operations_are_those_of_sinabs_spikes_followed_one_by_one() -> None:
         for name, layer in net.named_children():
             if name in WEIGHTED:
                 ones = nn.utils.skip_init(type(layer), **_shape_of(layer))
-                ones.weight.fill_(1.0)
+                for value in ones.parameters():
+                    value.fill_(1.0)
                 synapses[name] = float(ones(signal).double().sum()) / len(x)
                 everywhere = torch.ones_like(signal[:1])
                 dense[name] = int(ones(everywhere).double().sum()) * WINDOWS.steps
@@ -76,7 +87,10 @@ def _shape_of(layer: nn.Module) -> dict[str, object]:
         names = ("in_channels", "out_channels", "kernel_size", "stride", "padding")
     else:
         names = ("in_features", "out_features")
-    return {"bias": False, **{name: getattr(layer, name) for name in names}}
+    return {
+        "bias": layer.bias is not None,  # a synapse that is active in every step
+        **{name: getattr(layer, name) for name in names},
+    }
 
 
 def test_no_windows_are_no_work() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from analysis import metrics, training
 from analysis.model_file import FORMAT, load, save
-from analysis.network import GRID, build, exact, spike_counts, weights
+from analysis.network import GRID, build, exact, matrices, spike_counts, weights
 from analysis.training import (
     EpochRecord,
     Fitted,
@@ -98,9 +98,9 @@ def test_torchs_global_randomness_is_neither_used_nor_moved(fitted: Fitted) -> N
     torch.manual_seed(123)
     expected = torch.rand(1)
     torch.manual_seed(123)
-    again = run(epochs=1)
+    again = run()
     assert torch.equal(torch.rand(1), expected)
-    assert again.history[0] == fitted.history[0]
+    assert again.history == fitted.history
 
 
 def test_predictions_are_those_of_the_sinabs_network(fitted: Fitted) -> None:
@@ -197,6 +197,15 @@ def test_the_rate_falls_along_half_a_cosine() -> None:
     assert {learning_rate(TRAINING, done) for done in range(5)} == {TRAINING.learning_rate}
 
 
+def test_the_rate_rises_in_a_line_first() -> None:
+    rising = Training(epochs=10, learning_rate=1e-2, schedule="constant", warm_up=0.15)
+    rates = [learning_rate(rising, k // 100, k % 100, 100) for k in range(1000)]
+    np.testing.assert_allclose(rates[:150], 1e-2 * np.arange(1, 151) / 150, rtol=1e-12)
+    assert set(rates[150:]) == {1e-2}
+    flat = rising.model_copy(update={"warm_up": 0.0})
+    assert learning_rate(flat, 0, 0, 100) == 1e-2
+
+
 def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) -> None:
     """Edges stand on the right of every training window; here they stand on the left."""
     x, y = TEST[0][..., ::-1], TEST[1]
@@ -213,15 +222,16 @@ def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) ->
 
 
 def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
-    values = [value.numpy() for value in fitted.state_dict.values()]
+    values = matrices(restore(fitted))
     for value, step in zip(values, GRID, strict=True):
         assert not np.any(np.mod(value.astype(np.float64), step))
     assert exact(values)
 
 
-def test_silent_layers_are_named() -> None:
+def test_silent_layers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     network = NETWORK.model_copy(update={"weight_scale": (1e-3, 1.0, 1.0, 1.0)})
     settings = Training(epochs=1, batch=64, learning_rate=1e-9)
+    monkeypatch.setattr("analysis.network.FIRST_BIAS", {"fc1": (0.0, 0.0), "fc2": (0.0, 0.0)})
     found = fit(*TRAIN, *VAL, network, WINDOWS, settings, 0)
     assert [w.split()[1] for w in found.warnings] == ["iaf1", "iaf2", "iaf3", "iaf4"]
     assert "silent" in found.warnings[0]
