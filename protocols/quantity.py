@@ -117,6 +117,7 @@ def parse_or_ref(raw: object, unit: str) -> Decimal | FactorRef:
 REF_SCHEMA: dict[str, Any] = {
     "type": "string",
     "pattern": r"^\$[a-z][a-z0-9_]*$",
+    "patternErrorMessage": "must be a factor's name after '$', such as $depth",
     "description": "The level of this factor in the trial at hand, such as $depth.",
 }
 
@@ -131,9 +132,14 @@ def quantity_schema(unit: str, *, negative: bool = True, zero: bool = True) -> d
     sign = "[+-]?" if negative else "[+]?"
     some = "" if zero else "(?=[^eE]*[1-9])"
     number = r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
+    least = "" if negative else (", 0 or more" if zero else ", more than 0")
     return {
         "type": "string",
         "pattern": rf"^\s*{some}{sign}{number}\s*({'|'.join(units)})\s*$",
+        # read by editors with the YAML language server in place of the pattern
+        "patternErrorMessage": (
+            f"must be a number with its unit ({', '.join(units)}){least}, such as 1.5 {unit}"
+        ),
         "description": f"A number with its unit: {', '.join(units)}.",
         "examples": [f"1.5 {unit}"],
     }
