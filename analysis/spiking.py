@@ -20,7 +20,7 @@ from torch import nn
 
 from analysis import spiking_gradients, spiking_kernels
 from analysis.metrics import CLASSES
-from analysis.network import SPIKING, check_samples, matrices
+from analysis.network import SPIKING, matrices
 from analysis.sparse import SparseWindows
 from analysis.spiking_layout import Layout
 
@@ -44,7 +44,6 @@ class Engine:
     """
 
     def __init__(self, net: nn.Sequential, cells: int) -> None:
-        self._net = net
         self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
         self.threshold, _, _ = neuron(net)
         weights = matrices(net)
@@ -96,7 +95,6 @@ class Engine:
             ValueError: another shape, or not uint8.
         """
         if not isinstance(x, SparseWindows):
-            check_samples(self._net, x.shape)
             if x.shape[1:] != self.shape:
                 raise ValueError(f"samples have the shape {x.shape}; expected (n, *{self.shape})")
             x = SparseWindows.of(x)
