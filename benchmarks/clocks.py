@@ -28,7 +28,7 @@ import numpy as np
 from pyxdf.pyxdf import _robust_fit
 from scipy import fft, optimize
 
-from analysis.clocks import ClockFit, ClockRefused, fit_clock
+from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
 from benchmarks.measure import SEED, Figures, spread
 from rigs.pulse_code import PERIOD, code_bits
 from storage.streams import F64, I64

@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from analysis import dataset, metrics, model_file, training, window_groups
-from analysis.dataset import SampleSet
-from flows.orchestration import prepare
+from analysis.nets import dataset, metrics, model_file, training, window_groups
+from analysis.nets.dataset import SampleSet
+from flows.running.orchestration import prepare
 from protocols.hashing import hash_integer
 from storage.derived import make_key
 from storage.files import read_json, write_bytes, write_json, write_text
@@ -56,8 +56,8 @@ class Bench:
         self.out.mkdir(parents=True, exist_ok=True)
         self.store = Store.open(store)
         prepare(self.store.folder)
-        from flows.campaigns import collected, training_campaigns
-        from flows.train import training_settings
+        from flows.learning.train import training_settings
+        from flows.running.campaigns import collected, training_campaigns
 
         self.campaigns = training_campaigns(collected(self.store))
         self.settings = training_settings(self.campaigns)
@@ -152,18 +152,18 @@ class Bench:
         )
 
     def _model(self) -> tuple[Path, str]:
-        from flows.evaluate import choose_model
-        from flows.train import wanted_models
+        from flows.learning.evaluate import choose_model
+        from flows.learning.train import wanted_models
 
         model = choose_model(wanted_models(self.store, self.campaigns))
         return model.path, model.key
 
     def _touch(self, seed: int, rig: str, trials: int) -> Result:
-        from flows.campaigns import collected
-        from flows.collect import collect
-        from flows.label import label
-        from flows.orders import make_order
-        from flows.sync import sync
+        from flows.collecting.collect import collect
+        from flows.labelling.label import label
+        from flows.planning.orders import make_order
+        from flows.running.campaigns import collected
+        from flows.syncing.sync import sync
         from rigs.rig_inheritance import rig_path
 
         folder = self.out / f"skin{seed}"
@@ -191,9 +191,9 @@ class Bench:
 
 def all_samples(store: Store, campaigns: Sequence[Any]) -> tuple[SampleSet, I64, list[Any]]:
     """Samples of all parts of the split, the place of each one's trial, and the trials."""
-    from flows.reviewed import Labels
-    from flows.samples import load_samples
-    from flows.window_scores import owners, whose
+    from flows.labelling.reviewed import Labels
+    from flows.learning.samples import load_samples
+    from flows.learning.window_scores import owners, whose
 
     labels, used = Labels(store), list(campaigns)
     parts, places, known = [], [], []

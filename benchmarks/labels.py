@@ -19,8 +19,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from analysis.markers import MarkerTracks, track
-from analysis.plate import VideoTracks, track_video
+from analysis.labels.markers import MarkerTracks, track
+from analysis.labels.plate import VideoTracks, track_video
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from rigs.mock.settings import FrameCamera, MockSettings
 from rigs.mock.world import World

@@ -21,13 +21,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labelling import Label, label_places
-from analysis.markers import MarkerTracker, Measured, stack_tracks
-from analysis.places import from_tracks
-from analysis.plate import PlatePose, PlateTracker, bridge
+from analysis.labels.labelling import Label, label_places
+from analysis.labels.markers import MarkerTracker, Measured, stack_tracks
+from analysis.labels.places import from_tracks
+from analysis.labels.plate import PlatePose, PlateTracker, bridge
 from benchmarks.labels_summary import FRAME_MS, Checked, summary, tables, verdicts
 from benchmarks.measure import SEED, Figures
-from flows.scene_runs import MOTION, changed, sample_trials, with_true_times
+from flows.searching.scene_runs import MOTION, changed, sample_trials, with_true_times
 from protocols import Plan, Trial
 from protocols.hashing import hash_integer
 from protocols.plan import load_plan

@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from analysis.live import LiveDetector
-from analysis.spiking import Engine
+from analysis.detect.live import LiveDetector
+from analysis.nets.spiking import Engine
 from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
 from benchmarks.slides import slide_events

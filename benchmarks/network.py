@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from analysis.dataset import SampleSet
-from analysis.network import (
+from analysis.nets.dataset import SampleSet
+from analysis.nets.network import (
     build,
     by_parameter,
     matrices,
@@ -30,10 +30,10 @@ from analysis.network import (
     set_weights,
     spike_counts,
 )
-from analysis.sparse import SparseWindows
-from analysis.spiking import Engine
-from analysis.training import fit
-from analysis.windows import bin_events, list_events
+from analysis.nets.sparse import SparseWindows
+from analysis.nets.spiking import Engine
+from analysis.nets.training import fit
+from analysis.nets.windows import bin_events, list_events
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.network_rivals import Rival, installed
 from benchmarks.slides import slide_events

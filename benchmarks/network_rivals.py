@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from analysis.network import WEIGHTED, build
+from analysis.nets.network import WEIGHTED, build
 from protocols.settings import Network, Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]

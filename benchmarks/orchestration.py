@@ -1,12 +1,12 @@
 """What Prefect costs a collection a trial, beside a bare loop and Bluesky; catalogue and start-up.
 
-864 empty trials go through the task of `flows.collect`, 25 a task as on a mock rig (`batched_ms`)
-and one a task as on a real one (`per_trial_ms`). Both are milliseconds a trial over the bare loop,
-until the server has kept every task run as completed, and with what an empty flow right behind
-takes longer than one after that. `bluesky_ms` is a run of the RunEngine a trial (open, an empty
-message, close) and nothing that listens, `bluesky_plan_ms` one plan with all of them. The server is
-started before the clock runs. Processor time stands beside wall time (`*_cpu_ms`: this program
-and the server), for it tells more on a machine that has other things to do.
+864 empty trials go through the task of `flows.collecting.collect`, 25 a task as on a mock rig
+(`batched_ms`) and one a task as on a real one (`per_trial_ms`). Both are milliseconds a trial over
+the bare loop, until the server has kept every task run as completed, and with what an empty flow
+right behind takes longer than one after that. `bluesky_ms` is a run of the RunEngine a trial (open,
+an empty message, close) and nothing that listens, `bluesky_plan_ms` one plan with all of them. The
+server is started before the clock runs. Processor time stands beside wall time (`*_cpu_ms`: this
+program and the server), for it tells more on a machine that has other things to do.
 
 `catalogue_100k_s` is one filtered query over 100,000 trial records whose index is built;
 `startup_s` from the command to the first motion of a mock rig in a new store, with the caches that
@@ -28,7 +28,7 @@ from typing import Any
 from benchmarks.catalogues import catalogue_figures
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, spread
 from benchmarks.start_up import startup_seconds
-from flows.orchestration import Parcel, begin, embedded, prepare, run
+from flows.running.orchestration import Parcel, begin, embedded, prepare, run
 
 DRAIN_LIMIT_S = 120.0
 
@@ -67,7 +67,7 @@ def _flows() -> Any:
     from prefect import flow
     from prefect.runtime import flow_run
 
-    from flows.collect import take_trials
+    from flows.collecting.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
     def collect(wanted: Parcel[tuple[range, int, Any]]) -> str:
@@ -88,7 +88,7 @@ def _flows() -> Any:
 
 
 def _compare(trials: int, runs: int) -> Figures:
-    from flows.collect import MOCK_BATCH
+    from flows.collecting.collect import MOCK_BATCH
 
     collect, empty = _flows()
     every = range(trials)

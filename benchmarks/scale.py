@@ -17,11 +17,12 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from analysis import dataset, labelling, training
-from analysis.network import build, weights
+from analysis.labels import labelling
+from analysis.nets import dataset, training
+from analysis.nets.network import build, weights
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
 from benchmarks.trials import stretch
-from flows.sync_fit import fit_again
+from flows.syncing.sync_fit import fit_again
 from protocols import load_plan
 from storage.manifest import of_trial
 from storage.push import Wishes, push

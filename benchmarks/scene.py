@@ -20,7 +20,7 @@ import sys
 
 import numpy as np
 
-from analysis.scene_error import match_events
+from analysis.statistics.scene_error import match_events
 from benchmarks.emulator import emulate
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import CHUNK_S, LENGTH_MM, loads_of_slide

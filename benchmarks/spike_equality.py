@@ -4,7 +4,8 @@
 
 takes the samples that `sliplab train` keeps in the store, counts the output spikes of each by
 Sinabs' layers and by the event-driven network, and prints how many differ as one line of JSON.
-Exit 1 where one does. tests/analysis/test_spiking.py does the same on few windows and on extremes.
+Exit 1 where one does. tests/analysis/nets/test_spiking.py does the same on few windows and on
+extremes.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from analysis import model_file
-from analysis.dataset import SampleSet
-from analysis.network import exact, spike_counts
-from analysis.training import engine, restore
+from analysis.nets import model_file
+from analysis.nets.dataset import SampleSet
+from analysis.nets.network import exact, spike_counts
+from analysis.nets.training import engine, restore
 
 PART = 2048
 

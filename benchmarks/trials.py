@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import SEED, peak_mb
-from flows.orders import describe_campaign, make_order
-from flows.session import Session
+from flows.collecting.session import Session
+from flows.planning.orders import describe_campaign, make_order
 from protocols import Trial
 from rigs.build import build_rig
 from storage.store import Store

@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 from typer.exceptions import TyperException
 
-from flows import console, garbage, stopping
+from flows.running import console, garbage, stopping
 from protocols.errors import InputError
 from storage.errors import StoreError, disk_error
 
@@ -25,7 +25,7 @@ def main() -> None:
 
 def _run() -> int:
     try:
-        from flows.cli import app
+        from flows.cli.app import app
 
         code = app(standalone_mode=False)
         if code == console.INTERRUPTED:

@@ -8,18 +8,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from flows import label_check
-from flows.campaigns import collected
-from flows.collect import collect
-from flows.evaluate import evaluate
-from flows.label import label
-from flows.label_check import check_labels
-from flows.label_errors import CHECK
-from flows.orders import Order
-from flows.report import report
+from flows.collecting.collect import collect
+from flows.labelling import label_check
+from flows.labelling.label import label
+from flows.labelling.label_check import check_labels
+from flows.labelling.label_errors import CHECK
+from flows.learning.evaluate import evaluate
+from flows.learning.train import train
+from flows.planning.orders import Order
+from flows.reporting.report import report
+from flows.running.campaigns import collected
 from flows.study_ledger import Ledger, Row
-from flows.sync import sync
-from flows.train import train
+from flows.syncing.sync import sync
 from storage.store import Store
 
 COLLECT_S = {"tracks": 0.3, "video": 5.0}

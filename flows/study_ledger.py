@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows import console
+from flows.running import console
 from storage.files import read_json, write_json
 
 FILE = "study.json"

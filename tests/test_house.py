@@ -21,10 +21,10 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
         if "simulation_truth" in path.read_text()
     }
     assert readers == {
-        "flows/session.py",
+        "flows/collecting/session.py",
         "storage/recording.py",
-        "flows/label_errors.py",
-        "flows/view_streams.py",  # drawn beside the label, and called simulated
+        "flows/labelling/label_errors.py",
+        "flows/reviewing/view_streams.py",  # drawn beside the label, and called simulated
     }
 
 

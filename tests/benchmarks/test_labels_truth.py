@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.labels_summary import summary, tables, verdicts
 from benchmarks.labels_truth import GLARE, NUISANCES, ROOT, check
-from flows.scene_runs import sample_trials
+from flows.searching.scene_runs import sample_trials
 from protocols.plan import load_plan
 from rigs.rig_file import load_rig_file
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from flows.orders import Order, make_order
-from flows.stretch import stretch
+from flows.collecting.stretch import stretch
+from flows.planning.orders import Order, make_order
 from storage.files import read_json
 from storage.store import Store
 from storage.verify import UNFINISHED, verify

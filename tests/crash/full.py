@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.__main__ import _explain
-from flows.orders import Order
+from flows.planning.orders import Order
 from tests.crash.campaign import collect, hashes, order, wrong, wrong_at_the_end
 from tests.crash.hooks import Policy
 from tests.crash.policies import Full, ReadOnly

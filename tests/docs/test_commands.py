@@ -15,7 +15,7 @@ import pytest
 import typer
 from typer.exceptions import TyperException
 
-from flows.cli import app
+from flows.cli.app import app
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES, Command, blocks, commands
 

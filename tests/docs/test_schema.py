@@ -13,7 +13,7 @@ import pytest
 import yaml
 from jsonschema import Draft7Validator
 
-from flows.schema import Kind, file_schema
+from flows.planning.schema import Kind, file_schema
 from protocols.errors import InputError
 from protocols.model import Protocol
 from protocols.yaml_file import StrictModel, validate
@@ -189,7 +189,7 @@ def test_keys_are_explained() -> None:
 def test_the_command_prints_and_writes_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from flows.cli import app
+    from flows.cli.app import app
 
     out = tmp_path / "rig.json"
     assert not app(["schema", "rig", "--out", str(out)], standalone_mode=False)

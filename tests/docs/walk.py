@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from flows import console
+from flows.running import console
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.docs.blocks import Block, blocks, steps

@@ -17,8 +17,8 @@ from tests.conftest import ROOT, SMALL
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
-from flows.orchestration import prepare  # noqa: E402
-from flows.orders import Order, make_order  # noqa: E402
+from flows.planning.orders import Order, make_order  # noqa: E402
+from flows.running.orchestration import prepare  # noqa: E402
 from flows.study import Outcome, study  # noqa: E402
 
 prepare(Path(_HOME))

@@ -11,8 +11,8 @@ from typing import Any
 
 import yaml
 
-from flows.orders import Order, describe_campaign, make_order, pending_trials
-from flows.session import Session
+from flows.collecting.session import Session
+from flows.planning.orders import Order, describe_campaign, make_order, pending_trials
 from rigs.build import loopback_rig
 from rigs.rig_file import RigFile
 from rigs.wire.loopback import Loopback

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from flows.campaigns import Collected
-from flows.label import STEP, label_key
+from flows.labelling.label import STEP, label_key
+from flows.running.campaigns import Collected
 from storage.derived import Derived
 from storage.files import sha256
 from storage.store import Campaign, Store

@@ -12,23 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis import training
-from analysis.dataset import recorded_span
-from analysis.metrics import CLASSES
-from analysis.window_checks import Chance
-from flows import trial_work, window_baselines, window_checks
-from flows.campaigns import collected, training_campaigns
-from flows.collect import collect
-from flows.evaluate import evaluate
-from flows.label_check import check_labels, folder_of, wanted
-from flows.label_errors import read_check
-from flows.orders import Order, make_order
-from flows.report import read_summary, report
-from flows.reviewed import Labels
-from flows.samples import load_samples
+from analysis.nets import training
+from analysis.nets.dataset import recorded_span
+from analysis.nets.metrics import CLASSES
+from analysis.nets.window_checks import Chance
+from flows.collecting.collect import collect
+from flows.labelling.label_check import check_labels, folder_of, wanted
+from flows.labelling.label_errors import read_check
+from flows.labelling.reviewed import Labels
+from flows.learning import window_baselines, window_checks
+from flows.learning.evaluate import evaluate
+from flows.learning.samples import load_samples
+from flows.learning.train import train
+from flows.learning.window_scores import owners, whose
+from flows.planning.orders import Order, make_order
+from flows.reporting.report import read_summary, report
+from flows.running import trial_work
+from flows.running.campaigns import collected, training_campaigns
 from flows.study import Outcome, study
-from flows.train import train
-from flows.window_scores import owners, whose
 from storage.derived import Derived
 from storage.files import write_bytes
 from storage.store import Store, StoreError
@@ -349,7 +350,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
         raise _Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("flows.train.write_bytes", write_and_die)
+        patched.setattr("flows.learning.train.write_bytes", write_and_die)
         with pytest.raises(_Killed):
             train(store, collected(store))
     assert len(list(models.glob("*.state"))) == 1
@@ -377,9 +378,9 @@ def test_the_model_goes_out_as_what_it_is(
     ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
-    from analysis import onnx_file
-    from flows.detect_order import load_model
-    from flows.model_export import ExportFailed, export_model
+    from analysis.nets import onnx_file
+    from flows.detecting.detect_order import load_model
+    from flows.learning.model_export import ExportFailed, export_model
 
     store = store_of(ran)
     model = store.folder / "models" / "seed0.pt"

@@ -51,7 +51,7 @@ def _written(box: Path, name: str, data: bytes) -> Path:
 
 def read_protocol(box: Path, name: str, data: bytes) -> None:
     """A protocol, expanded, with all that `sliplab plan` tells of it."""
-    from flows.plan_view import as_json
+    from flows.planning.plan_view import as_json
     from protocols.plan import load_plan
 
     plan = load_plan(_written(box, "protocol.yaml", data))

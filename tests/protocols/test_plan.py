@@ -242,7 +242,8 @@ def test_people_are_asked_in_outer_blocks_only() -> None:
 
 def test_the_plan_is_read_without_heavy_libraries() -> None:
     code = (
-        "import sys; import flows.cli; from pathlib import Path; from protocols import load_plan;"
+        "import sys; import flows.cli.app; from pathlib import Path;"
+        "from protocols import load_plan;"
         "from rigs.rig_file import load_rig_file;"
         "load_plan(Path('protocols/kinematic.yaml')); load_rig_file(Path('rigs/mock.yaml'));"
         "heavy = {'torch', 'numba', 'cv2', 'prefect', 'pandas', 'scipy', 'h5py', 'samna'};"

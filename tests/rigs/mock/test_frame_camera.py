@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.plate import track_video
+from analysis.labels.plate import track_video
 from rigs.capabilities import Segment
 from rigs.mock.devices import MockDevices, build_mock
 from rigs.mock.settings import FrameCamera, MockSettings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.plate import PlateTracker
+from analysis.labels.plate import PlateTracker
 from rigs.scene.exposure import Way
 from rigs.scene.frames import FrameOptics, PlateView
 from rigs.scene.skin import SkinGeometry, make_skin

@@ -1,0 +1,181 @@
+"""All detectors at equal rates of false early detections: what the report's comparison is made of.
+
+They learn from training trials, their levels are set on validation trials and they are judged on
+test trials. Nothing is ever chosen by a test trial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.detect.detector_choice import (
+    Judged,
+    allowed_early,
+    interval,
+    judge,
+    merit,
+    outcomes,
+    set_levels,
+)
+from analysis.detect.detectors import (
+    Detector,
+    Heard,
+    Labelled,
+    Learned,
+    Levels,
+    Smoothing,
+    decide,
+    learn,
+)
+from analysis.detect.latency import TrialLatency, summarise_latency, summarise_lead
+from protocols.settings import Comparison, Detection, Windows
+
+CURVE_RATE = 0.06
+"""The curves end at this share of false early validation trials."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Trials with both onsets: training ones in consecutive windows, the others at the finer
+    stride."""
+
+    train: Sequence[Labelled]
+    validation: Sequence[Labelled]
+    test: Sequence[Labelled]
+
+
+def compare(
+    parts: Parts, windows: Windows, settings: Detection, fine_ms: int
+) -> dict[str, Any] | None:
+    """Every detector at every stride and rate, as plain data for JSON.
+
+    Args:
+        windows: their length and steps.
+        settings: smoothing of the paper's rule, the grid of smoothings, what is false early, and
+            the rates that are compared.
+        fine_ms: the finer stride; divides the window's length.
+
+    Returns:
+        None where nothing is to be compared, or training, validation or test trials are missing.
+        ``trials``: how many of each.
+        ``detectors``: one entry for each detector and stride, with ``name``, ``stride_ms``,
+        ``rates`` (one entry for each of the rates) and ``curve`` (false early validation
+        trials, and what the test trials then give).
+    """
+    asked = settings.compare
+    if asked is None or not (parts.train and parts.validation and parts.test):
+        return None
+    learned = learn(parts.train, windows.length_ms * 1_000_000, windows.steps)
+    found = []
+    for stride in sorted({windows.length_ms, fine_ms}, reverse=True):
+        every = stride // fine_ms
+        validation = [thinned(trial, every) for trial in parts.validation]
+        test = [thinned(trial, every) for trial in parts.test]
+        for name, choices in _detectors(learned, windows, settings, stride).items():
+            judged = {
+                key: (judge(detector, validation), judge(detector, test))
+                for key, detector in choices.items()
+            }
+            found.append({"name": name, "stride_ms": stride, **_scores(judged, settings, asked)})
+    return {
+        "trials": {name: len(getattr(parts, name)) for name in ("train", "validation", "test")},
+        "strides_ms": sorted({windows.length_ms, fine_ms}),
+        "detectors": found,
+    }
+
+
+def thinned(trial: Labelled, every: int) -> Labelled:
+    """A trial with each `every`-th of its windows, the first one among them."""
+    heard = trial.heard
+    kept = Heard(heard.counts[::every], heard.events[::every], heard.end_ns[::every])
+    return Labelled(kept, trial.incipient_ns, trial.gross_ns)
+
+
+def _detectors(
+    learned: Learned, windows: Windows, settings: Detection, stride_ms: int
+) -> dict[str, dict[int, Detector]]:
+    """Detectors by name; where there are several, the validation trials choose, by the number."""
+    ours = learned.detectors(stride_ms / windows.length_ms)
+    return {
+        "smoothing": {settings.smoothing: Smoothing(settings.smoothing)},
+        "smoothing chosen": {width: Smoothing(width) for width in settings.smoothing_grid},
+        **{name: {0: detector} for name, detector in ours.items()},
+    }
+
+
+def _scores(
+    judged: Mapping[int, tuple[list[Judged], list[Judged]]],
+    settings: Detection,
+    asked: Comparison,
+) -> dict[str, Any]:
+    tolerance = round(settings.false_early_ms * 1e6)
+    trials = len(next(iter(judged.values()))[0])
+    known: dict[int, dict[str, Any]] = {}
+
+    def at(allowed: int) -> dict[str, Any]:
+        if allowed not in known:
+            known[allowed] = _best(judged, allowed, tolerance)
+        return known[allowed]
+
+    rates = [
+        {"asked": rate, "allowed": allowed_early(rate, trials), **at(allowed_early(rate, trials))}
+        for rate in asked.rates
+    ]
+    last = min(allowed_early(CURVE_RATE, trials), trials - 1)
+    curve = [
+        {
+            "allowed": allowed,
+            "rate": allowed / trials,
+            "median_ms": at(allowed)["test"]["median_with_missed_ms"],
+        }
+        for allowed in range(last + 1)
+    ]
+    return {"rates": rates, "curve": curve}
+
+
+def _best(
+    judged: Mapping[int, tuple[list[Judged], list[Judged]]], allowed: int, tolerance: int
+) -> dict[str, Any]:
+    """One detector at one rate; of several the one that validation trials find quickest."""
+    ranked = []
+    for key, (validation, _) in judged.items():
+        levels = set_levels(validation, allowed, tolerance)
+        scored = outcomes(validation, levels, tolerance)
+        ranked.append((*merit(scored), key, levels))
+    # keys differ, so levels are never compared
+    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
+    return {
+        "choice": key,
+        "levels": {name: _plain(value) for name, value in vars(levels).items()},
+        **{
+            name: _summary(trials, outcomes(trials, levels, tolerance), levels)
+            for name, trials in zip(("validation", "test"), judged[key], strict=True)
+        },
+    }
+
+
+def _summary(
+    trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
+) -> dict[str, Any]:
+    early = sum(trial.false_early_incipient for trial in scored)
+    low, high = interval(early, len(scored))
+    before = []
+    for trial, score in zip(trials, scored, strict=True):
+        found = decide(trial.evidence, levels).incipient_ns
+        if score.false_early_incipient and found is not None:
+            before.append((trial.incipient_ns - found) / 1e6)
+    return {
+        "false_early_before_ms": sorted(before),
+        "false_early_rate": {"value": early / len(scored), "low": low, "high": high},
+        "median_with_missed_ms": _plain(merit(scored)[0]),
+        "latency_ms": summarise_latency(scored),
+        "lead_ms": summarise_lead(scored),
+    }
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

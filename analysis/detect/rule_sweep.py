@@ -1,0 +1,159 @@
+"""The paper's rule at every smoothing and margin at once, and what each pair is worth.
+
+`analysis.detect.detection.detect` is the rule for one pair; a search asks for dozens of pairs on
+every trial of every network, so the sums over windows are made once for all margins here. Tests
+hold each pair to `detect`, each figure to `analysis.detect.latency` and the choice to
+`analysis.detect.smoothing_choice`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.detect.detection import lead_of
+from analysis.detect.detector_choice import allowed_early
+from analysis.nets.metrics import GROSS, INCIPIENT
+
+I64 = npt.NDArray[np.int64]
+F64 = npt.NDArray[np.float64]
+
+NEVER = np.iinfo(np.int64).max
+"""The time of what was not detected."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """True onsets of trials and what counts as too early, int64 (n,), ns."""
+
+    incipient_ns: I64
+    gross_ns: I64
+    tolerance_ns: I64
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a pair is worth over trials.
+
+    Attributes:
+        mean_ms, p95_ms: incipient latency of counted detections; None without one.
+        gross_mean_ms: the same of gross slip.
+        lead_min_ms: shortest lead of gross slip's true onset over a counted detection.
+        missed, missed_gross: shares of trials without a detection.
+        false_early, false_early_gross: shares of trials whose detection came too early.
+        false_early_either: of trials where either did.
+        missed_either: of trials where either is missing.
+        trials: how many.
+    """
+
+    mean_ms: float | None
+    p95_ms: float | None
+    gross_mean_ms: float | None
+    lead_min_ms: float | None
+    missed: float
+    missed_gross: float
+    missed_either: float
+    false_early: float
+    false_early_gross: float
+    false_early_either: float
+    trials: int
+
+
+def sweep(
+    counts: npt.NDArray[np.integer],
+    end_ns: I64,
+    smoothings: Sequence[int],
+    margins: Sequence[float],
+) -> I64:
+    """What the rule detects in one trial by each pair.
+
+    Args:
+        counts: raw output spikes, integer (n, 3), windows in the order of time.
+        end_ns: int64 (n,), end of each window.
+
+    Returns:
+        int64 (smoothings, margins, 2): incipient and gross detection, `NEVER` where there is none.
+    """
+    found = np.full((len(smoothings), len(margins), 2), NEVER, np.int64)
+    for s, smoothing in enumerate(smoothings):
+        slips = [lead_of(counts, smoothing, wanted) for wanted in (INCIPIENT, GROSS)]
+        for m, margin in enumerate(margins):
+            first = _first(slips[0], margin, 0)
+            if first is None:
+                continue
+            found[s, m, 0] = end_ns[first]
+            second = _first(slips[1], margin, first + 1)
+            if second is not None:
+                found[s, m, 1] = end_ns[second]
+    return found
+
+
+def _first(lead: F64, margin: float, start: int) -> int | None:
+    """The first window from `start` on where a class leads by the margin, and leads at all."""
+    there = lead[start:] >= margin if margin > 0 else lead[start:] > 0
+    at = int(there.argmax()) if there.size else 0
+    return start + at if there.size and there[at] else None
+
+
+def worth(found: I64, trials: Trials) -> Figures:
+    """One pair's detections int64 (n, 2) against the true onsets of n trials, n at least 1."""
+    incipient, gross = (found[:, k] for k in (0, 1))
+    missed, missed_gross = incipient == NEVER, gross == NEVER
+    early = incipient < trials.incipient_ns - trials.tolerance_ns
+    early_gross = gross < trials.gross_ns - trials.tolerance_ns
+    counted, counted_gross = ~(missed | early), ~(missed_gross | early_gross)
+    late = (incipient - trials.incipient_ns)[counted] / 1e6
+    late_gross = (gross - trials.gross_ns)[counted_gross] / 1e6
+    lead = (trials.gross_ns - incipient)[counted] / 1e6
+
+    def share(which: npt.NDArray[np.bool_]) -> float:
+        return float(which.mean())
+
+    return Figures(
+        mean_ms=float(late.mean()) if late.size else None,
+        p95_ms=float(np.percentile(late, 95)) if late.size else None,
+        gross_mean_ms=float(late_gross.mean()) if late_gross.size else None,
+        lead_min_ms=float(lead.min()) if lead.size else None,
+        missed=share(missed),
+        missed_gross=share(missed_gross),
+        missed_either=share(missed | missed_gross),
+        false_early=share(early),
+        false_early_gross=share(early_gross),
+        false_early_either=share(early | early_gross),
+        trials=len(found),
+    )
+
+
+def choose_pair(
+    found: I64, trials: Trials, smoothings: Sequence[int], margins: Sequence[float], rate: float
+) -> tuple[int, int]:
+    """Places of the pair that `analysis.detect.smoothing_choice.choose_smoothing` would choose.
+
+    Args:
+        found: int64 (n, smoothings, margins, 2), n at least 1.
+        rate: share of the trials that may be false early, for either onset.
+    """
+    incipient, gross = found[..., 0], found[..., 1]
+    true = trials.incipient_ns[:, None, None]
+    tolerance = trials.tolerance_ns[:, None, None]
+    early = incipient < true - tolerance
+    early_gross = gross < trials.gross_ns[:, None, None] - tolerance
+    missed = incipient == NEVER
+    late = np.where(missed, np.inf, (np.where(missed, true, incipient) - true) / 1e6)
+    allowed = allowed_early(rate, len(found))
+
+    def rank(s: int, m: int) -> tuple[float, ...]:
+        n, n_gross = int(early[:, s, m].sum()), int(early_gross[:, s, m].sum())
+        values = np.sort(late[:, s, m][~early[:, s, m]])
+        median = float(np.median(values)) if values.size else np.inf
+        high = np.inf
+        if values.size:
+            high = float(np.percentile(values, 95, method="inverted_cdf"))
+        excess = max(n - allowed, 0) + max(n_gross - allowed, 0)
+        return excess, median, high, n + n_gross, smoothings[s], -margins[m]
+
+    pairs = [(s, m) for s in range(len(smoothings)) for m in range(len(margins))]
+    return min(pairs, key=lambda pair: rank(*pair))

@@ -1,0 +1,1 @@
+"""Ground truth: from a trial's video to tracks, slips and onsets, with the doubts about them."""

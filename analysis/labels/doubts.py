@@ -1,0 +1,128 @@
+"""Why an onset is not known although a rule gives one, in words.
+
+A label is what everything downstream is measured against: a wrong one costs more than a missing
+one. An onset is in doubt where a marker that could have changed it was out of sight, where its
+place was too uncertain to say when it crossed the line, and where the camera moved while too little
+stood still to tell by how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.labels.onsets import NO_ONSET, Onsets, paper_onsets
+from protocols.settings import Labelling
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAX_UNSEEN_NS = 30_000_000
+"""A marker may be out of sight for this long without making its onset unknown: one window."""
+MAX_OFF_FRAMES = 2
+"""An onset that its markers' uncertainty can move by more frames than this is in doubt."""
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """Why an onset of a trial is not known, in words; None where it is."""
+
+    incipient: str | None
+    gross: str | None
+
+    def or_else(self, other: Doubts) -> Doubts:
+        """These, and where there are none, those."""
+        return Doubts(self.incipient or other.incipient, self.gross or other.gross)
+
+
+NO_DOUBTS = Doubts(None, None)
+
+
+def doubts(
+    frame_ns: Ints, displacement: Floats, centre: int, settings: Labelling, not_before_ns: int
+) -> Doubts:
+    """`unseen` for the paper's rule; arguments and errors as for `paper_onsets`."""
+    onsets = paper_onsets(frame_ns, displacement, centre, settings, not_before_ns)
+    return unseen(frame_ns, displacement, onsets, centre, not_before_ns)
+
+
+def unseen(
+    frame_ns: Ints, displacement: Floats, onsets: Onsets, centre: int, not_before_ns: int
+) -> Doubts:
+    """Whether markers that were hidden, torn off or never seen could have changed the onsets.
+
+    A marker that is out of sight and comes back where it was has not slipped; one that comes back
+    displaced, or not at all, slipped at some time in between. An onset is in doubt when such a
+    time begins more than `MAX_UNSEEN_NS` before the onset that the seen markers give.
+
+    Args:
+        frame_ns: (n,) int64. displacement: (n, m) px, NaN where a marker was not seen.
+        onsets: by whatever rule.
+        not_before_ns: start of the motion; a marker never seen at rest is unseen from here on.
+    """
+    if not len(frame_ns):
+        return NO_DOUBTS
+    last_ns = int(frame_ns[-1])
+    incipient = last_ns if onsets.incipient_ns is None else onsets.incipient_ns
+    found: list[tuple[int, int]] = []
+    gross = None
+    for marker in range(displacement.shape[1]):
+        slipped = int(onsets.per_marker_ns[marker])
+        until = last_ns if slipped == NO_ONSET else slipped
+        at_rest = np.isfinite(displacement[:, marker])
+        if slipped != NO_ONSET:
+            at_rest &= frame_ns < slipped
+        seen = max(int(frame_ns[at_rest][-1]), not_before_ns) if at_rest.any() else not_before_ns
+        if marker == centre and until - seen > MAX_UNSEEN_NS:
+            gross = (
+                f"the centre marker could not be followed from {_s(seen - not_before_ns)} "
+                f"to {_s(until - not_before_ns)} after the motion began"
+            )
+        if min(until, incipient) - seen > MAX_UNSEEN_NS:
+            found.append((seen, marker))
+    if not found:
+        return Doubts(None, gross)
+    seen, marker = min(found)
+    reason = (
+        f"marker {marker} could not be followed from {_s(seen - not_before_ns)} after the motion "
+        "began, and may have slipped first"
+    )
+    return Doubts(reason, gross)
+
+
+def uncertain(
+    frame_ns: Ints, displacement: Floats, sigma: Floats, onsets: Onsets, centre: int,
+    threshold_px: float, not_before_ns: int,
+) -> Doubts:  # fmt: skip
+    """Whether the places' standard deviations leave it open when a marker crossed the line.
+
+    Args:
+        displacement, sigma: (n, m) px, the second of the first; NaN where unknown.
+        onsets: the paper's, of the same displacements.
+    """
+    moving = frame_ns >= not_before_ns
+    may = moving[:, None] & (displacement + _SIGMAS * sigma > threshold_px)
+    must = moving[:, None] & (displacement - _SIGMAS * sigma > threshold_px)
+    earliest = np.where(may.any(axis=0), may.argmax(axis=0), len(frame_ns))
+    surely = np.where(must.any(axis=0), must.argmax(axis=0), len(frame_ns))
+    gross = None
+    if abs(surely[centre] - earliest[centre]) > 2 * MAX_OFF_FRAMES:
+        gross = f"the centre marker's place is only known to {_worst(sigma, centre)} px"
+    first, last = int(earliest.min()), int(surely.min())
+    incipient = None
+    if last - first > 2 * MAX_OFF_FRAMES:
+        marker = int(earliest.argmin())
+        incipient = f"marker {marker}'s place is only known to {_worst(sigma, marker)} px"
+    return Doubts(incipient, gross)
+
+
+def _worst(sigma: Floats, marker: int) -> str:
+    known = sigma[:, marker][np.isfinite(sigma[:, marker])]
+    return f"{known.max():.2f}" if len(known) else "-"
+
+
+def _s(ns: int) -> str:
+    return f"{ns / 1e9:.2f} s"

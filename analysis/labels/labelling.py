@@ -1,0 +1,253 @@
+"""Ground truth of one recorded trial: its markers' places, and its onsets by both rules.
+
+The places come from the trial's video, tracked once, or from a camera that handed over tracks. The
+paper's rule and the change points are both kept; the protocol says which of them rules.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
+from analysis.labels.doubts import Doubts, uncertain, unseen
+from analysis.labels.onsets import Onsets, offsets, paper_onsets
+from analysis.labels.places import SURE_PX, Places, places_of
+from analysis.labels.slip_times import SlipTimes, slip_times
+from protocols.settings import Labelling
+from storage.recording import Recording
+
+F64 = npt.NDArray[np.float64]
+VERSION = 3
+
+Results = tuple[dict[str, Any], dict[str, Any]]
+"""A result's JSON and its arrays."""
+LOST_SHARE = 0.05
+"""A marker that is lost in more of the frames than this is named in the flags."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """Onsets of one trial and what they were read from.
+
+    Attributes:
+        rule: which onsets rule.
+        paper: by the paper's rule, on the trial's time line. slips: by change points.
+        paper_doubts, slip_doubts: why an onset is not known although the seen markers give one.
+        frame_ns: (n,) int64, middle of exposure of every frame on the time line.
+        displacement_px: (n, m) float64, NaN where a marker was lost.
+    """
+
+    rule: Literal["paper", "change_point"]
+    paper: Onsets
+    paper_doubts: Doubts
+    slips: SlipTimes
+    slip_doubts: Doubts
+    frame_ns: npt.NDArray[np.int64]
+    displacement_px: F64
+    places: Places
+    camera: CameraShift
+    start_ns: int
+    source: str
+
+    @property
+    def onsets(self) -> Onsets:
+        """The ones that rule."""
+        return self.paper if self.rule == "paper" else self.slips.onsets
+
+    @property
+    def doubts(self) -> Doubts:
+        """Of the ones that rule."""
+        return self.paper_doubts if self.rule == "paper" else self.slip_doubts
+
+    @property
+    def markers_lost(self) -> int:
+        """Marker-frames without a measurement."""
+        return int(np.count_nonzero(np.isnan(self.places.xy).any(axis=2)))
+
+    def quality(self) -> F64:
+        """(m,) each marker's lowest quality from the motion's start to its slip; see Places."""
+        times, until = self.frame_ns[:, None], self.paper.per_marker_ns
+        counts = (times >= self.start_ns) & ((until < 0) | (times <= until))
+        lowest = np.where(counts, self.places.quality, np.inf).min(axis=0, initial=np.inf)
+        return np.where(np.isfinite(lowest), lowest, 0.0)
+
+    def flags(self) -> list[str]:
+        """What a person should look at first."""
+        found = []
+        if self.camera.largest_px:
+            found.append(f"the camera moved by up to {self.camera.largest_px:.1f} px")
+        lost = np.isnan(self.places.xy).any(axis=2).mean(axis=0)
+        found += [
+            f"marker {marker} was lost in {lost[marker]:.0%} of the frames"
+            for marker in np.flatnonzero(lost > LOST_SHARE)
+        ]
+        if self.places.plate_lost:
+            found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
+        if self.places.tilted:
+            found.append("the plate is seen askew: displacements are in its plane")
+        return found
+
+    def as_json(self) -> dict[str, Any]:
+        """What is kept as JSON: an onset in doubt is none, and its reason stands beside it."""
+        onsets, doubts = self.onsets, self.doubts
+        return {
+            "rule": self.rule,
+            "incipient_ns": None if doubts.incipient else onsets.incipient_ns,
+            # without the first slip nothing is made of the second
+            "gross_ns": None if doubts.incipient or doubts.gross else onsets.gross_ns,
+            "doubts": _doubts_json(doubts),
+            "first_marker": onsets.first_marker,
+            "per_marker_ns": onsets.per_marker_ns.tolist(),
+            "paper": _onsets_json(self.paper, self.paper_doubts),
+            "change_point": {
+                **_onsets_json(self.slips.onsets, self.slip_doubts),
+                "low_ns": self.slips.low_ns.tolist(),
+                "high_ns": self.slips.high_ns.tolist(),
+            },
+            "markers_lost": self.markers_lost,
+            "plate_lost": self.places.plate_lost,
+            "camera_moved_px": round(self.camera.largest_px, 3),
+            "flags": self.flags(),
+            "quality": np.round(self.quality(), 3).tolist(),
+            "source": self.source,
+        }
+
+    def as_arrays(self) -> dict[str, Any]:
+        """What is kept as arrays; displacements to a thousandth of a pixel."""
+        places = self.places
+        arrays = {
+            "frame_ns": self.frame_ns,
+            "displacement_px": _thousandths(self.displacement_px),
+            "xy_px": _thousandths(places.xy),
+            "sigma_px": places.sigma.astype(np.float32),
+            "quality": np.round(100 * places.quality).astype(np.uint8),
+            "camera_px": _thousandths(self.camera.px),
+        }
+        if places.plate is not None:
+            arrays["plate_px"] = _thousandths(places.plate.xy)
+            arrays["plate_corners_px"] = _thousandths(places.plate.corners)
+            arrays["plate_seen"] = places.plate.ok
+        return arrays
+
+
+def label_results(recording: Recording, settings: Labelling) -> Results:
+    """A trial's label as it is kept: JSON and arrays."""
+    label = label_recording(recording, settings)
+    return label.as_json(), label.as_arrays()
+
+
+def label_recording(recording: Recording, settings: Labelling) -> Label:
+    """Find a trial's onsets in its video, or in its tracks where there is no video.
+
+    Raises:
+        ValueError: the trial has neither video nor tracks, or its markers cannot be told apart.
+    """
+    frame_ns = recording.frame_times()
+    start_ns = recording.step(recording.motion_phase)[0]
+    timing = recording.record.get("timing") or {}
+    return label_places(
+        places_of(recording),
+        frame_ns,
+        start_ns,
+        settings,
+        centre=int(recording.record["geometry"]["centre"]),
+        exposure_ns=2 * int(timing.get("mid_exposure_ns") or 0),
+        source=recording.frame_source,
+    )
+
+
+def label_places(
+    places: Places,
+    frame_ns: npt.NDArray[np.int64],
+    start_ns: int,
+    settings: Labelling,
+    *,
+    centre: int,
+    exposure_ns: int,
+    source: str,
+) -> Label:
+    """Both rules over a trial's places.
+
+    Displacements count from the markers' mean positions over the last part of the hold; in
+    trials with a sliding plate they are taken relative to the plate's own marker. A marker whose
+    place is not known to a quarter of a pixel is not seen in that frame.
+
+    Args:
+        frame_ns: (n,) int64 on the time line. start_ns: of the slide or retraction.
+        exposure_ns: how long the shutter was open.
+
+    Raises:
+        ValueError: there is no frame in the hold.
+    """
+    reference = (frame_ns < start_ns) & (frame_ns >= start_ns - int(settings.reference_ms * 1e6))
+    sure = places.sigma <= SURE_PX
+    xy = np.where(sure[..., None], places.flat_xy, np.nan)
+    away = offsets(xy, reference, places.flat_plate)
+    sigma = np.where(sure, places.sigma, np.nan)
+    camera = no_shift(len(frame_ns))
+    if places.plate is None:
+        camera = camera_shift(away)
+        away = away - camera.px[:, None, :]
+        sigma = np.hypot(sigma, camera.sigma[:, None])
+    else:
+        sigma = np.hypot(sigma, places.plate.sigma[:, None])
+    moved = np.hypot(away[..., 0], away[..., 1])
+    paper = paper_onsets(frame_ns, moved, centre, settings, start_ns)
+    slips = slip_times(frame_ns, away, sigma, centre, start_ns, exposure_ns, settings.threshold_px)
+    knocked = _knocked(frame_ns, camera)
+    paper_doubts = unseen(frame_ns, moved, paper, centre, start_ns).or_else(
+        uncertain(frame_ns, moved, sigma, paper, centre, settings.threshold_px, start_ns)
+    )
+    slip_doubts = unseen(frame_ns, moved, slips.onsets, centre, start_ns).or_else(slips.doubts())
+    return Label(
+        settings.rule,
+        paper,
+        paper_doubts.or_else(knocked(paper)),
+        slips,
+        slip_doubts.or_else(knocked(slips.onsets)),
+        frame_ns,
+        moved,
+        places,
+        camera,
+        start_ns,
+        source,
+    )
+
+
+def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:
+    """Doubts of onsets after the camera moved while too little stood still."""
+    moved = frame_ns[camera.unsure]
+
+    def doubts(onsets: Onsets) -> Doubts:
+        reason = "the camera moved while too few markers stood still to tell how far"
+
+        def of(onset: int | None) -> str | None:
+            late = onset is None or (len(moved) and int(moved[0]) <= onset)
+            return reason if len(moved) and late else None
+
+        return Doubts(of(onsets.incipient_ns), of(onsets.gross_ns))
+
+    return doubts
+
+
+def _thousandths(values: F64) -> npt.NDArray[np.float32]:
+    return np.round(values, 3).astype(np.float32)
+
+
+def _doubts_json(doubts: Doubts) -> dict[str, str | None]:
+    """A gross onset after an incipient one that is not known is not known either."""
+    return {"incipient": doubts.incipient, "gross": doubts.gross or doubts.incipient}
+
+
+def _onsets_json(onsets: Onsets, doubts: Doubts) -> dict[str, Any]:
+    return {
+        "incipient_ns": onsets.incipient_ns,
+        "gross_ns": onsets.gross_ns,
+        "first_marker": onsets.first_marker,
+        "per_marker_ns": onsets.per_marker_ns.tolist(),
+        "doubts": _doubts_json(doubts),
+    }

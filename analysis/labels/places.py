@@ -1,0 +1,107 @@
+"""Where everything is in a trial's frames: from its video, or as the camera handed it over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.labels.markers import MarkerTracks
+from analysis.labels.plane import Plane, plane_of
+from analysis.labels.plate import PlateTrack, track_video
+from storage.recording import Recording
+
+F64 = npt.NDArray[np.float64]
+
+SURE_PX = 0.25
+"""A place with a larger standard deviation is no measurement: it could be a part of a slip."""
+TRACKS_PX, TRACKS_PLATE_PX = 0.006, 0.04
+"""Standard deviations taken for tracks that a camera hands over without saying."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Markers and plate over n frames.
+
+    Attributes:
+        xy: (n, m, 2) px in the picture, NaN where a marker was not seen whole.
+        sigma: (n, m) standard deviation of a coordinate, px. quality: (n, m), 0 to 1.
+        plate: None in trials without a sliding plate.
+        plane: the plate's, where the camera looks askew.
+    """
+
+    xy: F64
+    sigma: F64
+    quality: F64
+    plate: PlateTrack | None = None
+    plane: Plane | None = None
+
+    @property
+    def flat_xy(self) -> F64:
+        """`xy` in the plate's plane, px at the picture's centre."""
+        return self.xy if self.plane is None else self.plane.flat(self.xy)
+
+    @property
+    def flat_plate(self) -> F64 | None:
+        """(n, 2) the plate's own marker, likewise."""
+        if self.plate is None or self.plane is None:
+            return None if self.plate is None else self.plate.xy
+        result: F64 = self.plane.flat(self.plate.corners).mean(axis=1)
+        return result
+
+    @property
+    def plate_lost(self) -> int:
+        """In how many frames the plate's marker was not seen."""
+        return 0 if self.plate is None else int(np.count_nonzero(~self.plate.ok))
+
+    @property
+    def tilted(self) -> bool:
+        """Whether the camera looks askew."""
+        return self.plane is not None
+
+
+def places_of(recording: Recording) -> Places:
+    """All places of a trial.
+
+    Raises:
+        ValueError: it has neither video nor tracks, or tracks without the plate that it has.
+    """
+    with_plate = recording.record["experiment"] != "kinematic"
+    if recording.has_video:
+        geometry = recording.record["geometry"]
+        layout = np.asarray(geometry["skin_mm"], np.float64) * geometry["px_per_mm"]
+        layout[:, 1] *= -1  # rows count downwards
+        video = track_video(recording.frames(), layout, with_plate)
+        return from_tracks(video.markers, video.plate, tuple(geometry["frame_px"]))
+    if recording.has_tracks:
+        return _handed_over(recording, with_plate)
+    raise ValueError(f"{recording.trial_id}: has neither video nor tracks to label from")
+
+
+def from_tracks(
+    markers: MarkerTracks, plate: PlateTrack | None, size_px: tuple[int, ...]
+) -> Places:
+    """What tracking a video of `size_px` gave."""
+    plane = None
+    if plate is not None:
+        plane = plane_of(plate.corners, plate.ok, (size_px[0], size_px[1]))
+    return Places(markers.xy, markers.sigma, markers.quality, plate, plane)
+
+
+def _handed_over(recording: Recording, with_plate: bool) -> Places:
+    tracks = recording.tracks()
+    seen = np.asarray(np.isfinite(tracks.markers_px).all(axis=2))
+    sigma, quality = np.where(seen, TRACKS_PX, np.nan), seen.astype(np.float64)
+    if not with_plate:
+        return Places(tracks.markers_px, sigma, quality)
+    if tracks.plate_px is None:
+        raise ValueError(f"{recording.trial_id}: its tracks lack the plate's marker")
+    ok = np.asarray(np.isfinite(tracks.plate_px).all(axis=1))
+    plate = PlateTrack(
+        tracks.plate_px,
+        np.full((len(ok), 4, 2), np.nan),
+        ok,
+        np.where(ok, TRACKS_PLATE_PX, np.nan),
+    )
+    return Places(tracks.markers_px, sigma, quality, plate)

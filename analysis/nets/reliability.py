@@ -1,0 +1,148 @@
+"""Whether a lead of so many spikes means what it says: shares right, and a probability from them.
+
+A detection trusts a class that leads by two spikes. How often is that right, and by how many
+spikes does the network have to lead to be right in 99 of 100 windows? Spike counts are no
+probabilities. One number, the temperature (Guo et al., 2017), makes them some; it is fitted on
+validation windows only, and what it is worth is measured on test windows.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize_scalar
+from scipy.special import log_softmax
+from scipy.stats import norm
+
+from analysis.nets.metrics import Counts, Labels, check
+
+FloatArray = npt.NDArray[np.float64]
+
+BINS = 15
+"""Of equal width, for the expected calibration error, as Guo et al. take them."""
+
+MOST = 10
+"""Leads of so many spikes and more share a row."""
+
+_TEMPERATURES = (1e-2, 1e3)
+
+
+def lead(counts: Counts) -> npt.NDArray[Any]:
+    """Spikes by which the winner leads the next class, (n,); 0 for a tie."""
+    ordered = np.sort(counts, axis=1)
+    return np.asarray(ordered[:, -1] - ordered[:, -2])
+
+
+def wilson(right: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a share, 0..1; all of it where n is 0.
+
+    Raises:
+        ValueError: more right than there are.
+    """
+    if not 0 <= right <= n:
+        raise ValueError(f"{right} right of {n}")
+    if not n:
+        return 0.0, 1.0
+    z = float(norm.ppf(0.5 + level / 2))
+    share, z2 = right / n, z * z
+    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
+    half = z / (1 + z2 / n) * np.sqrt(share * (1 - share) / n + z2 / (4 * n * n))
+    low, high = float(middle - half), float(middle + half)
+    return (0.0 if not right else low), (1.0 if right == n else high)
+
+
+def by_lead(counts: Counts, labels: Labels, most: int = MOST) -> list[dict[str, Any]]:
+    """Share right for each lead in whole spikes, from 0 (a tie, no winner, never right) up.
+
+    Returns:
+        a row for each lead that occurs: ``lead``, ``or_more`` (the last row may gather), ``n``,
+        ``right``, ``share``, and Wilson's 95 % interval ``low`` and ``high``, which takes windows
+        for independent of each other.
+    """
+    counts, labels = check(counts, labels)
+    by = np.minimum(lead(counts), most)
+    right = (by > 0) & (counts.argmax(axis=1) == labels)
+    rows = []
+    for value in np.unique(by).tolist():
+        there = by == value
+        n, hits = int(there.sum()), int(right[there].sum())
+        low, high = wilson(hits, n)
+        rows.append(
+            {
+                "lead": int(value), "or_more": value == most, "n": n, "right": hits,
+                "share": hits / n, "low": low, "high": high,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def fit_temperature(counts: Counts, labels: Labels) -> float | None:
+    """The temperature T for which softmax(counts / T) has the least cross-entropy.
+
+    The mean cross-entropy is convex in 1 / T, so there is one minimum; it is looked for between
+    0.01 and 1000 spikes. None without windows.
+    """
+    counts, labels = check(counts, labels)
+    if not len(labels):
+        return None
+    low, high = np.log(_TEMPERATURES)
+    found = minimize_scalar(
+        lambda log_t: cross_entropy(counts, labels, float(np.exp(log_t))),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    return float(np.exp(found.x))
+
+
+def cross_entropy(counts: Counts, labels: Labels, temperature: float) -> float:
+    """Mean of -log of the probability of the true class, in nats."""
+    log_p = log_softmax(np.asarray(counts, np.float64) / temperature, axis=1)
+    return -float(log_p[np.arange(len(labels)), labels].mean())
+
+
+def expected_calibration_error(
+    probabilities: FloatArray, labels: Labels, bins: int = BINS
+) -> float:
+    """Mean distance between what was said and what was right, 0..1, weighted by windows.
+
+    Windows are put by their highest probability into bins of equal width. Where classes tie, each
+    has its share of being right, so that the order of classes does not matter.
+    """
+    said = probabilities.max(axis=1)
+    top = probabilities == said[:, None]
+    right = top[np.arange(len(labels)), labels] / top.sum(axis=1)
+    place = np.minimum((said * bins).astype(np.int64), bins - 1)
+    gap = np.bincount(place, right - said, minlength=bins)
+    return float(np.abs(gap).sum() / len(labels))
+
+
+def calibration(
+    counts: Counts, labels: Labels, held_counts: Counts, held_labels: Labels
+) -> dict[str, Any]:
+    """The temperature that validation windows give, and what it is worth on test windows.
+
+    Args:
+        counts, labels: of test windows.
+        held_counts, held_labels: of validation windows; nothing else is fitted.
+
+    Returns:
+        ``temperature``; ``ece`` and ``cross_entropy`` of test windows with it, and with 1 under
+        ``uncalibrated``; None where a part has no windows.
+    """
+    counts, labels = check(counts, labels)
+    temperature = fit_temperature(held_counts, held_labels)
+    if temperature is None or not len(labels):
+        return {"temperature": temperature, "ece": None, "cross_entropy": None,
+                "uncalibrated": None}  # fmt: skip
+
+    def worth(t: float) -> dict[str, float]:
+        p = np.exp(log_softmax(counts / t, axis=1))
+        return {
+            "ece": expected_calibration_error(p, labels),
+            "cross_entropy": cross_entropy(counts, labels, t),
+        }
+
+    return {"temperature": temperature, **worth(temperature), "uncalibrated": worth(1.0)}

@@ -1,0 +1,404 @@
+"""Fitting the spiking network to windows, choosing an epoch, and keeping the result.
+
+Surrogate gradients through the event-driven network of `analysis.nets.spiking`, cross-entropy on
+output spike counts, Adam. Spikes are those of weights on the grid
+(`analysis.nets.network.on_grid`), and their gradients move the fine weights behind it: the network
+that is trained, validated, saved and run is one, to the last spike. Two traps of spiking networks
+are dealt with here: a layer that never fires passes for a network that says "no slip" (it is named
+in the warnings), and a result that cannot be repeated (everything random comes from one seed; the
+same call gives the same bits on any number of threads, and after a stop at any epoch).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy.special import log_softmax
+from torch import nn
+
+from analysis.nets import metrics
+from analysis.nets.network import (
+    SPIKING,
+    build,
+    by_parameter,
+    matrices,
+    on_grid,
+    parameters,
+    set_weights,
+    weights,
+)
+from analysis.nets.sparse import SparseWindows
+from analysis.nets.spiking import Engine, Job, Samples, Trainer, WindowLoss
+from protocols.settings import Network, Training, Windows
+
+MICRO_BATCH = 4
+"""Samples whose gradients are computed at once; they are summed up to ``training.batch``. Small
+enough for the processor's cache, and to give every thread something to do."""
+
+SILENT_RATE = 1e-5
+"""Spikes per neuron and step at or below which a layer counts as silent."""
+
+SATURATED_RATE = 0.9
+"""Spikes per neuron and step at or above which a layer counts as saturated (1 is the most)."""
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one pass over the training samples gave.
+
+    Attributes:
+        epoch: 1 for the first.
+        loss: mean cross-entropy of the training samples, each before the step it was used in.
+        train_argmax: their accuracy, likewise, ties shared (`analysis.nets.metrics.Accuracy`).
+        val_loss: mean cross-entropy of the validation samples after the epoch.
+        val_argmax, val_strict, val_margin: their accuracies.
+        rates: mean spikes per neuron and step of each spiking layer over the epoch, by name.
+    """
+
+    epoch: int
+    loss: float
+    train_argmax: float
+    val_loss: float
+    val_argmax: float
+    val_strict: float
+    val_margin: float
+    rates: dict[str, float]
+
+    @property
+    def merit(self) -> tuple[float, float, float]:
+        """What epochs are compared by, the larger the better: see `fit`."""
+        return (self.val_strict, self.val_argmax, -self.val_loss)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A trained network and how it came about.
+
+    Attributes:
+        state_dict: weights of the chosen epoch, by name; no neuron states.
+        network, windows, training, seed: what was asked for.
+        history: one record an epoch.
+        chosen_epoch: the epoch the weights are from.
+        warnings: in words, what is wrong with the chosen network; empty when nothing is.
+        epoch_seconds: wall time of each epoch. Kept apart from the records and not saved, so
+            that the same training gives the same file.
+    """
+
+    state_dict: dict[str, torch.Tensor]
+    network: Network
+    windows: Windows
+    training: Training
+    seed: int
+    history: tuple[EpochRecord, ...]
+    chosen_epoch: int
+    warnings: tuple[str, ...]
+    epoch_seconds: tuple[float, ...] = field(default=(), compare=False)
+
+    @property
+    def chosen(self) -> EpochRecord:
+        """The record of the chosen epoch."""
+        return self.history[self.chosen_epoch - 1]
+
+
+def fit(
+    train_x: Samples,
+    train_y: metrics.Labels,
+    val_x: Samples,
+    val_y: metrics.Labels,
+    network: Network,
+    windows: Windows,
+    training: Training,
+    seed: int,
+    on_epoch: Callable[[EpochRecord], None] | None = None,
+    on_state: Callable[[bytes], None] | None = None,
+    state: bytes | None = None,
+) -> Fitted:
+    """Train one network and keep its best epoch.
+
+    The best epoch has the highest STRICT validation accuracy on raw spike counts: a unique winner
+    that is right. Argmax would give a silent network something for its ties, and a detection
+    needs a winner. Equal epochs are told apart by argmax accuracy (ties shared), then by the lower
+    validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
+    ``training.patience`` epochs in a row were no better. It uses as many threads as torch may.
+
+    A window without any event gets what the biases alone give; where that is no spike, or a tie,
+    it is wrong by strict accuracy.
+
+    Args:
+        train_x, val_x: event counts uint8 (n, steps, channels, cells, cells), or sparse.
+        train_y, val_y: classes, integer (n,), 0..2.
+        network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
+        seed: decides the first weights and the order of the samples.
+        on_epoch: called with each record as soon as it is there, in the calling thread.
+        on_state: called after each epoch with all that is needed to go on from there.
+        state: what `on_state` was given last, by a call with the same arguments: training goes on
+            there and ends with the same bits. Records of the epochs before are told again.
+
+    Raises:
+        ValueError: no samples, shapes that do not fit, a label that is no class, a state of
+            another training.
+    """
+    run = _Run(network, windows, training, seed)
+    train, train_y = _check(run.trained, windows, train_x, train_y, "training")
+    val, val_y = _check(run.trained, windows, val_x, val_y, "validation")
+    if state is not None:
+        run.go_on(state)
+        if on_epoch is not None:
+            for record in run.history:
+                on_epoch(record)
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        while not run.ended:
+            started = time.perf_counter()
+            epoch = len(run.history) + 1
+            rng = np.random.default_rng([seed, epoch])
+            order = rng.permutation(len(train))
+            seen = train
+            if training.mirror:
+                seen = train.mirrored(rng.integers(0, 4, len(train), np.uint8))
+            loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
+            val_counts = Engine(run.trained, windows.cells).counts(val)
+            record = _record(epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain)
+            run.keep(record)
+            run.seconds.append(time.perf_counter() - started)
+            if on_epoch is not None:
+                on_epoch(record)
+            if on_state is not None:
+                on_state(run.state())
+    return Fitted(
+        state_dict=run.kept,
+        network=network,
+        windows=windows,
+        training=training,
+        seed=seed,
+        history=tuple(run.history),
+        chosen_epoch=run.best,
+        warnings=_warnings(run.history[run.best - 1]),
+        epoch_seconds=tuple(run.seconds),
+    )
+
+
+def restore(fitted: Fitted) -> nn.Sequential:
+    """The trained network as Sinabs modules."""
+    net = build(fitted.network, fitted.windows, fitted.seed)
+    set_weights(net, fitted.state_dict)
+    return net
+
+
+def engine(fitted: Fitted) -> Engine:
+    """What counts spikes of the trained network fast."""
+    return Engine(restore(fitted), fitted.windows.cells)
+
+
+def predict_counts(fitted: Fitted, x: Samples) -> npt.NDArray[np.int64]:
+    """Output spikes int64 (n, 3) of samples (n, steps, channels, cells, cells).
+
+    Raises:
+        ValueError: samples of another shape.
+    """
+    return engine(fitted).counts(x)
+
+
+def limit_threads(count: int) -> None:
+    """Compute in `count` threads of this process from now on; results do not depend on it."""
+    torch.set_num_threads(count)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What a few samples contribute to a step."""
+
+    loss: float
+    counts: metrics.IntArray
+    rates: dict[str, float]
+    gradients: tuple[torch.Tensor, ...]
+
+
+class _Run:
+    """A training between two epochs."""
+
+    def __init__(self, network: Network, windows: Windows, training: Training, seed: int) -> None:
+        self.training = training
+        self.fine = build(network, windows, seed)
+        self.trained = build(network, windows, seed)
+        """Has the fine weights at their points of the grid, between epochs."""
+        self.parameters = parameters(self.fine)
+        self.optimizer = torch.optim.Adam(
+            self.parameters.values(), training.learning_rate, fused=True
+        )
+        self.trainer = Trainer(self.trained, windows.cells)
+        self.history: list[EpochRecord] = []
+        self.seconds: list[float] = []
+        self.best = 0
+        self.to_grid()
+        self.settle()
+        self.kept = weights(self.trained)
+
+    def to_grid(self) -> None:
+        """Let the spikes be those of the fine weights as they are now."""
+        self.trainer.take(on_grid(matrices(self.fine)))
+
+    def settle(self) -> None:
+        """Let `trained` have the weights that the spikes are of."""
+        set_weights(self.trained, by_parameter(on_grid(matrices(self.fine))))
+
+    @property
+    def ended(self) -> bool:
+        """Whether all epochs were run, or none of late was better."""
+        done = len(self.history)
+        return done >= self.training.epochs or (
+            self.best > 0 and done - self.best >= self.training.patience
+        )
+
+    def one_epoch(
+        self, x: SparseWindows, y: metrics.IntArray, order: metrics.IntArray, pool: Executor
+    ) -> tuple[float, metrics.IntArray, dict[str, float]]:
+        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates.
+
+        Parts of a batch are computed in any order and added up in theirs: the sum has the same
+        bits on any number of threads.
+        """
+        batch = self.training.batch
+        steps = math.ceil(len(x) / batch)
+
+        def compute(rows: metrics.IntArray) -> _Part:
+            job = Job(self.trainer, x, rows, y[rows], self.training.gain)
+            loss = WindowLoss.apply(job, *self.trainer.leaves)  # type: ignore[no-untyped-call]
+            grads = torch.autograd.grad(loss, self.trainer.leaves)
+            return _Part(loss.item(), job.counts, job.rates(), grads)
+
+        loss = 0.0
+        counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
+        fired = dict.fromkeys(SPIKING, 0.0)
+        for start in range(0, len(x), batch):
+            chosen = order[start : start + batch]
+            rows = [chosen[k : k + MICRO_BATCH] for k in range(0, len(chosen), MICRO_BATCH)]
+            parts = list(pool.map(compute, rows))
+            for row, part in zip(rows, parts, strict=True):
+                loss += part.loss
+                counts[row] = part.counts
+                for name, rate in part.rates.items():
+                    fired[name] += rate * len(row)
+            sums = [
+                torch.stack(each).sum(dim=0).numpy()
+                for each in zip(*(part.gradients for part in parts), strict=True)
+            ]
+            total = self.trainer.layout.unpack(sums)
+            for name, gradient in by_parameter(total).items():
+                self.parameters[name].grad = gradient / len(chosen)
+            for group in self.optimizer.param_groups:
+                group["lr"] = learning_rate(self.training, len(self.history), start // batch, steps)
+            self.optimizer.step()
+            self.to_grid()
+        self.settle()
+        return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
+
+    def keep(self, record: EpochRecord) -> None:
+        """An epoch is over; its weights are kept if it is the best yet."""
+        self.history.append(record)
+        if self.best == 0 or record.merit > self.history[self.best - 1].merit:
+            self.best, self.kept = record.epoch, weights(self.trained)
+
+    def state(self) -> bytes:
+        """Everything that the epochs to come depend on."""
+        buffer = io.BytesIO()
+        content = {
+            "fine": weights(self.fine),
+            "optimizer": self.optimizer.state_dict(),
+            "kept": self.kept,
+            "best": self.best,
+            "history": [asdict(record) for record in self.history],
+            "seconds": self.seconds,
+        }
+        torch.save(content, buffer)
+        return buffer.getvalue()
+
+    def go_on(self, state: bytes) -> None:
+        """Take up what `state` gave.
+
+        Raises:
+            ValueError: it is damaged, or of another network.
+        """
+        try:
+            content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
+            set_weights(self.fine, content["fine"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.kept, self.best = content["kept"], content["best"]
+            self.history = [EpochRecord(**record) for record in content["history"]]
+            self.seconds = content["seconds"]
+        except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise ValueError(f"not a state of this training: {error}") from error
+        self.to_grid()
+        self.settle()
+
+
+def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
+    """Of a step in the epoch after `done` epochs.
+
+    Constant, or falling from the full rate to nothing along half a cosine over all epochs
+    (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a line.
+
+    Args:
+        step, steps: done in this epoch, and all of an epoch.
+    """
+    rising = training.warm_up * training.epochs * steps
+    rate = training.learning_rate * min(1.0, (done * steps + step + 1) / max(rising, 1.0))
+    if training.schedule == "constant":
+        return rate
+    return rate * 0.5 * (1.0 + math.cos(math.pi * done / training.epochs))
+
+
+def _record(
+    epoch: int,
+    loss: float,
+    train_counts: metrics.IntArray,
+    train_y: metrics.IntArray,
+    val_counts: metrics.IntArray,
+    val_y: metrics.IntArray,
+    rates: dict[str, float],
+    gain: float,
+) -> EpochRecord:
+    val = metrics.accuracy(val_counts, val_y)
+    train = metrics.accuracy(train_counts, train_y)
+    log_p = log_softmax(gain * val_counts, axis=1)
+    return EpochRecord(
+        epoch=epoch,
+        loss=loss,
+        train_argmax=train.argmax or 0.0,
+        val_loss=-float(log_p[np.arange(len(val_y)), val_y].mean()),
+        val_argmax=val.argmax or 0.0,
+        val_strict=val.strict or 0.0,
+        val_margin=val.margin or 0.0,
+        rates=rates,
+    )
+
+
+def _warnings(record: EpochRecord) -> tuple[str, ...]:
+    """Layers that are silent or saturated, by name."""
+    found = []
+    for name, rate in record.rates.items():
+        if rate <= SILENT_RATE:
+            found.append(f"layer {name} is silent: {rate:.2g} spikes per neuron and step")
+        elif rate >= SATURATED_RATE:
+            found.append(f"layer {name} is saturated: {rate:.2g} spikes per neuron and step")
+    return tuple(found)
+
+
+def _check(
+    net: nn.Sequential, windows: Windows, x: Samples, y: metrics.Labels, what: str
+) -> tuple[SparseWindows, metrics.IntArray]:
+    y = metrics.check_labels(y)
+    if not len(y) or len(x) != len(y):
+        raise ValueError(f"{len(x)} {what} samples and {len(y)} labels; expected as many, not none")
+    try:
+        return Engine(net, windows.cells).sparse(x), y
+    except ValueError as error:
+        raise ValueError(f"{what} {error}") from error

@@ -1,0 +1,1 @@
+"""Figures and pages: arrays and tables in, SVG and HTML text out."""

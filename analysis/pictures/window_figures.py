@@ -1,0 +1,71 @@
+"""Figures of the test windows: what a lead means, and where in a phase the network is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from analysis.nets.metrics import CLASSES
+from analysis.pictures.figure_style import BLUE, GREY, STYLE, svg_text
+from analysis.pictures.figures import CLASS_COLOURS, CLASS_WORDS
+
+
+def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
+    """Share right by lead with its interval, and how many windows there are of each.
+
+    Args:
+        rows: from `analysis.nets.reliability.by_lead`.
+    """
+    with plt.rc_context(STYLE):
+        figure, (top, low) = plt.subplots(
+            2, 1, figsize=(6.2, 3.8), sharex=True, height_ratios=(2.2, 1)
+        )
+        leads = [row["lead"] for row in rows]
+        shares = np.array([row["share"] for row in rows])
+        off = np.array([[row["share"] - row["low"], row["high"] - row["share"]] for row in rows])
+        top.errorbar(
+            leads,
+            100 * shares,
+            yerr=100 * off.T.clip(0),
+            fmt="o",
+            color=BLUE,
+            ms=4,
+            lw=1,
+            capsize=2,
+        )
+        top.set_ylabel("windows called\nrightly (%)")
+        top.set_ylim(-3, 103)
+        low.bar(leads, [row["n"] for row in rows], color=GREY, width=0.7)
+        low.set_ylabel("windows")
+        low.set_xlabel("lead of the winner over the next class (spikes)")
+        low.set_xticks(
+            leads, [f"≥ {row['lead']}" if row["or_more"] else row["lead"] for row in rows]
+        )
+        return svg_text(figure, simulated)
+
+
+def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simulated: bool) -> str:
+    """Recall of each class over its phase, a panel a class.
+
+    Args:
+        tenths: from `analysis.nets.window_groups.by_tenth`.
+    """
+    with plt.rc_context(STYLE):
+        figure, grid = plt.subplots(1, len(tenths), figsize=(6.4, 2.4), sharey=True)
+        for axes, name, word, colour in zip(grid, CLASSES, CLASS_WORDS, CLASS_COLOURS, strict=True):
+            for row in tenths[name]:
+                if row["share"] is None:
+                    continue
+                middle = 10 * row["tenth"] - 5
+                axes.plot(middle, 100 * row["share"], "o", ms=4, color=colour)
+                if row["low"] is not None:
+                    axes.plot([middle] * 2, [100 * row["low"], 100 * row["high"]], color=colour)
+            axes.set_title(word)
+            axes.set_xlim(0, 100)
+            axes.set_ylim(-3, 103)
+            axes.set_xlabel("of the phase (%)")
+        grid[0].set_ylabel("recall (%)")
+        return svg_text(figure, simulated)

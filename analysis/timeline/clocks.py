@@ -1,0 +1,358 @@
+"""The clock map of a device, from the coded pulses it saw, or a reason why there is none.
+
+Camera, arm and sync box each stamp the same pulses with clocks that started on different days. The
+pulses are coded, so the trains fit together at one place only; `analysis.timeline.pulse_match`
+finds that place and the pairs, `analysis.timeline.clock_line` the line through them, and this file
+says whether to trust it. It must say no rather than be wrong: a regular train, which fits
+everywhere, is refused, and so is one whose residuals are not jitter (docs/decisions/0002,
+docs/clocks.md).
+
+Times stay int64; floats hold differences only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.timeline.clock_line import ClockLine, fit_line, line_within_unit
+from analysis.timeline.pulse_kernels import median
+from analysis.timeline.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
+from analysis.timeline.pulse_runs import stray_stretch
+from storage.clockmap import ClockMap
+
+Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
+Rounding = Literal["down", "up", "nearest"]
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+MIN_MATCHED = 0.7
+"""Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
+MIN_EITHER = 0.75
+"""A device loses pulses or adds some; where both trains are full of strangers the place is wrong,
+or a clock jumped by whole ticks, after which half of the pulses meet others."""
+BEND_PPM_S = 2.0
+"""By how much a clock's drift may change in a second without being taken for a jump; a crystal that
+warms up by 10 K in a minute makes 0.4."""
+
+
+class ClockRefused(ValueError):
+    """No clock map can be trusted for these pulses.
+
+    Attributes:
+        reason: which gate said no: ``too_few_pulses``, ``ambiguous`` (the train fits in more than
+            one place), ``no_match`` (it fits nowhere), ``drift`` or ``residuals``.
+    """
+
+    def __init__(self, reason: Reason, message: str) -> None:
+        super().__init__(message)
+        self.reason: Reason = reason
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """A clock map with what is known about its quality.
+
+    Attributes:
+        map: device ns to reference ns; more than one piece where the clocks bend.
+        pulses_seen: pulses on which the line stands.
+        pulses_late: pulses that found a partner but lie outside the gate; not in the line.
+        pulses_missed: reference pulses inside the device's train that found no partner.
+        pulses_spurious: device pulses without a partner (a second report of a pulse is one).
+        residual_median_ns, residual_p95_ns, residual_max_ns: absolute residuals of the pulses seen.
+        offset_ns: reference less device in the middle of the train.
+        drift_ppm: what the reference gains on the device, in the mean.
+        uncertainty_ns: the map's largest error between the first and the last pulse seen, 95 %:
+            from the residuals, what the stamps' unit hides, and what bends between knots. A delay
+            that all pulses share cannot be seen and is not in it.
+        peak_ratio: second correlation peak over the first, 0 to 1; low is unambiguous.
+        first_ns, last_ns: the first and the last pulse seen, on the device's clock: the map is
+            vouched for in between.
+        pulse_ns, residual_ns: (n,) pulses seen on the reference clock, and their residuals; not
+            compared and not in `to_json`.
+    """
+
+    map: ClockMap
+    pulses_seen: int
+    pulses_late: int
+    pulses_missed: int
+    pulses_spurious: int
+    residual_median_ns: float
+    residual_p95_ns: float
+    residual_max_ns: float
+    offset_ns: int
+    drift_ppm: float
+    uncertainty_ns: float
+    peak_ratio: float
+    first_ns: int
+    last_ns: int
+    pulse_ns: Ints = field(repr=False, compare=False)
+    residual_ns: Floats = field(repr=False, compare=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the single pulses, for a record."""
+        data = {part.name: getattr(self, part.name) for part in fields(self) if part.compare}
+        return {**data, "map": self.map.to_json()}
+
+
+def fit_clock(
+    device_ns: Ints,
+    reference_ns: Ints,
+    *,
+    jitter_ns: float = 20_000.0,
+    max_drift_ppm: float = 10_000.0,
+    resolution_ns: float = 1_000.0,
+    rounding: Rounding = "down",
+    in_order: bool = False,
+    start_marker_ns: float | None = None,
+) -> ClockFit:
+    """The map from a device's clock to the reference, from pulses that both saw.
+
+    Args:
+        device_ns: (m,) int64, the pulses on the device's clock, ns. Pulses may be missing, doubled,
+            late, spurious, out of order.
+        reference_ns: (n,) int64, the pulses on the reference clock, ns; may have gaps too.
+        jitter_ns: the scatter (1 sigma) to be expected of the device's stamps. Residuals whose
+            95th percentile exceeds three times this are refused.
+        max_drift_ppm: clocks that differ by more are refused.
+        resolution_ns: the unit to which the device cuts its stamps.
+        rounding: which way it cuts them: an input that is looked at now and then stamps ``up``. The
+            map takes the middle of what a stamp may mean.
+        in_order: the stamps stand in the order in which the pulses came, so that a clock that
+            jumps back is seen to do so. It must be known: once they are sorted, such a train looks
+            like one that began earlier than the reference and ended earlier.
+        start_marker_ns: the train is regular, and begins with a pulse and this much silence, ns;
+            without it a regular train is refused.
+
+    Raises:
+        ClockRefused: with its `reason`.
+        TypeError: the times are not integers.
+        ValueError: the times are not 1-D, or a limit is not positive.
+    """
+    if not (jitter_ns > 0 and resolution_ns >= 0 and 0 < max_drift_ppm <= 50_000):
+        raise ValueError(
+            f"jitter_ns = {jitter_ns} and resolution_ns = {resolution_ns} must be positive, "
+            f"max_drift_ppm = {max_drift_ppm} in (0, 50000]"
+        )
+    device, reference = _train(device_ns, "device"), _train(reference_ns, "reference")
+    if in_order:
+        for name, times in (("device", device_ns), ("reference", reference_ns)):
+            back_ns = -int(np.diff(np.asarray(times)).min(initial=0))
+            if back_ns > jitter_ns:
+                raise ClockRefused("residuals", f"the {name} clock jumps back by {back_ns / 1e9} s")
+    # differences to a pulse of each train; float64 holds them exactly up to 104 days
+    device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
+    shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
+    x, y = _differences(device, device_0) + shift, _differences(reference, reference_0)
+    try:
+        tick = tick_of(reference)
+        if jitter_ns > tick / 4:
+            raise ValueError(
+                f"jitter_ns = {jitter_ns}: pulses {tick} ns apart cannot be told apart"
+            )
+        match = match_trains(x, y, tick, 1.02 * max_drift_ppm * 1e-6, start_marker_ns)
+    except NoMatchError as error:
+        raise ClockRefused(cast("Reason", error.reason), str(error)) from None
+    _gate_share(x, y, match)
+    px, py = x[match.device], y[match.reference]
+    line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
+    # where a unit is all that the stamps show, it knows better than their scatter
+    steep = bool(np.abs(line.slopes).max() > max_drift_ppm * 1e-6)
+    unsure = line.uncertainty > resolution_ns and np.ptp(line.residuals) <= 2 * resolution_ns
+    if steep or unsure:
+        bounded = line_within_unit(px, py - px, resolution_ns, max_drift_ppm * 1e-6)
+        if bounded is not None and (steep or bounded.uncertainty < line.uncertainty):
+            line = bounded
+    _gate_line(line, jitter_ns, max_drift_ppm)
+    predicted = _extended(line, x)
+    inside = line.inside
+    i, j = match.device[inside], match.reference[inside]
+    stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
+    if stray is not None:
+        raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
+    shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
+    if max(shares) < MIN_EITHER:
+        raise ClockRefused(
+            "no_match",
+            f"only {shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses "
+            f"fit (of one of them at least {MIN_EITHER:.0%}): a clock jumped, or not these pulses",
+        )
+    return _fit(match, line, x, y, device_0, reference_0)
+
+
+def _fit(
+    match: Match, line: ClockLine, x: Floats, y: Floats, device_0: int, reference_0: int
+) -> ClockFit:
+    inside = line.inside
+    px, py = x[match.device], y[match.reference]
+    residuals = np.abs(line.residuals[inside])
+    knots = np.rint(line.knots).astype(np.int64)
+    images = knots + np.rint(np.interp(knots, line.knots, line.values)).astype(np.int64)
+    if knots.size == 2:
+        slope = float(line.slopes[0])
+        middle = int((knots[0] + knots[1]) // 2)
+        image = middle + round(float(np.interp(middle, line.knots, line.values)))
+        drift = (round(slope * 1e18),)
+        clock = ClockMap((device_0 + middle,), (reference_0 + image,), drift)
+    else:
+        clock = ClockMap.through(
+            [device_0 + int(knot) for knot in knots], [reference_0 + int(image) for image in images]
+        )
+    seen = px[inside]
+    first, last = device_0 + int(seen[0]), device_0 + int(seen[-1])
+    in_span = (y >= py.min()) & (y <= py.max())
+    middle_ns = (first + last) // 2
+    run = float(line.knots[-1] - line.knots[0])
+    return ClockFit(
+        map=clock,
+        pulses_seen=int(inside.sum()),
+        pulses_late=int(px.size - inside.sum()),
+        pulses_missed=int(in_span.sum()) - px.size,
+        pulses_spurious=x.size - px.size,
+        residual_median_ns=median(residuals),
+        residual_p95_ns=line.residual_p95,
+        residual_max_ns=float(residuals.max()),
+        offset_ns=clock.to_reference(middle_ns) - middle_ns,
+        drift_ppm=float(line.values[-1] - line.values[0]) / run * 1e6,
+        uncertainty_ns=line.uncertainty,
+        peak_ratio=match.peak_ratio,
+        first_ns=first,
+        last_ns=last,
+        pulse_ns=py[inside].astype(np.int64) + reference_0,
+        residual_ns=line.residuals[inside],
+    )
+
+
+def _train(times: Ints, name: str) -> Ints:
+    array = np.asarray(times)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"{name} pulse times must be int64 ns, not {array.dtype}")
+    if array.ndim != 1:
+        raise ValueError(f"{name} pulse times must be 1-D, not {array.shape}")
+    if array.size < MIN_PULSES:
+        raise ClockRefused(
+            "too_few_pulses", f"{array.size} {name} pulses; at least {MIN_PULSES} are needed"
+        )
+    return np.sort(array.astype(np.int64))
+
+
+def _differences(times: Ints, origin: int) -> Floats:
+    """Float differences to `origin`; a stray stamp too far away to be subtracted is left out."""
+    near = (times >= max(origin - 2**52, -(2**63))) & (times <= min(origin + 2**52, 2**63 - 1))
+    kept: Floats = (times[near] - origin).astype(np.float64)
+    return kept
+
+
+def _extended(line: ClockLine, x: Floats) -> Floats:
+    """x on the reference clock by the line, which goes on straight beyond its ends."""
+    slopes = line.slopes
+    gained = np.interp(x, line.knots, line.values)
+    gained += slopes[0] * np.minimum(x - line.knots[0], 0.0)
+    gained += slopes[-1] * np.maximum(x - line.knots[-1], 0.0)
+    result: Floats = x + gained
+    return result
+
+
+def _gate_share(x: Floats, y: Floats, match: Match) -> None:
+    """Refuse when, where the trains overlap, too few pulses of the shorter have a partner."""
+    matched = int(match.device.size)
+    if matched < MIN_PULSES:
+        raise ClockRefused(
+            "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
+        )
+    px, py = x[match.device], y[match.reference]
+    lag = median(py - px)
+    low, high = max(x[0] + lag, y[0]), min(x[-1] + lag, y[-1])
+    in_x = int(((x + lag >= low) & (x + lag <= high)).sum())
+    in_y = int(((y >= low) & (y <= high)).sum())
+    share = matched / max(1, min(in_x, in_y))
+    if share < MIN_MATCHED:
+        raise ClockRefused(
+            "no_match",
+            f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}); "
+            f"{in_x} device and {in_y} reference pulses overlap",
+        )
+
+
+def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
+    """Refuse a line that is too steep, that bends like no clock, or on which too little lies."""
+    steepest = float(line.slopes[np.abs(line.slopes).argmax()]) * 1e6
+    p95 = line.residual_p95
+    if p95 > 3 * jitter_ns or line.inside.mean() < MIN_MATCHED:
+        raise ClockRefused(
+            "residuals",
+            f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
+            f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
+        )
+    if line.sudden > 3 * jitter_ns:
+        raise ClockRefused(
+            "residuals",
+            f"the drift changes so fast that the line may be wrong by {line.sudden / 1e3:.1f} us "
+            f"there (at most {3 * jitter_ns / 1e3:.1f}): a clock jumped",
+        )
+    if abs(steepest) > max_drift_ppm:
+        raise ClockRefused(
+            "drift", f"the clocks differ by {steepest:.1f} ppm, more than {max_drift_ppm:g}"
+        )
+    if not line.straightened:
+        raise ClockRefused("residuals", "what the line leaves over is not jitter: a clock jumped")
+
+
+def fit_numbered(
+    device_ns: Ints,
+    numbers: Ints,
+    reference_ns: Ints,
+    *,
+    jitter_ns: float = 20_000.0,
+    max_drift_ppm: float = 10_000.0,
+    resolution_ns: float = 1_000.0,
+    rounding: Rounding = "down",
+    reference_resolution_ns: float = 0.0,
+) -> ClockFit:
+    """The map from a device's clock to the reference, for instants that the device counts.
+
+    A camera that runs by itself exposes at regular intervals, and the box stamps every exposure. A
+    regular train fits anywhere, so both must have seen the first and the last one: number 0 is the
+    first stamp, and the last number must be the last.
+
+    Args:
+        device_ns: (m,) int64 times on the device's clock, ns, in order.
+        numbers: (m,) int64 the device's own count of them, rising; what was lost is left out.
+        reference_ns: (n,) int64 the stamps of all of them on the reference clock, ns, in order.
+        jitter_ns, max_drift_ppm, resolution_ns, rounding: as in `fit_clock`.
+        reference_resolution_ns: the unit to which the reference's stamps are cut, downwards.
+
+    Raises:
+        ClockRefused: with its `reason`.
+    """
+    device, reference = _train(device_ns, "device"), _train(reference_ns, "reference")
+    if (np.diff(device_ns) < 0).any() or (np.diff(reference_ns) < 0).any():
+        raise ClockRefused("residuals", "a clock jumps back")
+    period = float(np.median(np.diff(reference)))
+    steps = np.rint(np.diff(reference) / period).astype(np.int64)
+    counted = np.concatenate([[0], np.cumsum(steps)])
+    # a second report of an edge
+    first = np.concatenate([[True], steps > 0])
+    counted, reference = counted[first], reference[first]
+    if int(counted[-1]) != int(numbers[-1]):
+        raise ClockRefused(
+            "ambiguous",
+            f"the device counts {int(numbers[-1]) + 1} exposures and the box stamped "
+            f"{int(counted[-1]) + 1}: nobody knows which one is missing",
+        )
+    _, i, j = np.intersect1d(numbers, counted, return_indices=True)
+    device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
+    shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
+    x = _differences(device, device_0) + shift
+    y = _differences(reference, reference_0) + 0.5 * reference_resolution_ns
+    if x.size != device.size or y.size != reference.size:
+        raise ClockRefused("residuals", "stamps of another age among the exposures")
+    match = Match(i.astype(np.int64), j.astype(np.int64), 0.0)
+    px, py = x[match.device], y[match.reference]
+    unit = max(resolution_ns, reference_resolution_ns)
+    line = fit_line(px, py - px, unit, BEND_PPM_S * 1e-15)
+    _gate_line(line, jitter_ns, max_drift_ppm)
+    return _fit(match, line, x, y, device_0, reference_0)

@@ -1,0 +1,1 @@
+"""Teaching and calibrating a rig: what is measured is asked for, checked, and written down."""

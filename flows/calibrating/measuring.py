@@ -1,0 +1,210 @@
+"""One measurement of one rig: say what will move, ask, measure, write, and say what was found."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from flows.running import console, stopping
+from protocols.errors import InputError
+from protocols.program import Position
+from rigs import build
+from rigs.capabilities import RigError
+from rigs.plate_frame import PlateFrame
+from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
+from rigs.rig_edit import writable_target, write_entries
+from rigs.rig_file import RigFile, load_rig_file
+from rigs.rig_inheritance import rig_path
+from rigs.rig_lock import held
+from rigs.teaching import APPROACH_MM_S
+
+WAY = (
+    f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "
+    f"{APPROACH_MM_S:g} mm/s, and then as listed"
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was measured: keys of the rig file to set and to remove, and figures for people."""
+
+    changes: dict[str, Any]
+    figures: dict[str, Any]
+    remove: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Planned:
+    """One motion that a command will make: plate coordinates of the rig's present plane."""
+
+    what: str
+    x_mm: float
+    y_mm: float
+    from_mm: float
+    to_mm: float
+    speed_mm_s: float
+
+
+@dataclass
+class Bench:
+    """The rig at hand.
+
+    Attributes:
+        today: the day that entries get.
+    """
+
+    file: RigFile
+    rig: Rig
+    today: date = field(default_factory=date.today)
+
+    @property
+    def simulated(self) -> str:
+        """``simulated `` before a number of a simulated rig."""
+        return "simulated " if self.file.simulated else ""
+
+
+def mm(value: float) -> str:
+    """A length as a rig file has it."""
+    return f"{value:.4f} mm"
+
+
+def px(value: float) -> str:
+    """A length in a picture as a rig file has it."""
+    return f"{value:.3f} px"
+
+
+class Measurement:
+    """One calibration of one rig file, from the question to the written entry.
+
+    Raises:
+        InputError: the rig file cannot be read, or not be written to.
+    """
+
+    def __init__(self, rig: Path, out: Path | None, what: str, as_json: bool) -> None:
+        self.path, self.what, self.as_json = rig_path(rig), what, as_json
+        self.file, self.text = load_rig_file(rig)
+        self._target: Callable[[], Path] = lambda: writable_target(self.path, out)
+
+    def run(
+        self,
+        moves: Sequence[Planned],
+        yes: bool,
+        dry_run: bool,
+        measure: Callable[[Bench], Finding],
+        who: str = "",
+        *,
+        with_arm: bool = True,
+    ) -> None:
+        """Say what will move, ask, measure, write, and say what was found."""
+        if dry_run:
+            self._dry(moves, who)
+            return
+        target = self._target()
+        self._say(moves, who)
+        if moves and not yes:
+            _confirm()
+        today = date.today()
+        with held(self.file):
+            rig = build.build_rig(self.file)
+            rig.should_stop = stopping.requested
+            try:
+                if with_arm:
+                    rig.connect()
+                finding = measure(Bench(self.file, rig, today))
+            except StopRequested:
+                console.say("stopped: the arm stands still, nothing was written")
+                raise KeyboardInterrupt from None
+            finally:
+                with suppress(RigError):  # it would hide what went wrong before
+                    rig.close()
+        written = write_entries(
+            self.path, target, finding.changes, today=today, remove=finding.remove,
+            expected=self.text,
+        )  # fmt: skip
+        self._show(finding, written.path, written.kept)
+
+    def _rows(self, moves: Sequence[Planned]) -> list[dict[str, Any]]:
+        plane = self.file.calibration.contact_plane
+        frame = PlateFrame.taught((plane.centre, plane.right, plane.above))
+        if self.what == "crop":
+            frame = frame.with_zero(self.file.calibration.zero_mm)
+        rows = []
+        for move in moves:
+            base = frame.pose(Position(move.x_mm, move.y_mm, move.to_mm)).xyz_mm
+            rows.append({**vars(move), "base_mm": [round(v, 3) for v in base]})
+        return rows
+
+    def _say(self, moves: Sequence[Planned], who: str) -> None:
+        simulated = " (simulated)" if self.file.simulated else ""
+        console.say(f"{self.what} of rig {self.file.name}{simulated}: {who or WAY}")
+        for row in self._rows(moves):
+            console.say(
+                f"  {row['what']}: at ({row['x_mm']:.1f}, {row['y_mm']:.1f}) mm of the plate, "
+                f"depth {row['from_mm']:+.2f} to at most {row['to_mm']:+.2f} mm at "
+                f"{row['speed_mm_s']:g} mm/s; the deepest point is {row['base_mm']} mm in the "
+                "arm's base frame"
+            )
+
+    def _dry(self, moves: Sequence[Planned], who: str) -> None:
+        rows = self._rows(moves)
+        if self.as_json:
+            console.print_json(
+                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
+                 "dry_run": True, "how": who or WAY, "moves": rows}
+            )  # fmt: skip
+            return
+        columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
+                   "deepest in base, mm"]  # fmt: skip
+        table = [[*list(row.values())[:-1], _shown(row["base_mm"])] for row in rows]
+        title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
+        console.print_table(title, columns, table)
+        console.say(who or WAY)
+
+    def _show(self, finding: Finding, path: Path, kept: Path | None) -> None:
+        removed = [key for key in finding.remove if self._had(key)]
+        if self.as_json:
+            console.print_json(
+                {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
+                 **finding.figures, "written": str(path), "kept": kept and str(kept),
+                 "keys": list(finding.changes), "removed": removed}
+            )  # fmt: skip
+            return
+        simulated = " (simulated)" if self.file.simulated else ""
+        shown = {name: _shown(value) for name, value in finding.figures.items()}
+        console.print_pairs(f"{self.what} of rig {self.file.name}{simulated}", shown)
+        console.say(f"written to {path}: {', '.join(finding.changes)}")
+        for key in removed:
+            console.say(f"removed {key}: it belonged to what was there before")
+        if kept is not None:
+            console.say(f"the old file is {kept}")
+
+    def _had(self, key: str) -> bool:
+        return getattr(self.file.calibration, key.rpartition(".")[2], None) is not None
+
+
+def _confirm() -> None:
+    if not sys.stdin.isatty():
+        raise InputError("--yes", "", None, "is needed where there is no terminal to ask on")
+    typer.confirm("Is the way free, and a hand at the stop button? Move the arm?", abort=True,
+                  err=True)  # fmt: skip
+
+
+def _shown(value: object) -> object:
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    if isinstance(value, dict):
+        return "; ".join(f"{key} {_shown(item)}" for key, item in value.items())
+    return _text(value) if isinstance(value, float) else value
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) and abs(value) < 100 else (
+        f"{value:.2f}" if isinstance(value, float) else str(value)
+    )  # fmt: skip

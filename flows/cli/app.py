@@ -1,0 +1,169 @@
+"""The command line. Heavy libraries load inside the commands that use them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.calibrate import calibrate_app, teach_app
+from flows.cli.chain import register as register_chain
+from flows.cli.common import (
+    EnableOption,
+    JsonOption,
+    ProtocolArgument,
+    RigOption,
+    StoreOption,
+    finish,
+    prepare_store,
+)
+from flows.cli.control import register as register_control
+from flows.cli.detect import register as register_detect
+from flows.cli.exchange import register as register_exchange
+from flows.cli.guesses import register as register_guesses
+from flows.cli.models import register as register_models
+from flows.cli.remote import register as register_remote
+from flows.cli.review import register as register_review
+from flows.cli.rigs import rigs
+from flows.cli.schema import register as register_schema
+from flows.cli.serve import register as register_serve
+from flows.cli.steps import register as register_steps
+from flows.cli.store import register as register_store
+from flows.cli.tradeoff import register as register_tradeoff
+from flows.running import console
+
+app = typer.Typer(
+    name="sliplab",
+    help="Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.command()
+def plan(
+    protocol: ProtocolArgument,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="A rig file or name, for bytes.")
+    ] = None,
+    enable: EnableOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
+    from flows.planning import plan_view
+    from protocols.plan import load_plan
+
+    found = load_plan(protocol, enable or ())
+    needed, scene = None, None
+    if rig is not None:
+        from flows.planning.estimate import plan_bytes
+        from flows.planning.plan_scene import scene_of
+        from rigs.rig_file import check_plan, load_rig_file
+
+        rig_file, _ = load_rig_file(rig)
+        check_plan(rig_file, found, str(rig))
+        needed = round(plan_bytes(rig_file, found))
+        scene = scene_of(rig_file, found)
+    if as_json:
+        console.print_json(plan_view.as_json(found, needed, scene))
+    else:
+        plan_view.show(found, needed, scene)
+
+
+@app.command()
+def check(
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    store: StoreOption,
+    enable: EnableOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Look at everything that can be known before anything moves."""
+    from flows.planning import preflight
+
+    found = preflight.check(protocol, rig, store, tuple(enable or ()))
+    if as_json:
+        console.print_json(preflight.as_json(found))
+    else:
+        rows = [["ok" if item.passed else "FAILED", item.name, item.finding] for item in found]
+        console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
+    if not all(item.passed for item in found):
+        raise typer.Exit(console.FAILED)
+
+
+@app.command()
+def collect(
+    protocol: ProtocolArgument,
+    rig: RigOption,
+    store: StoreOption,
+    enable: EnableOption = None,
+    trials: Annotated[
+        int | None, typer.Option("--trials", min=1, help="Take so many of the missing, no more.")
+    ] = None,
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
+    ] = None,
+    operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
+    temperature: Annotated[
+        float | None, typer.Option("--temperature", help="Of the room, degrees Celsius.")
+    ] = None,
+    humidity: Annotated[
+        float | None, typer.Option("--humidity", min=0, max=100, help="Relative, percent.")
+    ] = None,
+    note: Annotated[str, typer.Option("--note", help="Anything worth keeping.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
+    from flows.planning.orders import Bench, check_disk, make_order
+    from flows.running import orchestration
+    from storage.store import Store
+
+    order = make_order(
+        protocol,
+        rig,
+        store,
+        enable=tuple(enable or ()),
+        campaign=campaign,
+        bench=Bench(operator, temperature, humidity, note),
+        most=trials,
+    )
+    for warning in order.plan.warnings():
+        console.say(f"note: {warning}")
+    check_disk([order])
+    prepare_store(store)
+    if order.wanted(Store(store).campaign(order.campaign)):
+        orchestration.begin()  # starts beside all that is imported below
+    from flows.collecting.collect import collect as run
+
+    result = run(order)
+    if not result["taken"]:
+        console.say("nothing to do: the store holds every trial that can be taken")
+    if not as_json:
+        from flows.collecting.aside_view import show_aside
+
+        show_aside(result["causes"])
+        result = {key: value for key, value in result.items() if key != "causes"}
+    finish(result, f"collected into {store}", as_json)
+    if result["missing"] > result["left_out"]:
+        raise typer.Exit(console.FAILED)
+
+
+register_steps(app)
+register_tradeoff(app)
+register_guesses(app)
+register_chain(app)
+register_store(app)
+register_remote(app)
+app.command()(rigs)
+register_control(app)
+register_serve(app)
+register_exchange(app)
+register_review(app)
+register_detect(app)
+register_models(app)
+register_schema(app)
+app.add_typer(teach_app, name="teach")
+app.add_typer(calibrate_app, name="calibrate")

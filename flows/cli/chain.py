@@ -1,0 +1,135 @@
+"""`sliplab study` and `demo`: the whole chain from a rig to the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.common import JsonOption, RigOption, prepare_store
+from flows.running import console
+
+FULL = ("kinematic", "gravity", "disturbance")
+PILOT = ("pilot", "pilot_gravity")
+EXTRA = ("disturbance=125",)
+
+
+def package_file(package: str, name: str) -> Path:
+    """A file that ships with a package."""
+    module = __import__(package)
+    return Path(module.__path__[0]) / name
+
+
+def study(
+    folder: Annotated[Path, typer.Argument(help="The study's store; made if missing.")],
+    rig: RigOption = Path("rehearsal"),
+    pilot: Annotated[bool, typer.Option("--pilot", help="The small protocols.")] = False,
+    protocol: Annotated[
+        list[Path] | None,
+        typer.Option(help="Your own protocols in place of those that ship; may be repeated."),
+    ] = None,
+    extra: Annotated[
+        bool, typer.Option(help="Also the disturbance of 125 % that the paper left out.")
+    ] = True,
+    check_labels: Annotated[
+        int,
+        typer.Option(min=0, help="Trials to take again with video, to check labels of tracks by."),
+    ] = 60,
+    status: Annotated[
+        bool, typer.Option("--status", help="Only say how far it is, from any terminal.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole chain: collect, sync, label, train, evaluate, report. Run again, it goes on."""
+    if status:
+        _status(folder, as_json)
+        return
+    names = PILOT if pilot else FULL
+    files = protocol or [package_file("protocols", f"{name}.yaml") for name in names]
+    whole = not (pilot or protocol)
+    enable: dict[Path, tuple[str, ...]] = {files[-1]: EXTRA} if whole and extra else {}
+    _chain(folder, files, rig, as_json, enable, check_labels)
+
+
+def _status(folder: Path, as_json: bool) -> None:
+    """How far a study is."""
+    from flows.study_ledger import FILE, print_rows, read
+    from protocols.errors import InputError
+
+    rows = read(folder)
+    if not rows:
+        raise InputError("FOLDER", "", str(folder), f"must hold a study: there is no {FILE}")
+    if as_json:
+        console.print_json({"steps": [vars(row) for row in rows]})
+    else:
+        print_rows(rows)
+
+
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
+    rig: RigOption = Path("rehearsal"),
+    as_json: JsonOption = False,
+) -> None:
+    """Run the pilot study on the simulated rig and say where the report is."""
+    protocols = [package_file("protocols", f"{name}.yaml") for name in PILOT]
+    if rig == Path("rehearsal"):
+        console.say(
+            "The demo's outside camera hands over simulated tracks of the markers, no video; "
+            "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
+        )
+    _chain(folder, protocols, rig, as_json)
+
+
+def _chain(
+    folder: Path,
+    protocols: list[Path],
+    rig: Path,
+    as_json: bool,
+    enable: dict[Path, tuple[str, ...]] | None = None,
+    check: int = 0,
+) -> None:
+    """Run the whole chain and print what came out."""
+    from flows.planning.orders import check_disk, make_order
+
+    enabled = enable or {}
+    orders = [make_order(file, rig, folder, enable=enabled.get(file, ())) for file in protocols]
+    check_disk(orders)
+    prepare_store(folder)
+    from flows.reporting.report import read_summary
+    from flows.study import study as run
+    from storage.store import Store
+
+    outcome = run(orders, check)
+    summary = read_summary(Store.open(folder))
+    page = folder / "report" / "index.html"
+    if as_json:
+        console.print_json(
+            {
+                "report": str(page),
+                "collected": outcome.collected,
+                "steps": outcome.steps,
+                "took": [vars(row) for row in outcome.rows],
+                "summary": summary,
+            }
+        )
+        return
+    from flows.reporting.sections import headline
+    from flows.study_ledger import print_rows
+
+    print_rows(outcome.rows)
+    simulated = " (simulated)" if summary["simulated"] else ""
+    rows = [[item.name, item.value, item.note] for item in headline(summary)]
+    for name, value in summary["kinematic"]["baselines"].items():
+        shown = "-" if value is None else f"{100 * value:.1f} %"
+        rows.append([f"baseline: {name.replace('_', ' ')}", shown, "argmax, same windows"])
+    argmax = summary["kinematic"]["accuracy"]["argmax"]
+    rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
+    console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
+    console.results.print(f"Report{simulated}: {page.resolve()}", soft_wrap=True)
+
+
+def register(app: typer.Typer) -> None:
+    """Make them commands of `app`."""
+    for command in (study, demo):
+        app.command()(command)

@@ -1,0 +1,121 @@
+"""What the commands share: their options, and how they run a step and print what came of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.running import console
+
+ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
+StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+PlaceArgument = Annotated[
+    str, typer.Argument(help="A store's folder, or the URL of a pushed one (s3://..., file://...).")
+]
+DaskOption = Annotated[
+    str | None,
+    typer.Option("--dask", help="HOST:PORT of a Dask scheduler whose workers take the trials."),
+]
+RigOption = Annotated[
+    Path, typer.Option("--rig", help="A rig file (YAML), or the name of one that ships: mock.")
+]
+StoreOption = Annotated[Path, typer.Option("--store", help="The store's folder; made if missing.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
+]
+EnableOption = Annotated[
+    list[str] | None, typer.Option("--enable", help="Switch an optional level on: factor=level.")
+]
+CampaignOption = Annotated[
+    list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
+]
+STEPS = {
+    "sync": "flows.syncing.sync",
+    "label": "flows.labelling.label",
+    "train": "flows.learning.train",
+    "evaluate": "flows.learning.evaluate",
+    "window_baselines": "flows.learning.window_baselines",
+    "window_checks": "flows.learning.window_checks",
+    "report": "flows.reporting.report",
+}
+"""Where each step stands: the module whose function has the step's name."""
+
+
+def prepare_store(folder: Path) -> None:
+    """Make the store and point Prefect at it; everything that imports Prefect comes after."""
+    from flows.running import orchestration
+    from storage.store import Store
+
+    orchestration.prepare(Store.create(folder).folder)
+
+
+def located(place: str) -> Path:
+    """The folder of a store: itself, or the mirror of a URL, brought up to date.
+
+    Raises:
+        StoreError: there is none.
+    """
+    from storage.mirror import open_mirror
+    from storage.urls import is_url
+
+    if not is_url(place):
+        return Path(place)
+    with console.bar(f"look at {place} (trials)", 0) as bar:
+
+        def seen(name: str) -> None:
+            bar.extend(1)
+            bar.advance(1, name)
+
+        store, done = open_mirror(place, seen)
+    for problem in done.problems:
+        console.say(f"left out: {problem}")
+    console.say(f"working on {store.folder}; events and videos come when they are read")
+    return store.folder
+
+
+def step(place: str, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
+    """Run one analysis step on a store and print what it did."""
+    finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
+
+
+def run_step(
+    folder: Path, names: list[str] | None, step: str, dask: str | None = None, **options: Any
+) -> dict[str, Any]:
+    """Run one analysis step on a store.
+
+    Args:
+        dask: the scheduler whose workers take the trials.
+    """
+    from importlib import import_module
+
+    from storage.store import Store
+
+    store = Store.open(folder)
+    prepare_store(folder)
+    from flows.running.campaigns import collected
+    from flows.running.cluster import connected
+
+    campaigns = collected(store, names)
+    with connected(dask) as cluster:
+        if cluster is not None:
+            options["cluster"] = cluster
+        result: dict[str, Any] = getattr(import_module(STEPS[step]), step)(
+            store, campaigns, **options
+        )
+    if not result["done"]:
+        console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
+    return result
+
+
+def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
+    """Print what a command did, as one JSON object or for a person."""
+    if as_json:
+        console.print_json(result)
+        return
+    shown = {
+        key: ", ".join(map(str, value)) or "none" if isinstance(value, list) else value
+        for key, value in result.items()
+    }
+    console.print_pairs(title, shown)

@@ -1,0 +1,113 @@
+"""`sliplab detect`: the detector live on a rig's event stream."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.common import EnableOption, JsonOption, RigOption
+from flows.running import console
+
+
+def detect(
+    rig: RigOption,
+    model: Annotated[Path, typer.Option("--model", help="A trained network: models/seed0.pt.")],
+    protocol: Annotated[
+        Path | None, typer.Option("--protocol", help="Make a trial's motion; else only listen.")
+    ] = None,
+    trial: Annotated[
+        str | None, typer.Option("--trial", help="Its condition: depth=2.4mm,direction=0deg.")
+    ] = None,
+    enable: EnableOption = None,
+    reflex: Annotated[
+        str | None,
+        typer.Option("--reflex", help="At incipient slip: stop, or press:MM. Needs --protocol."),
+    ] = None,
+    hold: Annotated[
+        float, typer.Option("--hold", min=0, max=60, help="Stand and watch after a reflex, s.")
+    ] = 1.0,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.1, help="Listen so long; else to Ctrl-C.")
+    ] = None,
+    stride: Annotated[
+        float | None, typer.Option("--stride", help="From window to window, ms; their length.")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
+    ] = None,
+    smoothing: Annotated[
+        int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
+    ] = None,
+    poll: Annotated[
+        float, typer.Option("--poll", min=1, max=200, help="Read the streams so often, ms.")
+    ] = 5.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Decisions as JSON lines, while it runs.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
+    from flows.detecting.detect import detect as run
+    from flows.detecting.detect_order import make_detect_order
+
+    order = make_detect_order(
+        rig,
+        model,
+        protocol=protocol,
+        trial=trial,
+        enable=tuple(enable or ()),
+        reflex=reflex,
+        hold_s=hold,
+        seconds=seconds,
+        stride_ms=stride,
+        margin=margin,
+        smoothing=smoothing,
+        poll_s=poll / 1000,
+    )
+    result = run(order, out)
+    if as_json:
+        console.print_json(result)
+    else:
+        simulated = " (simulated)" if result["simulated"] else ""
+        console.print_pairs(f"detect on {result['rig']}{simulated}", _shown(result))
+    if result["interrupted"]:
+        raise typer.Exit(console.INTERRUPTED)
+
+
+def _shown(result: dict[str, Any]) -> dict[str, Any]:
+    """The summary in a few lines."""
+    latency, compute, losses = result["latency_ms"], result["compute_ms"], result["losses"]
+    clock = "virtual" if result["virtual_time"] else "real"
+    found = {
+        "windows": f"{result['windows']} ({result['quiet_windows']} without events)",
+        "states": ", ".join(f"{name} {count}" for name, count in result["states"].items()),
+        f"last event to decision, ms ({clock} time)": _spread(latency),
+        "read to decision, ms": _spread(compute),
+        "lost": f"{losses['late']} events late, {losses['gaps']} gaps",
+    }
+    for name, onset in result["onsets"].items():
+        where = "" if onset is None or not onset["phase"] else f" ({onset['phase']})"
+        found[f"first {name}"] = None if onset is None else f"{onset['trial_s']:.3f} s{where}"
+    if result["reflex"] is not None:
+        reflex = result["reflex"]
+        done = f"{reflex['kind']}: not called for"
+        if reflex["done"]:
+            done = (
+                f"{reflex['kind']} in the {reflex['phase']}, arm at rest after "
+                f"{reflex['stop_ms']:.1f} ms, depth {reflex['depth_mm']:.2f} mm"
+            )
+        found["reflex"] = done
+    return found
+
+
+def _spread(values: dict[str, Any]) -> str | None:
+    if not values["n"]:
+        return None
+    return f"median {values['median']:.2f}, 99 % {values['p99']:.2f}, most {values['max']:.2f}"
+
+
+def register(app: typer.Typer) -> None:
+    """Make it a command of `app`."""
+    app.command()(detect)

@@ -1,0 +1,108 @@
+"""`sliplab import` and `export`: trials from and to the files of others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.common import JsonOption, StoreArgument, StoreOption, finish
+from flows.running import console
+from protocols.errors import InputError
+
+TABLES = {".csv", ".parquet", ".json"}
+
+
+def import_(
+    kind_or_path: Annotated[
+        str, typer.Argument(metavar="[KIND] PATH", help="A file, or a folder of files.")
+    ],
+    path: Annotated[Path | None, typer.Argument(metavar="", show_default=False)] = None,
+    store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
+    name: Annotated[str, typer.Option("--name", help="Of the campaign that is made.")] = ...,  # type: ignore[assignment]  # as above
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="The files are of a simulation.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Take trials of other programs into a campaign of their own, what is unknown marked so.
+
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; without it, names of files tell.
+    """
+    from dataclasses import replace
+
+    from flows.collecting.stretch import owned
+    from storage.exchange.find import KINDS, kind_of, trials_in
+    from storage.exchange.take_in import take_in
+    from storage.store import Store, StoreError, safe_name
+
+    where = Path(kind_or_path) if path is None else path
+    kind = kind_of(where) if path is None else kind_or_path
+    if kind not in KINDS:
+        raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
+    try:
+        safe_name(name)
+    except StoreError as error:
+        raise InputError("--name", "", name, str(error)) from None
+    opened = Store.create(store)
+    found = trials_in(where, kind)
+    if simulated:
+        found = (replace(trial, simulated=True) for trial in found)
+    with owned(opened):
+        result = take_in(opened, name, found, where, kind, lambda trial: console.say(trial))
+    finish(result, f"imported into {store}", as_json)
+
+
+def export(
+    store: StoreArgument,
+    what: Annotated[str, typer.Argument(help="A campaign, or a trial of one.")],
+    output: Annotated[
+        Path, typer.Option("--output", help="A folder; with --labels a .csv, .parquet or .json.")
+    ],
+    form: Annotated[str, typer.Option("--format", help="aedat4 or dsec.")] = "aedat4",
+    labels: Annotated[bool, typer.Option("--labels", help="The labels as a table.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write trials as files that other programs read, or their labels as a table."""
+    from storage.exchange.hand_out import SUFFIXES, hand_out
+    from storage.exchange.tables import label_table, write_table
+    from storage.store import Store
+
+    opened = Store.open(store)
+    campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
+    if what in campaigns:
+        campaign, names = campaigns[what], sorted(campaigns[what].committed())
+    else:
+        holders = [item for item in campaigns.values() if what in item.committed()]
+        if len(holders) != 1:
+            raise InputError(
+                store, "", what,
+                "is in several campaigns; export one of them" if holders
+                else f"is no campaign and no committed trial; campaigns: {', '.join(campaigns)}",
+            )  # fmt: skip
+        campaign, names = holders[0], [what]
+    if labels:
+        table = label_table(opened, campaign.name, names)
+        write_table(table, output)
+        finish({"labels": len(table), "output": str(output)}, f"labels of {what}", as_json)
+        return
+    if form not in SUFFIXES:
+        raise InputError("--format", "", form, f"must be one of {', '.join(SUFFIXES)}")
+    with console.bar("export (trials)", len(names)) as bar:
+        result = hand_out(
+            [campaign.recording(name) for name in names],
+            output,
+            form,
+            campaign.name,
+            lambda trial: bar.advance(1, trial),
+        )
+    if not as_json:
+        result = {key: value for key, value in result.items() if key != "files"}
+    finish(result, f"exported to {output}", as_json)
+
+
+def register(app: typer.Typer) -> None:
+    """Make them commands of `app`."""
+    app.command("import")(import_)
+    app.command()(export)

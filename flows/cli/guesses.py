@@ -1,0 +1,58 @@
+"""`sliplab guesses`: what a study's figures owe to the guessed numbers of its simulated scene."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from flows.running import console
+
+
+def guesses(
+    folder: StoreArgument,
+    guess: Annotated[
+        list[str] | None,
+        typer.Option("--guess", help="Only this number of the scene; may be given again."),
+    ] = None,
+    trials: Annotated[
+        int, typer.Option("--trials", min=2, help="Test trials of each campaign.")
+    ] = 20,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Take some test trials again with each guess 20 % down and up, and judge them anew."""
+    from storage.store import Store
+
+    store = Store.open(folder)
+    prepare_store(folder)
+    from flows.running.campaigns import collected
+    from flows.searching.guess_changes import FIGURES, UNITS
+    from flows.searching.guesses import GUESSES, measure_guesses
+
+    result = measure_guesses(store, collected(store, campaign), tuple(guess or GUESSES), trials)
+    if as_json:
+        console.print_json(result)
+        return
+    columns = [f"{FIGURES[name]} ({UNITS[name]})" for name in FIGURES]
+    rows = []
+    for name, found in result["settings"].items():
+        shown = [
+            "-"
+            if value is None
+            else f"{100 * value:.1f}"
+            if key == "strict"
+            else f"{value:.3f}"
+            if UNITS[key] == "mm"
+            else f"{value:.0f}"
+            for key, value in found.items()
+        ]
+        rows.append([name.removeprefix("scene.").removeprefix("event_camera."), *shown])
+    console.print_table("guesses, simulated", ["setting", *columns], rows)
+    console.say(f"kept in {result['file']}; the next report shows them")
+
+
+def register(app: typer.Typer) -> None:
+    """Make it a command of `app`."""
+    app.command()(guesses)

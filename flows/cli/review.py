@@ -1,0 +1,80 @@
+"""`sliplab review` and `sliplab view`: labels gone through by a person, a trial looked at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flows.cli.common import CampaignOption, JsonOption, StoreArgument
+from flows.running import console
+from protocols.errors import InputError
+
+if TYPE_CHECKING:
+    from flows.reviewing.review_list import TrialList
+
+
+def review(
+    store: StoreArgument,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Of the page; a free one by default.")
+    ] = 0,
+    campaign: CampaignOption = None,
+    who: Annotated[
+        str, typer.Option("--who", help="Who reviews; the user's name by default.")
+    ] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Go through the labels in a browser on this computer; Ctrl-C ends it.
+
+    Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
+    """
+    from flows.reviewing.review_server import serve
+    from storage.store import Store
+
+    def ready(address: str, trials: TrialList) -> None:
+        waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
+        if as_json:
+            told = {"url": address, "trials": len(trials.rows), "to_decide": waiting}
+            console.print_json(told)
+        else:
+            console.say(f"{len(trials.rows)} trials, {waiting} to decide. Ctrl-C ends the page:")
+            console.results.print(address, soft_wrap=True)
+
+    serve(Store.open(store), campaign or (), port, who, ready)
+
+
+def view(
+    store: StoreArgument,
+    trial: Annotated[str, typer.Argument(help="A trial's id, as in `sliplab trials`.")],
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write an .rrd file instead of opening it.")
+    ] = None,
+    campaign: Annotated[
+        str | None, typer.Option("--campaign", help="Whose trial, where several have it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
+    from flows.reviewing import view as looking
+    from storage.store import Store
+
+    subject = looking.find(Store.open(store), trial, campaign)
+    if save is None:
+        looking.show(subject)
+        return
+    if save.suffix != ".rrd" or not save.parent.is_dir():
+        raise InputError("--save", "", str(save), "must end in .rrd and stand in a folder")
+    counts = looking.save(subject, save)
+    if as_json:
+        console.print_json({"file": str(save), "trial": trial, **counts})
+    else:
+        told = {**counts, "bytes": console.size(counts["bytes"])}
+        console.print_pairs(f"{save} (open it with `rerun {save}`)", told)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    for command in (review, view):
+        app.command()(command)

@@ -1,0 +1,92 @@
+"""Collection: takes the trials that the store lacks, on one rig, under one protocol.
+
+The truth about what is done is the store; Prefect sees a flow a campaign and a task a trial on a
+real rig, a task a batch on a mock rig (where a trial takes less time than a task costs).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+
+from flows.collecting.boundary import carry_out, refuse_paused
+from flows.collecting.remaining import Remaining
+from flows.collecting.session import Session
+from flows.collecting.showing import shown
+from flows.collecting.stretch import owned, refresh, stretch
+from flows.planning.orders import Order, campaign_counts, check_disk
+from flows.running import console, stopping
+from flows.running.orchestration import Parcel, run
+from flows.running.timing import timed
+from protocols import Trial
+from storage import control
+from storage.store import Store
+
+MOCK_BATCH = 25
+
+
+@task(name="trials", cache_policy=NO_CACHE, persist_result=False)
+def take_trials(session: Parcel[Session], trials: Parcel[list[Trial]]) -> int:
+    """Take some trials; returns how many."""
+    session.content.take(trials.content)
+    return len(trials.content)
+
+
+@flow(name="collect", validate_parameters=False, persist_result=False)
+def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
+    """Take the trials of an order that its store lacks."""
+    wanted = order.content
+    with (
+        shown(wanted) as page,
+        stretch(wanted) as work,
+        timed(Store(wanted.store), f"collect {wanted.campaign}"),
+    ):
+        session, trials = work.session, work.trials
+        simulated = "simulated " if wanted.rig.simulated else ""
+        page.begin(len(trials))
+        left = Remaining(wanted.plan, trials, real_time=not wanted.rig.in_virtual_time)
+        title = f"collect {wanted.campaign} ({simulated}trials)"
+        with console.bar(title, len(trials), str(left)) as bar:
+
+            def told(trial: Trial, outcome: str) -> None:
+                left.done(trial)
+                page.told(trial, outcome)
+                bar.advance(1, f"{trial.id} {outcome}", str(left))
+
+            session.on_trial, work.boundary.on_pause = told, left.pause
+            with stopping.signals():  # Prefect has handlers of its own inside a flow
+                session.rig.connect()
+                size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
+                while trials:
+                    for start in range(0, len(trials), size):
+                        take_trials(Parcel(session), Parcel(trials[start : start + size]))
+                    trials = work.boundary.more() if wanted.most is None else []
+                    bar.extend(len(trials))
+                    page.more(len(trials))
+                    left.add(trials)
+        return {
+            **campaign_counts(wanted, session.campaign),
+            "taken": session.taken,
+            "retaken": session.retaken,
+            "left_out": work.left_out,
+        }
+
+
+def collect(order: Order) -> dict[str, Any]:
+    """Run the collection; returns at once when the store lacks nothing that can be taken.
+
+    Raises:
+        CampaignStopped: the store is paused, the disk has no room for the next trial, or
+            reference trials drifted apart.
+    """
+    store = Store.create(order.store)
+    refuse_paused(store)
+    if control.open_requests(store):  # whoever asked was killed before it was done
+        with owned(store):
+            carry_out(store)
+    if order.wanted(store.campaign(order.campaign)):
+        check_disk([order])
+        return run(collect_flow, Parcel(order))
+    return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

@@ -1,0 +1,217 @@
+"""Is this trial good enough to keep? Clocks fitted, losses counted, gates applied.
+
+Runs on the sealed files of a trial that is not committed yet, so that a doubtful trial is taken
+again while the rig still stands there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from analysis.timeline.synchronise import TrialSync, streams_of, synchronise
+from protocols.conditions import Gates
+from protocols.timing import Timing
+from rigs.rig import TrialRun
+from storage.hdf5 import StreamReader
+from storage.streams import F64, I64
+from storage.writer import DATA
+
+UNVOUCHED_S = 0.3
+"""A recording may begin and end this much before and after the pulses on which a clock's fit
+stands: the code may be silent for 16 ticks."""
+BURST_US = 10_000
+"""The stretch in which `gates.event_burst` counts events."""
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Clock maps and gates of one attempt, as JSON data."""
+
+    clocks: dict[str, Any]
+    gates: dict[str, dict[str, Any]]
+    counts: dict[str, int]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every gate is passed."""
+        return all(bool(gate["passed"]) for gate in self.gates.values())
+
+    @property
+    def causes(self) -> str:
+        """The failed gates in words."""
+        failed = {name: gate for name, gate in self.gates.items() if not gate["passed"]}
+        return "; ".join(_cause(name, gate) for name, gate in failed.items())
+
+
+def _cause(name: str, gate: dict[str, Any]) -> str:
+    """Why one gate was not passed: its figure, or why there is none."""
+    value, limit = gate["value"], gate["limit"]
+    if isinstance(value, str):  # why a clock was refused
+        return f"{name}: {value}"
+    return f"{name}: cannot be told" if value < 0 else f"{name} = {value} (limit {limit})"
+
+
+def assess(
+    folder: Path,
+    run: TrialRun,
+    gates: Gates,
+    timing: Timing,
+    rate_hz: int,
+    mid_exposure_ns: int | None,
+) -> Assessment:
+    """Fit the clocks of a sealed trial and hold it against the protocol's gates.
+
+    Args:
+        timing: how the rig's devices are timed.
+        mid_exposure_ns: from a frame's trigger to its time; None without a video.
+    """
+    with StreamReader(folder / DATA) as reader:
+        streams = streams_of(reader, mid_exposure_ns)
+        event_us = reader.event_times()
+        pose_mm = reader.column("poses/xyz")
+    sync = synchronise(streams, timing, rate_hz)
+    results = _sync_gates(sync, gates, run, mid_exposure_ns is not None)
+    if mid_exposure_ns is not None:
+        lost = _frames_lost(streams.frame_number, run, rate_hz)
+        results["frames_lost"] = {
+            "value": lost,
+            "limit": gates.frames_lost,
+            "passed": lost <= gates.frames_lost,
+        }
+    gap = _event_gap(event_us, sync, run)
+    gap_limit = float(gates.event_gap)
+    results["event_gap_s"] = {"value": gap, "limit": gap_limit, "passed": 0 <= gap <= gap_limit}
+    burst = _event_burst(event_us)
+    results["event_burst"] = {
+        "value": burst,
+        "limit": gates.event_burst,
+        "passed": burst <= gates.event_burst,
+    }
+    away, away_limit = _path_deviation(streams.pose_ns, pose_mm, run), float(gates.path_deviation)
+    results["path_deviation_mm"] = {
+        "value": away,
+        "limit": away_limit,
+        "passed": 0 <= away <= away_limit,
+    }
+    return Assessment(
+        sync.to_json(),
+        results,
+        {
+            "events": len(event_us),
+            "frames": len(streams.frame_ns),
+            "poses": len(streams.pose_ns),
+            "pulses": len(streams.sync_pulses),
+        },
+    )
+
+
+def _sync_gates(
+    sync: TrialSync, gates: Gates, run: TrialRun, video: bool
+) -> dict[str, dict[str, Any]]:
+    """Every device has a clock map, good enough for its grade and for all of the recording."""
+    limits = gates.sync_uncertainty
+    results: dict[str, dict[str, Any]] = {}
+    for device in ("events", "arm", "frames")[: 3 if video else 2]:
+        name = f"sync_uncertainty_{device}_s"
+        known = sync.devices.get(device)
+        if known is None:
+            results[name] = {"value": sync.refused[device], "limit": None, "passed": False}
+            continue
+        grade = "digital input" if device == "events" else known.grade
+        # a latency is a difference: both maps count
+        both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
+        value = (known.uncertainty_ns if both is None else both) / 1e9
+        limit = limits.limit_s(grade)
+        passed = value <= limit
+        results[name] = {"value": value, "limit": limit, "grade": known.grade, "passed": passed}
+    beyond = _unvouched_s(sync, run)
+    results["sync_unvouched_s"] = {
+        "value": beyond,
+        "limit": UNVOUCHED_S,
+        "passed": 0 <= beyond <= UNVOUCHED_S,
+    }
+    return results
+
+
+def _unvouched_s(sync: TrialSync, run: TrialRun) -> float:
+    """How long, at either end, the recording goes on beyond the pulses of a clock's fit, s.
+
+    -1 where the arm's clock is not known.
+    """
+    if "arm" not in sync.devices:
+        return -1.0
+    start, end = (int(sync.devices["arm"].map.to_reference(t)) for t in run.recorded_ns)
+    beyond = 0
+    for device in sync.devices.values():
+        if device.fit is not None:
+            first = device.map.to_reference(device.fit.first_ns)
+            last = device.map.to_reference(device.fit.last_ns)
+            beyond = max(beyond, first - start, end - last)
+    return beyond / 1e9
+
+
+def _frames_lost(numbers: I64, run: TrialRun, rate_hz: int) -> int:
+    """Frames missing between the first and the last, and against the recorded time."""
+    start, end = run.recorded_ns
+    expected = int((end - start) / 1e9 * rate_hz)
+    if not len(numbers):
+        return expected
+    gaps = int(numbers[-1]) + 1 - len(numbers)
+    return max(gaps, expected - 1 - len(numbers), 0)
+
+
+def _event_gap(event_us: I64, sync: TrialSync, run: TrialRun) -> float:
+    """Longest silence of the event camera while the arm moved in contact, seconds.
+
+    -1 when it cannot be told, because a clock has no map or there are no events.
+    """
+    if "events" not in sync.devices or "arm" not in sync.devices or not len(event_us):
+        return -1.0
+    moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
+    arm, events = (sync.devices[name].map for name in ("arm", "events"))
+    start, end = (
+        int(events.to_device(int(arm.to_reference(t)))) // 1000
+        for t in (moving.start_ns, moving.end_ns)
+    )
+    inside = event_us[np.searchsorted(event_us, start) : np.searchsorted(event_us, end, "right")]
+    edges = np.concatenate([[start], inside, [end]])
+    return float(np.max(np.diff(edges))) / 1e6
+
+
+@njit(cache=True, nogil=True)
+def _event_burst(event_us):  # type: ignore[no-untyped-def]
+    """Most events in any 10 ms that begin with an event."""
+    most, end = 0, 0
+    for begin in range(len(event_us)):
+        while end < len(event_us) and event_us[end] < event_us[begin] + BURST_US:
+            end += 1
+        most = max(most, end - begin)
+    return most
+
+
+def _path_deviation(pose_ns: I64, pose_mm: F64, run: TrialRun) -> float:
+    """How far the tool was, at most, from the ways of the recorded steps, mm, to a micrometre.
+
+    Only across: along its way an arm may be early or late, as it gathers speed. -1 without poses
+    in some step, or when the arm's clock is not to be believed.
+    """
+    worst = 0.0
+    for way in run.ways:
+        if way.end_ns <= way.start_ns:
+            continue
+        inside = (pose_ns >= way.start_ns) & (pose_ns <= way.end_ns)
+        if not inside.any():
+            return -1.0
+        begin = np.asarray(way.begin_mm)
+        along = np.asarray(way.end_mm) - begin
+        from_begin = pose_mm[inside] - begin
+        length_2 = float(along @ along)
+        share = np.zeros(len(from_begin)) if length_2 == 0 else from_begin @ along / length_2
+        across: F64 = from_begin - np.clip(share, 0.0, 1.0)[:, None] * along
+        worst = max(worst, float(np.max(np.linalg.norm(across, axis=1))))
+    return round(worst, 3)

@@ -1,0 +1,214 @@
+"""What Prefect's page shows of a collection: progress, trials by outcome, a picture, the rig.
+
+A thread of its own tells the server, every few seconds at most, so that neither a batch of quick
+trials nor a slow server holds a trial up. What cannot be shown is left out: a page is a view, and
+the store has it all.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextvars
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+from uuid import UUID
+
+from flows.planning.orders import Order, campaign_counts
+from flows.running import orchestration
+from protocols import Trial
+from protocols.hashing import hash_text
+from storage.store import Store, StoreError
+from storage.streams import Json
+
+PERIOD_S = 5.0
+END_LIMIT_S = 10.0
+"""How long the end of a collection waits for its page."""
+MOST_POINTS = 300
+
+
+class Show:
+    """What a collection tells while it runs; all of it returns at once."""
+
+    def __init__(self, start: Callable[[], None] = lambda: None) -> None:
+        self._total = self._done = 0
+        self.outcomes: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._start = start
+
+    def begin(self, count: int) -> None:
+        """The rig is ours, and so many trials are to be taken."""
+        self.more(count)
+        self._start()
+
+    def more(self, count: int) -> None:
+        """So many trials are to be taken besides."""
+        with self._lock:
+            self._total += count
+
+    def told(self, trial: Trial, outcome: str) -> None:
+        """A trial is over."""
+        with self._lock:
+            self._done += 1
+            self.outcomes[outcome] += 1
+
+    @property
+    def progress(self) -> tuple[float, str]:
+        """Percent, and in words."""
+        with self._lock:
+            share = 100.0 * self._done / self._total if self._total else 0.0
+            words = ", ".join(f"{n} {what}" for what, n in sorted(self.outcomes.items()))
+            return min(share, 100.0), f"{self._done} of {self._total} trials: {words or 'none yet'}"
+
+
+@contextmanager
+def shown(order: Order) -> Iterator[Show]:
+    """Show a collection on the page of the flow run round it while the block runs."""
+    from prefect.context import FlowRunContext
+
+    context = FlowRunContext.get()
+    if context is None or context.flow_run is None:
+        yield Show()
+        return
+    page = _Page(order, context.flow_run.id)
+    try:
+        yield page.show
+    finally:
+        page.end()
+
+
+class _Page:
+    """The thread that tells the server, and what it tells."""
+
+    def __init__(self, order: Order, run: UUID) -> None:
+        self._order, self._run = order, run
+        self._over = threading.Event()
+        self._progress: Any = None
+        self._public = not orchestration.private()
+        settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
+        self._thread = threading.Thread(
+            target=settings.run, args=(self._tell,), name="page", daemon=True
+        )
+        self.show = Show(self._thread.start)
+
+    def end(self) -> None:
+        """Tell the last of it; waits for it, but not for ever."""
+        self._over.set()
+        if self._thread.is_alive():
+            self._thread.join(END_LIMIT_S)
+
+    def _tell(self) -> None:
+        from prefect.client.orchestration import get_client
+
+        with suppress(Exception), get_client(sync_client=True) as client:
+            with suppress(Exception):
+                self._rig(client, True)
+            try:
+                before = None
+                while not self._over.wait(PERIOD_S):
+                    with suppress(Exception):
+                        if (now := self.show.progress) != before:
+                            self._tell_progress(client)
+                            before = now
+                self._tell_progress(client)
+                self._tell_table(client)
+                if self._public:
+                    self._tell_picture(client)
+            finally:
+                self._rig(client, False)
+
+    def _rig(self, client: Any, busy: bool) -> None:
+        """The concurrency limit of the rig's name: a sign on its door, and not its lock."""
+        if self._public:
+            sign_rig(client, self._order.rig.name, busy)
+
+    def _tell_progress(self, client: Any) -> None:
+        from prefect.client.schemas.actions import ArtifactUpdate
+
+        percent, words = self.show.progress
+        if self._progress is None:
+            self._progress = self._make(client, "progress", percent, words).id
+        else:
+            client.update_artifact(self._progress, ArtifactUpdate(data=percent, description=words))
+
+    def _tell_table(self, client: Any) -> None:
+        import json
+
+        campaign = Store(self._order.store).campaign(self._order.campaign)
+        rows = outcome_rows(campaign_counts(self._order, campaign), self.show.outcomes)
+        self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
+
+    def _tell_picture(self, client: Any) -> None:
+        from analysis.pictures.campaign_figure import event_rates
+
+        numbers, rates = self._rates()
+        if rates:
+            svg = event_rates(numbers, rates, simulated=self._order.rig.simulated)
+            data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+            self._make(client, "image", data, self._title("events a second of each trial"))
+
+    def _rates(self) -> tuple[list[int], list[float]]:
+        """Places in the plan from 1, and events a second, of trials evenly spread over it."""
+        campaign = Store(self._order.store).campaign(self._order.campaign)
+        there = campaign.committed()
+        wanted = [(n, t) for n, t in enumerate(self._order.plan, 1) if t.id in there]
+        numbers, rates = [], []
+        for number, trial in wanted[:: -(-len(wanted) // MOST_POINTS) or 1]:
+            with suppress(StoreError):
+                record = campaign.recording(trial.id).record
+                numbers.append(number)
+                rates.append(record["counts"]["events"] / record["recorded_s"])
+        return numbers, rates
+
+    def _title(self, what: str) -> str:
+        simulated = " (simulated)" if self._order.rig.simulated else ""
+        return f"{self._order.campaign}: {what}{simulated}"
+
+    def _make(self, client: Any, kind: str, data: Any, words: str) -> Any:
+        from prefect.client.schemas.actions import ArtifactCreate
+
+        return client.create_artifact(
+            ArtifactCreate(
+                key=artifact_key(self._order.campaign, kind),
+                type=kind,
+                data=data,
+                description=words,
+                flow_run_id=self._run,
+            )
+        )
+
+
+def outcome_rows(counts: Json, here: Counter[str]) -> list[Json]:
+    """The table of trials by outcome: how many in this run, and in the whole campaign."""
+    return [
+        {"outcome": "planned", "this run": "", "campaign": counts["planned"]},
+        {"outcome": "committed", "this run": here["committed"], "campaign": counts["committed"]},
+        {"outcome": "set aside", "this run": here["set aside"] + here["skipped"],
+         "campaign": len(counts["set_aside"])},
+        {"outcome": "missing", "this run": "", "campaign": counts["missing"]},
+        {"outcome": "takes in quarantine", "this run": "", "campaign": counts["quarantined"]},
+    ]  # fmt: skip
+
+
+def artifact_key(campaign: str, kind: str) -> str:
+    """Prefect takes letters a-z, digits and dashes only; what that loses, a hash tells apart."""
+    plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in campaign.lower())
+    if plain != campaign:
+        plain += f"-{hash_text(campaign)[:6]}"
+    return f"collect-{plain}-{kind}"
+
+
+def sign_rig(client: Any, rig: str, busy: bool) -> None:
+    """Show on Prefect's page whether a rig is in use: its limit's one slot is taken, or free.
+
+    The slot is set and not acquired: a lease of a killed process would stay taken for minutes.
+    """
+    from prefect.client.schemas.actions import GlobalConcurrencyLimitUpdate
+
+    name = f"rig {rig}"
+    client.upsert_global_concurrency_limit_by_name(name, 1)
+    client.update_global_concurrency_limit(
+        name, GlobalConcurrencyLimitUpdate(active_slots=int(busy))
+    )

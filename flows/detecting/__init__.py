@@ -1,0 +1,1 @@
+"""A trained network live on a rig's event stream."""

@@ -1,0 +1,111 @@
+"""What a person sees of a running detection: a small picture that is drawn anew, or lines."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from types import TracebackType
+
+from rich.console import Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from analysis.nets.metrics import CLASSES, GROSS, INCIPIENT
+from flows.detecting.detect_sink import Timed
+from flows.running import console
+
+EVERY_NS = 150_000_000
+"""The picture is drawn no more often: drawing takes milliseconds in which nothing is decided."""
+WIDTH = 30
+LAST = 5
+_STYLES = ("green", "yellow", "red")
+
+
+class DetectView:
+    """A context manager; on anything but a terminal it prints a line at each change of state.
+
+    Args:
+        title: says "simulated" where that is so.
+    """
+
+    def __init__(self, title: str, steps: int) -> None:
+        self._title, self._steps = title, steps
+        self._rate: deque[tuple[float, int]] = deque(maxlen=34)
+        self._last: deque[str] = deque(maxlen=LAST)
+        self._state = ""
+        self._now: Timed | None = None
+        self._drawn_ns = 0
+        self._live: Live | None = None
+        if console.messages.is_terminal:
+            self._live = Live(console=console.messages, auto_refresh=False)
+
+    def __enter__(self) -> DetectView:
+        if self._live is not None:
+            self._live.start()
+        else:
+            console.say(self._title)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._draw()
+            self._live.stop()
+
+    def told(self, timed: Timed) -> None:
+        """A decision was made."""
+        made = timed.decision
+        self._now = timed
+        self._rate.append((made.end_us - made.start_us, made.events))
+        if timed.state != self._state or made.onset is not None:
+            self._state = timed.state
+            line = _line(timed)
+            self._last.append(line)
+            if self._live is None:
+                console.say(line)
+
+    def poll(self) -> None:
+        """Draw, if it is time to."""
+        if self._live is None or time.monotonic_ns() - self._drawn_ns < EVERY_NS:
+            return
+        self._draw()
+        self._drawn_ns = time.monotonic_ns()
+
+    def _draw(self) -> None:
+        assert self._live is not None
+        self._live.update(self._picture(), refresh=True)
+
+    def _picture(self) -> Group:
+        table = Table.grid(padding=(0, 1))
+        timed = self._now
+        for number, name in enumerate(CLASSES):
+            mean = 0.0 if timed is None else timed.decision.smoothed[number]
+            filled = min(WIDTH, round(WIDTH * mean / self._steps))
+            bar = Text("█" * filled + "·" * (WIDTH - filled), style=_STYLES[number])
+            table.add_row(name.replace("_", " "), bar, f"{mean:5.2f}")
+        if timed is None:
+            return Group(Text(self._title), table, Text("no window yet"))
+        span_us = sum(part[0] for part in self._rate)
+        rate = sum(part[1] for part in self._rate) / span_us * 1e6 if span_us else 0.0
+        valid = timed.decision.valid_class
+        style = {INCIPIENT: "bold yellow", GROSS: "bold red"}.get(valid, "bold green")
+        state = Text(f"{timed.state.replace('_', ' '):<10}", style=style if valid >= 0 else "dim")
+        state.append(f"  {timed.trial_s:8.2f} s  {timed.phase}  {rate:,.0f} events/s", "default")
+        return Group(Text(self._title), table, state, *(Text(line) for line in self._last))
+
+
+def _line(timed: Timed) -> str:
+    made = timed.decision
+    counts = "/".join(str(count) for count in made.counts)
+    late = "" if timed.latency_ms is None else f", {timed.latency_ms:.1f} ms after its last event"
+    onset = f"; first {made.onset}" if made.onset else ""
+    phase = f" ({timed.phase})" if timed.phase else ""
+    return (
+        f"{timed.trial_s:8.3f} s{phase} camera {made.end_us} us: "
+        f"{timed.state.replace('_', ' ')}, spikes {counts}{late}{onset}"
+    )

@@ -1,0 +1,1 @@
+"""Labels of stored trials: made, held against the truth, read with people's decisions."""

@@ -1,0 +1,120 @@
+"""How far the labels' two rules are apart, and each from the simulation's truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flows.labelling.label import STEP as LABELS
+from flows.running.campaigns import Collected
+from storage.derived import Derived
+from storage.store import Store
+
+KINDS = ("incipient", "gross")
+CHECK = "label-check"
+"""The step of `flows.labelling.label_check`, and where its own store stands."""
+_TRUTH = {
+    "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
+    "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
+}
+"""What a rule's onset is held against: the true crossing, or the true start of the slip."""
+
+
+def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Ruling labels against what is true of their rule, over every labelled simulated trial; ms."""
+    rules = {item.settings.labelling.rule for item in campaigns}
+    errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for rule, kind, label, truth in _cases(store, campaigns):
+        if label["rule"] == rule and label[f"{kind}_ns"] is not None and truth is not None:
+            errors[kind].append((label[f"{kind}_ns"] - truth) / 1e6)
+    return {"rule": "+".join(sorted(rules)), **{k: spread(v) for k, v in errors.items()}}
+
+
+def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Both rules: each less its truth, and the paper's less the change point; ms.
+
+    `paper` and `change_point` hold a spread by kind, `apart` too; `papillae` that of all papillae's
+    change points, with `coverage`, the share of 95 % intervals that hold the truth.
+    """
+    found: dict[str, dict[str, list[float]]] = {
+        name: {kind: [] for kind in KINDS} for name in ("paper", "change_point", "apart")
+    }
+    for rule, kind, label, truth in _cases(store, campaigns):
+        mine = _known(label, rule, kind)
+        if mine is not None and truth is not None:
+            found[rule][kind].append((mine - truth) / 1e6)
+        other = _known(label, "change_point", kind)
+        if rule == "paper" and mine is not None and other is not None:
+            found["apart"][kind].append((mine - other) / 1e6)
+    errors, inside = [], []
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.trials:
+            truth = recording.simulation_truth()
+            if truth is None or "slip_per_papilla_ns" not in truth:
+                continue
+            slips = labels.read(trial.id)["change_point"]
+            for at, low, high, true in zip(
+                slips["per_marker_ns"], slips["low_ns"], slips["high_ns"],
+                truth["slip_per_papilla_ns"], strict=True,
+            ):  # fmt: skip
+                if at != -1 and true is not None:
+                    errors.append((at - true) / 1e6)
+                    inside.append(low <= true <= high)
+    return {
+        **{name: {k: spread(v) for k, v in kinds.items()} for name, kinds in found.items()},
+        "papillae": {**spread(errors), "coverage": float(np.mean(inside)) if inside else None},
+    }
+
+
+def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, list[float]]]:
+    """Every trial's distance of each rule's onset from its own truth, ms, by rule and kind.
+
+    Rules of which no truth is known are left out.
+    """
+    found: dict[str, dict[str, list[float]]] = {}
+    for rule, kind, label, truth in _cases(store, campaigns):
+        mine = _known(label, rule, kind)
+        if mine is not None and truth is not None:
+            kinds = found.setdefault(rule, {name: [] for name in KINDS})
+            kinds[kind].append(abs(mine - truth) / 1e6)
+    return found
+
+
+def spread(values: list[float]) -> dict[str, Any]:
+    """Number, median, median distance and largest."""
+    there = np.asarray(values)
+    return {
+        "n": len(values),
+        "median": float(np.median(there)) if len(there) else None,
+        "median_abs": float(np.median(np.abs(there))) if len(there) else None,
+        "max_abs": float(np.max(np.abs(there))) if len(there) else None,
+    }
+
+
+def _known(label: dict[str, Any], rule: str, kind: str) -> int | None:
+    """A rule's onset, if it is not in doubt."""
+    found = label[rule]
+    at = None if found["doubts"][kind] is not None else found[f"{kind}_ns"]
+    return None if at is None else int(at)
+
+
+def _cases(store: Store, campaigns: list[Collected]) -> Any:
+    """Rule, kind, label and the time that is true of them, or None."""
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        for trial, recording in item.trials:
+            truth = recording.simulation_truth()
+            label = labels.read(trial.id)
+            centre = int(recording.record["geometry"]["centre"])
+            for rule, keys in _TRUTH.items():
+                for kind in KINDS:
+                    true = None if truth is None else truth.get(keys[kind])
+                    yield rule, kind, label, true[centre] if isinstance(true, list) else true
+
+
+def read_check(store: Store) -> dict[str, Any] | None:
+    """The figures of the last check; None where there was none."""
+    kept = Derived.of(store, CHECK)
+    return kept.read(CHECK) if kept.key(CHECK) is not None else None

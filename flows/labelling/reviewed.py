@@ -1,0 +1,111 @@
+"""Labels as the steps after labelling read them: automatic, or with people's decisions applied.
+
+A decision counts only for the very label it was made on. Where that label has changed since, the
+automatic one is used and the decision is counted as stale, so that nobody's word is put on
+something they never saw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from flows.labelling.label import STEP, label_key
+from flows.running import console
+from flows.running.campaigns import Collected
+from storage.derived import Derived, make_key
+from storage.recording import Recording
+from storage.review import Decision, last
+from storage.store import Store
+from storage.streams import Json
+
+VERSION = 1
+State = Literal["open", "accepted", "adjusted", "rejected", "stale"]
+STATES: tuple[State, ...] = ("open", "accepted", "adjusted", "rejected", "stale")
+_AFTER: dict[str, State] = {
+    "accept": "accepted", "adjust": "adjusted", "reject": "rejected", "reopen": "open"
+}  # fmt: skip
+
+
+def state_of(decision: Decision | None, key: str) -> State:
+    """What is decided about the label with this key; ``stale``: about an older one."""
+    if decision is None or decision.verdict == "reopen":
+        return "open"
+    return _AFTER[decision.verdict] if decision.label == key else "stale"
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The labels of a store.
+
+    Attributes:
+        reviewed: whether people's decisions are applied.
+    """
+
+    store: Store
+    reviewed: bool = False
+
+    def fresh(self, item: Collected, recording: Recording) -> bool:
+        """Whether a trial has its automatic label."""
+        name = recording.folder.name
+        return Derived.of(self.store, STEP, item.name).fresh(name, _automatic(item, recording))
+
+    def key(self, item: Collected, recording: Recording) -> str:
+        """The key of a trial's label: the automatic one's where no decision changes it.
+
+        Raises:
+            StoreError: its decision is damaged.
+        """
+        automatic = _automatic(item, recording)
+        decision = self._applied(item, recording)
+        if decision is None or decision.verdict == "accept":
+            return automatic
+        return make_key("reviewed", VERSION, automatic, [decision.verdict, vars(decision.new)])
+
+    def read(self, item: Collected, recording: Recording) -> Json:
+        """A trial's label; a rejected one has no onsets.
+
+        Raises:
+            FileNotFoundError: it was never labelled.
+            StoreError: its decision is damaged.
+        """
+        label = Derived.of(self.store, STEP, item.name).read(recording.folder.name)
+        decision = self._applied(item, recording)
+        if decision is None or decision.verdict == "accept":
+            return label
+        doubt = f"rejected: {decision.why}" if decision.verdict == "reject" else None
+        return {**label, **vars(decision.new), "doubts": {"incipient": doubt, "gross": doubt}}
+
+    def states(self, campaigns: list[Collected]) -> dict[State, int] | None:
+        """How many trials there are of each state; None where no decision is asked for."""
+        if not self.reviewed:
+            return None
+        found = dict.fromkeys(STATES, 0)
+        for item in campaigns:
+            for _, recording in item.trials:
+                decision = last(self.store, item.name, recording.folder.name)
+                found[state_of(decision, _automatic(item, recording))] += 1
+        return found
+
+    def told(self, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
+        """The same as a part of a step's result; decisions that are not applied are said."""
+        states = self.states(campaigns)
+        if states is None:
+            return {}
+        if states["stale"]:
+            console.say(
+                f"warning: decisions on {states['stale']} trials were made on labels that have "
+                f"changed since and are not applied; see `sliplab review {self.store.folder}`"
+            )
+        return {"reviewed": states}
+
+    def _applied(self, item: Collected, recording: Recording) -> Decision | None:
+        if not self.reviewed:
+            return None
+        decision = last(self.store, item.name, recording.folder.name)
+        state = state_of(decision, _automatic(item, recording))
+        return None if state in {"open", "stale"} else decision
+
+
+def _automatic(item: Collected, recording: Recording) -> str:
+    return label_key(recording, item.settings.labelling)

@@ -1,0 +1,188 @@
+"""Which trials detectors learn from, are set by and are judged on, found before any is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from analysis.detect.detector_comparison import Parts, compare
+from analysis.detect.detectors import Heard, Labelled
+from analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
+from flows.labelling.reviewed import Labels
+from flows.learning.detector_trials import Wanted, heard, want
+from flows.running.campaigns import Collected, training_campaigns
+from protocols.settings import AnalysisSettings, Detection
+from storage.recording import Recording
+from storage.store import Store, StoreError
+
+
+@dataclass(frozen=True)
+class Known:
+    """A trial with both onsets, and the windows of it that are wanted."""
+
+    wanted: Wanted
+    label: str
+    incipient_ns: int
+    gross_ns: int
+
+
+@dataclass(frozen=True)
+class DetectorWork:
+    """Everything that detectors need besides what is scored anyway.
+
+    Attributes:
+        scored: windows of scored trials whose stride is not a window's length.
+        choosing: by campaign, the trials that choose its smoothing and margin; empty where the
+            protocol says them.
+        compared: ``train``, ``validation`` and ``test`` trials of the comparison; None without.
+        carried: the same with states carried; None without.
+    """
+
+    scored: list[Wanted]
+    choosing: dict[str, list[Known]]
+    compared: dict[str, list[Known]] | None
+    carried: dict[str, list[Known]] | None
+
+    @property
+    def wanted(self) -> list[Wanted]:
+        """Windows of all of them, each once."""
+        known = [
+            *self.choosing.values(),
+            *(self.compared or {}).values(),
+            *(self.carried or {}).values(),
+        ]
+        every = [*self.scored, *(trial.wanted for trials in known for trial in trials)]
+        unique = {(item.campaign, item.recording.folder.name, item.step): item for item in every}
+        return list(unique.values())
+
+    @property
+    def inputs(self) -> list[Any]:
+        """What results depend on here, for a key."""
+
+        def keys(trials: list[Known]) -> list[list[str]]:
+            return [[trial.wanted.key, trial.label] for trial in trials]
+
+        return [
+            [item.key for item in self.scored],
+            {name: keys(trials) for name, trials in self.choosing.items()},
+            *(
+                None if parts is None else {name: keys(trials) for name, trials in parts.items()}
+                for parts in (self.compared, self.carried)
+            ),
+        ]
+
+    def choices(self, store: Store, detection: dict[str, Detection]) -> dict[str, Choice | None]:
+        """Smoothing and margin by campaign; None where the protocol says them."""
+        found: dict[str, Choice | None] = {}
+        for name, settings in detection.items():
+            trials = self.choosing[name]
+            if not trials:
+                found[name] = None
+                continue
+            counted = [_counted(store, trial) for trial in trials]
+            found[name] = choose_smoothing(counted, settings, settings.choose)
+        return found
+
+    def compare(
+        self, store: Store, settings: AnalysisSettings, detection: Detection
+    ) -> dict[str, Any] | None:
+        """The comparison as `analysis.detect.detector_comparison` gives it; None without one.
+
+        Args:
+            settings: windows and strides; detection: what the paper's rule is set to.
+        """
+        fine = settings.fine_stride_ms
+        parts = _parts(store, self.compared)
+        if parts is None or fine is None:
+            return None
+        found = compare(parts, settings.windows, detection, fine)
+        carried = _parts(store, self.carried)
+        if found is None or carried is None:
+            return found
+        beside = compare(carried, settings.windows, detection, fine) or {"detectors": []}
+        return {**found, "carried": beside["detectors"]}
+
+
+def detector_work(
+    labels: Labels, campaigns: list[Collected], detection: dict[str, Detection], model_key: str
+) -> DetectorWork:
+    """Find it.
+
+    Raises:
+        StoreError: smoothing and margin are to be chosen, and there is no trial to choose by.
+    """
+    used = training_campaigns(campaigns)
+    settings = used[0].settings
+    length = settings.windows.length_ms
+
+    def hear(name: str, recording: Recording, stride_ms: int, carried: bool = False) -> Wanted:
+        return want(name, recording, model_key, settings.windows, stride_ms, carried)
+
+    def known(
+        split: str, stride_ms: int, most: int | None = None, carried: bool = False
+    ) -> list[Known]:
+        found: list[Known] = []
+        for item in used:
+            for _, recording in item.of_split(split):
+                label = labels.read(item, recording)
+                if label["incipient_ns"] is None or label["gross_ns"] is None:
+                    continue
+                if most is not None and len(found) >= most:
+                    return found
+                found.append(
+                    Known(
+                        hear(item.name, recording, stride_ms, carried),
+                        labels.key(item, recording),
+                        label["incipient_ns"],
+                        label["gross_ns"],
+                    )
+                )
+        return found
+
+    choosing: dict[str, list[Known]] = {}
+    scored = []
+    for item in campaigns:
+        ours = detection[item.name]
+        choosing[item.name] = []
+        if ours.choose != "protocol":
+            choosing[item.name] = known(ours.choose, ours.stride_ms or length)
+            if not choosing[item.name]:
+                raise StoreError(
+                    f"{item.name}: smoothing and margin are to be chosen by {ours.choose} trials, "
+                    "and no kinematic one has both onsets"
+                )
+        if ours.stride_ms is not None:
+            scored += [hear(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
+    fine, asked = settings.fine_stride_ms, settings.detection.compare
+
+    def compared(carried: bool) -> dict[str, list[Known]] | None:
+        if fine is None or asked is None or (carried and not asked.carried):
+            return None
+        return {
+            "train": known("train", length, asked.train_trials, carried),
+            "validation": known("validation", fine, None, carried),
+            "test": known("test", fine, None, carried),
+        }
+
+    return DetectorWork(scored, choosing, compared(False), compared(True))
+
+
+def _parts(store: Store, known: dict[str, list[Known]] | None) -> Parts | None:
+    """The trials of a comparison, read; None without one."""
+    if known is None:
+        return None
+    return Parts(**{name: [_labelled(store, t) for t in trials] for name, trials in known.items()})
+
+
+def _labelled(store: Store, trial: Known) -> Labelled:
+    arrays = heard(store, trial.wanted)
+    return Labelled(
+        Heard(arrays["counts"], arrays["events"], arrays["end_ns"]),
+        trial.incipient_ns,
+        trial.gross_ns,
+    )
+
+
+def _counted(store: Store, trial: Known) -> Counted:
+    arrays = heard(store, trial.wanted)
+    return Counted(arrays["counts"], arrays["end_ns"], trial.incipient_ns, trial.gross_ns)

@@ -1,0 +1,205 @@
+"""Evaluation: what the trained network is worth on trials it has never seen."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy.typing as npt
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+
+from analysis.detect.smoothing_choice import settled
+from analysis.nets.dataset import SampleSet
+from flows.labelling.label_errors import label_errors, rules_compared
+from flows.labelling.reviewed import Labels
+from flows.learning import counting
+from flows.learning.counting import COUNTS, count_spikes
+from flows.learning.detector_trials import hear_trials, heard_step
+from flows.learning.detector_work import DetectorWork, detector_work
+from flows.learning.samples import load_samples
+from flows.learning.train import Model, training_settings, wanted_models
+from flows.learning.trial_scores import score_row, summaries
+from flows.learning.window_scores import key_inputs, score_windows
+from flows.running.campaigns import Collected, training_campaigns
+from flows.running.orchestration import Parcel, run
+from flows.running.timing import timed
+from protocols import Trial
+from protocols.settings import Detection
+from storage.derived import Derived, make_key
+from storage.files import read_json
+from storage.recording import Recording
+from storage.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+STEP = "evaluation"
+VERSION = 2
+NAME = "evaluation"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything an evaluation depends on, found before anything is computed."""
+
+    store: Store
+    campaigns: list[Collected]
+    labels: Labels
+    model: Model
+    models: list[Model]
+    """Of all seeds, the chosen one among them."""
+    detection: dict[str, Detection]
+    trials: list[tuple[Collected, Trial, Recording, str]]
+    """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
+    detectors: DetectorWork
+    key: str
+    cluster: Cluster | None = None
+
+
+def choose_model(models: list[Model]) -> Model:
+    """The model with the best strict validation accuracy; ties go to the first seed.
+
+    Raises:
+        StoreError: a model is missing or stale.
+    """
+    for model in models:
+        if not model.fresh:
+            raise StoreError(
+                f"{model.path}: is missing or stale; run `sliplab train` first, with `--reviewed` "
+                "where the evaluation has it"
+            )
+    return max(models, key=lambda model: read_json(model.info_path)["validation"]["strict"])
+
+
+def make_job(
+    store: Store,
+    campaigns: list[Collected],
+    margin: float | None = None,
+    smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> Job:
+    """Find what is to be evaluated, and by what detection settings.
+
+    Args:
+        margin, smoothing: instead of the protocols' own, and of what these would choose.
+        cluster: what counts spikes and makes samples, instead of this machine.
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
+    model = choose_model(models)
+    windows = training_settings(campaigns).windows.model_dump(mode="json")
+    change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
+    change = {name: value for name, value in change.items() if value is not None}
+    if change:
+        change["choose"] = "protocol"
+    detection, trials, inputs = {}, [], [key_inputs(models)]
+    for item in campaigns:
+        detection[item.name] = Detection.model_validate(
+            {**item.settings.detection.model_dump(), **change}
+        )
+        for trial, recording in item.trials:
+            if trial.split != "test":
+                continue
+            if not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            label = labels.key(item, recording)
+            counts = make_key(COUNTS, counting.VERSION, [model.key, recording.checksum], windows)
+            trials.append((item, trial, recording, counts))
+            inputs.append([item.name, trial.id, label, counts])
+    used = {name: value.model_dump(mode="json") for name, value in detection.items()}
+    detectors = detector_work(labels, campaigns, detection, model.key)
+    # what people decided on trials beside the test trials is counted in the result
+    states = labels.states(campaigns)
+    of_review = [] if states is None else [states]
+    key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)
+    return Job(store, campaigns, labels, model, models, detection, trials, detectors, key, cluster)
+
+
+@task(name="scores", cache_policy=NO_CACHE, persist_result=False)
+def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
+    """Windows, detections and label errors, kept as one result."""
+    job, train, test = wanted.content
+    settings = training_settings(job.campaigns)
+    choices = job.detectors.choices(job.store, job.detection)
+    detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
+    ours = job.detection[training_campaigns(job.campaigns)[0].name]
+    rows = _score_trials(job, detection)
+    result = {
+        "seed": job.model.seed,
+        "windows": score_windows(job, train, test),
+        "trials": rows,
+        "experiments": summaries(rows),
+        "label_error_ms": label_errors(job.store, job.campaigns),
+        "label_rules_ms": rules_compared(job.store, job.campaigns),
+        "reviewed": job.labels.states(job.campaigns),
+        "detection": {n: d.model_dump(mode="json") for n, d in detection.items()},
+        "choices": {n: None if c is None else asdict(c) for n, c in choices.items()},
+        "detectors": job.detectors.compare(job.store, settings, ours),
+    }
+    Derived.of(job.store, STEP).write(NAME, job.key, result)
+
+
+def _score_trials(job: Job, detection: dict[str, Detection]) -> list[dict[str, Any]]:
+    """One row a trial: onsets, detections, latency."""
+    rows = []
+    for item, trial, recording, _ in job.trials:
+        found = trial_counts(job.store, item.name, trial.id, detection[item.name])
+        label = job.labels.read(item, recording)
+        rows.append(
+            score_row(item, trial, label, found["counts"], found["end_ns"], detection[item.name])
+        )
+    return rows
+
+
+def trial_counts(
+    store: Store, campaign: str, trial_id: str, settings: Detection
+) -> dict[str, npt.NDArray[Any]]:
+    """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
+    step = COUNTS if settings.stride_ms is None else heard_step(settings.stride_ms)
+    return Derived.of(store, step, campaign).arrays(trial_id)
+
+
+@flow(name="evaluate", validate_parameters=False, persist_result=False)
+def evaluate_flow(wanted: Parcel[Job]) -> None:
+    """Count spikes where needed, then score."""
+    job = wanted.content
+    with timed(job.store, "evaluate"):
+        count_spikes(
+            job.store,
+            job.model.path,
+            training_settings(job.campaigns).windows,
+            [(item.name, recording, key) for item, _, recording, key in job.trials],
+            job.cluster,
+        )
+        windows = training_settings(job.campaigns).windows
+        hear_trials(job.store, job.model.path, windows, job.detectors.wanted, job.cluster)
+        train, test = (
+            load_samples(job.labels, job.campaigns, split, job.cluster)
+            for split in ("train", "test")
+        )
+        score(Parcel((job, train, test)))
+
+
+def evaluate(
+    store: Store,
+    campaigns: list[Collected],
+    margin: float | None = None,
+    smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> dict[str, Any]:
+    """Evaluate if any input or setting changed."""
+    training_campaigns(campaigns)
+    job = make_job(store, campaigns, margin, smoothing, cluster, reviewed)
+    stale = not Derived.of(store, STEP).fresh(NAME, job.key)
+    if stale:
+        run(evaluate_flow, Parcel(job), cluster)
+    return {
+        "step": "evaluate",
+        "done": int(stale),
+        "fresh": int(not stale),
+        **job.labels.told(campaigns),
+    }

@@ -1,0 +1,275 @@
+"""`sliplab export-model`: a trained network as ONNX, on a Speck, and with a card.
+
+Everything that is said of the network is measured on windows of a store, by default the one that
+the model lies in. Nothing is written until all of it is there and the ONNX file has given Sinabs'
+spike counts.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.nets import metrics, training
+from analysis.nets.activity import activity
+from analysis.nets.dataset import SampleSet
+from analysis.nets.model_card import SplitResult, card_markdown, model_card
+from analysis.nets.network import SPIKING, WEIGHTED
+from analysis.nets.quantised import Quantised, chip_run, compare, quantise, quantised_net
+from analysis.nets.speck import speck_fit
+from analysis.nets.speck_page import speck_markdown
+from analysis.nets.training import Fitted
+from flows.labelling.reviewed import Labels
+from flows.learning.model_latency import latencies
+from flows.learning.samples import load_samples
+from flows.learning.train import training_settings, wanted_models
+from flows.running import console
+from flows.running.campaigns import Collected, collected, training_campaigns
+from protocols.errors import InputError
+from storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
+from storage.store import Store, StoreError
+
+SPLITS = ("train", "validation", "test")
+CHECKED = 256
+"""Windows of the test trials that the ONNX file is held against Sinabs on."""
+PACKAGES = ("sliplab", "torch", "sinabs", "numpy", "numba")
+SPECK_FORMAT = "sliplab-speck-1"
+
+
+class ExportFailed(StoreError):
+    """What was exported does not do what the network does, or could not be made."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A model, and the store that it is looked at on."""
+
+    path: Path
+    sha256: str
+    fitted: Fitted
+    store: Store
+    campaigns: list[Collected]
+    labels: Labels
+
+    @property
+    def simulated(self) -> bool:
+        """Whether anything of the data is."""
+        return any(bool(item.info["simulated"]) for item in self.campaigns)
+
+    @property
+    def about(self) -> dict[str, str]:
+        """What every file says of the model."""
+        return {"file": self.path.name, "sha256": self.sha256}
+
+
+def export_model(
+    model: Path,
+    fitted: Fitted,
+    out: Path,
+    store: Store,
+    names: list[str] | None = None,
+    *,
+    onnx: bool = True,
+    checked: int = CHECKED,
+) -> dict[str, Any]:
+    """Write ``NAME.onnx``, ``NAME.speck.{json,md,npz}`` and ``NAME.card.{json,md}`` into `out`.
+
+    Args:
+        model, fitted: the file, and what is in it.
+        names: campaigns of the store; all by default.
+        onnx: whether to make the ONNX file, which needs the extra of that name.
+        checked: windows to check it on.
+
+    Raises:
+        InputError: the store's windows are others than the model's.
+        StoreError: nothing collected, or not labelled.
+        ExportFailed: the ONNX file gives other counts, or cannot be made.
+    """
+    campaigns = collected(store, names)
+    if training_settings(campaigns).windows != fitted.windows:
+        file = training_campaigns(campaigns)[0].campaign.protocol_file
+        raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
+    source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
+    files: dict[str, bytes | str] = {}
+    with console.bar("export", 5) as bar:
+        made_from_these = _made_from_these(source)
+        samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}
+        seen = _look_at(samples)
+        bar.advance(1, "windows")
+        checks = 0
+        if onnx:
+            files[".onnx"], checks = _onnx(source, seen.x, checked)
+        bar.advance(1, "onnx")
+        whole = quantise(training.restore(fitted))
+        real, chip = latencies(campaigns, source.labels, fitted, whole)
+        bar.advance(1, "test trials")
+        speck = _speck(source, whole, seen, real, chip)
+        files |= {
+            ".speck.json": json_text(speck),
+            ".speck.md": speck_markdown(speck),
+            ".speck.npz": _weights_file(whole),
+        }
+        bar.advance(1, "speck")
+        card = _card(source, samples, seen, real, made_from_these)
+        files |= {".card.json": json_text(card), ".card.md": card_markdown(card)}
+        bar.advance(1, "card")
+    make_folder(out)
+    for suffix, content in files.items():
+        path = out / f"{model.stem}{suffix}"
+        if isinstance(content, bytes):
+            write_bytes(path, content)
+        else:
+            write_text(path, content)
+    return {
+        "files": [str(out / f"{model.stem}{suffix}") for suffix in files],
+        "simulated": source.simulated,
+        "onnx_windows_equal": checks,
+        "speck_fits": speck["fit"]["fits"],
+        "problems": speck["fit"]["problems"],
+        "change": speck["quantisation"]["change"],
+        "accuracy": speck["quantisation"]["accuracy"],
+        "synaptic_operations": card["activity"]["synaptic_operations"]["all"],
+        "warnings": card["warnings"],
+    }
+
+
+def _weights_file(whole: Quantised) -> bytes:
+    """The whole weights and biases as NumPy's archive, int8; the same bytes for the same ones."""
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = dict(whole.weights)
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _made_from_these(source: _Source) -> bool:
+    """Whether the model is what `train` would make of this store now. Raises StoreError."""
+    wanted = {model.key for model in wanted_models(source.store, source.campaigns)}
+    try:
+        return read_json(source.path.with_suffix(".json"))["key"] in wanted
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
+    """The samples that figures are measured on: the test trials', else what else there is."""
+    for split in reversed(SPLITS):
+        if len(samples[split]):
+            return samples[split]
+    raise StoreError("there are no samples to look at; collect and label more trials")
+
+
+def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[bytes, int]:
+    """The ONNX file, and on how many windows it was found right."""
+    from analysis.nets.onnx_file import OnnxDiffers, check_onnx, to_onnx
+
+    windows = source.fitted.windows
+    about = {
+        **source.about,
+        "classes": ",".join(metrics.CLASSES),
+        "windows": windows.model_dump_json(),
+        "simulated": str(source.simulated).lower(),
+    }
+    some = x[np.unique(np.linspace(0, len(x) - 1, min(checked, len(x))).astype(int))]
+    net = training.restore(source.fitted)
+    try:
+        data = to_onnx(net, windows, about)
+        return data, check_onnx(data, net, some)
+    except ModuleNotFoundError as error:
+        raise ExportFailed(
+            f"ONNX cannot be written ({error}): `pip install 'sliplab[onnx]'`, or --no-onnx"
+        ) from None
+    except OnnxDiffers as error:
+        raise ExportFailed(f"{source.path}: nothing was written: {error}") from None
+
+
+def _speck(
+    source: _Source,
+    whole: Quantised,
+    seen: SampleSet,
+    real: dict[str, Any],
+    chip: dict[str, Any],
+) -> dict[str, Any]:
+    """The description of the network on the chip."""
+    fitted = source.fitted
+    net = training.restore(fitted)
+    margin = training_settings(source.campaigns).detection.margin
+    ran = chip_run(quantised_net(fitted, whole), seen.x)
+    counts = training.engine(fitted).counts(seen.windows)
+    rounding = whole.rounding(net)
+    layers = {
+        name: {
+            "scale": whole.scales[name],
+            "threshold": whole.thresholds[spiking],
+            "rounding": rounding[name],
+            "potential": list(ran.potentials[spiking]),
+            "saturated": ran.saturated[spiking],
+        }
+        for name, spiking in zip(WEIGHTED, SPIKING, strict=True)
+    }
+    accuracy = {
+        name: vars(metrics.accuracy(each, seen.y, margin))
+        for name, each in (("real", counts), ("whole", ran.counts))
+    }
+    return {
+        "format": SPECK_FORMAT,
+        "simulated": source.simulated,
+        "model": source.about,
+        "fit": speck_fit(fitted.network, fitted.windows).as_json(),
+        "quantisation": {
+            "layers": layers,
+            "change": compare(counts, ran.counts, margin),
+            "accuracy": accuracy,
+        },
+        "detection": {"real": real, "whole": chip},
+    }
+
+
+def _card(
+    source: _Source,
+    samples: dict[str, SampleSet],
+    seen: SampleSet,
+    detection: dict[str, Any],
+    made_from_these: bool,
+) -> dict[str, Any]:
+    net, engine = training.restore(source.fitted), training.engine(source.fitted)
+    kinematic = training_campaigns(source.campaigns)
+    splits = {
+        split: SplitResult(
+            engine.counts(part.windows),
+            part.y,
+            sum(1 for item in kinematic for _ in item.of_split(split)),
+        )
+        for split, part in samples.items()
+        if len(part)
+    }
+    campaigns = [
+        {
+            "name": item.name,
+            "experiment": item.experiment,
+            "protocol": item.plan.protocol.name,
+            "collection_hash": item.plan.collection_hash,
+            "analysis_hash": item.plan.analysis_hash,
+            "rig": item.info["rig"],
+            "simulated": item.info["simulated"],
+            "trials": {split: sum(1 for _ in item.of_split(split)) for split in SPLITS},
+        }
+        for item in source.campaigns
+    ]
+    data = {
+        "store": source.store.folder.resolve().name,
+        "simulated": source.simulated,
+        "made_from_these_data": made_from_these,
+        "campaigns": campaigns,
+    }
+    versions = {name: version(name) for name in PACKAGES}
+    margin = training_settings(source.campaigns).detection.margin
+    return model_card(
+        source.fitted, source.about, data, splits, activity(net, seen.x), detection, versions,
+        margin,
+    )  # fmt: skip

@@ -1,0 +1,46 @@
+"""How late a network sees slip over whole test trials: as trained, and in a chip's arithmetic."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from analysis.detect.detection import detect
+from analysis.detect.latency import score_trial, summarise_latency
+from analysis.nets import dataset, training
+from analysis.nets.quantised import Quantised, chip_run, quantised_net
+from analysis.nets.training import Fitted
+from flows.labelling.reviewed import Labels
+from flows.running.campaigns import Collected
+
+Latency = dict[str, Any]
+"""By experiment: ``trials`` with both onsets, and ``latency_ms`` as `summarise_latency` has it."""
+
+
+def latencies(
+    campaigns: list[Collected], labels: Labels, fitted: Fitted, whole: Quantised
+) -> tuple[Latency, Latency]:
+    """Latency over the test trials of `campaigns`, as trained and with the whole numbers."""
+    fast, chip = training.engine(fitted), quantised_net(fitted, whole)
+    found: tuple[dict[str, list[Any]], ...] = ({}, {})
+    for item in campaigns:
+        rule = item.settings.detection
+        for _, recording in item.of_split("test"):
+            label = labels.read(item, recording)
+            onsets = (label["incipient_ns"], label["gross_ns"])
+            if None in onsets:
+                continue
+            x, end_ns = dataset.trial_windows(recording, fitted.windows)
+            both = fast.counts(x), chip_run(chip, x.dense()).counts
+            for rows, counts in zip(found, both, strict=True):
+                said = detect(counts, end_ns, rule)
+                scored = score_trial(said, *onsets, round(rule.false_early_ms * 1e6))
+                rows.setdefault(item.experiment, []).append(scored)
+    real, chips = map(_summary, found)
+    return real, chips
+
+
+def _summary(rows: dict[str, list[Any]]) -> Latency:
+    return {
+        experiment: {"trials": len(each), "latency_ms": summarise_latency(each)}
+        for experiment, each in rows.items()
+    }

@@ -1,0 +1,193 @@
+"""Training: the network of every seed, from the labelled trials of the kinematic campaigns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+
+from analysis.nets import dataset, model_file, training
+from analysis.nets.dataset import SampleSet
+from flows.labelling.reviewed import Labels
+from flows.learning.samples import load_samples
+from flows.learning.training_progress import progress
+from flows.running import console
+from flows.running.campaigns import Collected, training_campaigns
+from flows.running.orchestration import Parcel, run
+from flows.running.timing import timed
+from protocols.settings import AnalysisSettings
+from storage.derived import make_key
+from storage.files import read_json, write_bytes, write_json
+from storage.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+VERSION = 5
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network on disk."""
+
+    seed: int
+    path: Path
+    key: str
+
+    @property
+    def info_path(self) -> Path:
+        """The JSON beside the model file; written last, it decides."""
+        return self.path.with_suffix(".json")
+
+    @property
+    def state_path(self) -> Path:
+        """Where its training is kept after each epoch, to go on there after a stop."""
+        return self.path.with_suffix(f".{self.key[:16]}.state")
+
+    @property
+    def curves_path(self) -> Path:
+        """The training curves, drawn anew after each epoch."""
+        return self.path.with_suffix(".svg")
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the file was made with `key`."""
+        try:
+            return self.path.exists() and read_json(self.info_path)["key"] == self.key
+        except (OSError, ValueError, KeyError):
+            return False
+
+
+def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
+    """The settings that the network is made by: those of the first kinematic campaign."""
+    return training_campaigns(campaigns)[0].settings
+
+
+def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
+    """The models that the settings ask for, with the keys they must have.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
+
+    Raises:
+        StoreError: a trial has no fresh label yet.
+    """
+    used = training_campaigns(campaigns)
+    settings = used[0].settings
+    inputs = []
+    labels = Labels(store, reviewed)
+    for item in used:
+        for trial, recording in item.trials:
+            if not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            if trial.split in {"train", "validation"}:
+                key = labels.key(item, recording)
+                inputs.append([item.name, trial.id, trial.split, key])
+    parameters = {
+        name: getattr(settings, name).model_dump(mode="json")
+        for name in ("windows", "samples", "network")
+    }
+    parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
+    models = []
+    for seed in settings.training.seeds:
+        key = make_key(
+            "train", VERSION, inputs, {**parameters, "seed": seed, "dataset": dataset.VERSION}
+        )
+        models.append(Model(seed, store.folder / "models" / f"seed{seed}.pt", key))
+    return models
+
+
+@task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
+def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings, bool]]) -> int:
+    """Train one network and keep it."""
+    model, train, validation, settings, simulated = job.content
+    model.path.parent.mkdir(parents=True, exist_ok=True)
+    with progress(model, settings.training.epochs, simulated) as told:
+        fitted = training.fit(
+            train.windows,
+            train.y,
+            validation.windows,
+            validation.y,
+            settings.network,
+            settings.windows,
+            settings.training,
+            model.seed,
+            on_epoch=told.epoch,
+            on_state=partial(write_bytes, model.state_path),
+            state=begun(model),
+        )
+    for warning in fitted.warnings:
+        console.say(f"warning: {warning}")
+    model_file.save(model.path, fitted)
+    info = {
+        "key": model.key,
+        "seed": model.seed,
+        "samples": {"train": len(train), "validation": len(validation)},
+        "chosen_epoch": fitted.chosen_epoch,
+        "validation": {
+            "argmax": fitted.chosen.val_argmax,
+            "strict": fitted.chosen.val_strict,
+            "margin": fitted.chosen.val_margin,
+        },
+        "warnings": list(fitted.warnings),
+    }
+    write_json(model.info_path, info)
+    for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
+        left.unlink()
+    return model.seed
+
+
+def begun(model: Model) -> bytes | None:
+    """Where a training of this model stopped; None where it never began."""
+    try:
+        return model.state_path.read_bytes()
+    except FileNotFoundError:
+        return None
+
+
+@flow(name="train", validate_parameters=False, persist_result=False)
+def train_flow(
+    wanted: Parcel[tuple[Labels, list[Collected], list[Model], Cluster | None]],
+) -> int:
+    """Train the seeds that are stale, one after the other."""
+    labels, campaigns, models, cluster = wanted.content
+    settings = training_settings(campaigns)
+    simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
+    with timed(labels.store, "train"):
+        train = load_samples(labels, campaigns, "train", cluster)
+        validation = load_samples(labels, campaigns, "validation", cluster)
+        for name, part in (("training", train), ("validation", validation)):
+            if not len(part):
+                raise StoreError(f"there are no {name} samples; collect more trials")
+        for model in models:
+            train_one(Parcel((model, train, validation, settings, simulated)))
+    return len(models)
+
+
+def train(
+    store: Store,
+    campaigns: list[Collected],
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> dict[str, Any]:
+    """Train what is missing or stale.
+
+    Args:
+        cluster: what makes the samples; this machine trains.
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
+    stale = [model for model in models if not model.fresh]
+    if stale:
+        run(train_flow, Parcel((labels, campaigns, stale, cluster)), cluster)
+    return {
+        "step": "train",
+        "done": len(stale),
+        "fresh": len(models) - len(stale),
+        **labels.told(campaigns),
+    }

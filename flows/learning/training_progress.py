@@ -1,0 +1,74 @@
+"""What people see of a training while it runs: a bar, a picture in the store and on Prefect's page.
+
+The picture is drawn anew after each epoch. A page that cannot be told is left as it is: the store
+has the picture.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from analysis.nets.training import EpochRecord
+from analysis.pictures.figures import training_curves
+from flows.running import console, orchestration
+from storage.files import write_text
+
+if TYPE_CHECKING:
+    from flows.learning.train import Model
+
+
+@contextmanager
+def progress(model: Model, epochs: int, simulated: bool) -> Iterator[Progress]:
+    """Show the training of a model while the block runs."""
+    with console.bar(f"train seed {model.seed} (epochs)", epochs) as bar:
+        yield Progress(model, bar, simulated)
+
+
+class Progress:
+    """What is told after each epoch."""
+
+    def __init__(self, model: Model, bar: Any, simulated: bool) -> None:
+        self._model, self._bar, self._simulated = model, bar, simulated
+        self._records: list[dict[str, Any]] = []
+        self._best: EpochRecord | None = None
+        self._artifact: Any = None
+
+    def epoch(self, record: EpochRecord) -> None:
+        """An epoch is over."""
+        self._records.append(asdict(record))
+        if self._best is None or record.merit > self._best.merit:
+            self._best = record
+        self._bar.advance(1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict")
+        svg = training_curves(self._records, self._best.epoch, simulated=self._simulated)
+        write_text(self._model.curves_path, svg)
+        if not orchestration.private():
+            with suppress(Exception):
+                self._show(svg)
+
+    def _show(self, svg: str) -> None:
+        """On the page of the flow run; made at the first epoch, changed after."""
+        from prefect.client.orchestration import get_client
+        from prefect.client.schemas.actions import ArtifactCreate, ArtifactUpdate
+        from prefect.context import get_run_context
+
+        data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+        words = f"training curves of seed {self._model.seed}, {len(self._records)} epochs"
+        with get_client(sync_client=True) as client:
+            if self._artifact is not None:
+                client.update_artifact(self._artifact, ArtifactUpdate(data=data, description=words))
+                return
+            run: Any = get_run_context()
+            made = client.create_artifact(
+                ArtifactCreate(
+                    key=f"train-seed-{self._model.seed}-curves",
+                    type="image",
+                    data=data,
+                    description=words,
+                    flow_run_id=run.task_run.flow_run_id,
+                )
+            )
+            self._artifact = made.id

@@ -1,0 +1,65 @@
+"""What a detector was worth in each trial, as rows that are kept, and over each experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy.typing as npt
+
+from analysis.detect.detection import detect
+from analysis.detect.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from flows.running.campaigns import Collected
+from protocols import Trial
+from protocols.settings import Detection
+
+Json = dict[str, Any]
+
+
+def score_row(
+    item: Collected,
+    trial: Trial,
+    label: Json,
+    counts: npt.NDArray[Any],
+    end_ns: npt.NDArray[Any],
+    settings: Detection,
+) -> Json:
+    """Onsets, detections and latency of a trial; ``latency`` is None without both onsets.
+
+    Args:
+        label: with ``incipient_ns`` and ``gross_ns``, None where there is none.
+        counts, end_ns: spikes of consecutive windows (n, 3), and where these end (n,), ns.
+    """
+    detections = detect(counts, end_ns, settings)
+    incipient, gross = label["incipient_ns"], label["gross_ns"]
+    latency = None
+    if incipient is not None and gross is not None:
+        tolerance = round(settings.false_early_ms * 1e6)
+        latency = asdict(score_trial(detections, incipient, gross, tolerance))
+    return {
+        "campaign": item.name,
+        "experiment": item.experiment,
+        "trial": trial.id,
+        "condition": item.plan.describe(trial),
+        "incipient_ns": incipient,
+        "gross_ns": gross,
+        "detected_incipient_ns": detections.incipient_ns,
+        "detected_gross_ns": detections.gross_ns,
+        "latency": latency,
+    }
+
+
+def summaries(rows: Sequence[Json]) -> dict[str, Json]:
+    """Latency and lead by experiment, of rows of `score_row`."""
+    result = {}
+    for experiment in ("kinematic", "gravity", "disturbance"):
+        ours = [row for row in rows if row["experiment"] == experiment]
+        scored = [TrialLatency(**row["latency"]) for row in ours if row["latency"] is not None]
+        result[experiment] = {
+            "trials": len(ours),
+            "without_onsets": len(ours) - len(scored),
+            "latency_ms": summarise_latency(scored),
+            "lead_ms": summarise_lead(scored),
+        }
+    return result

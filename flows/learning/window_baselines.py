@@ -1,0 +1,111 @@
+"""`sliplab evaluate --baselines`: other methods on the same windows, each trained once and kept.
+
+They take minutes and do not depend on the spiking network, so each is kept on its own as soon as
+it is there, and is made again only when a sample changed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from analysis.nets import metrics
+from analysis.nets.baseline_nets import EPOCHS, KINDS, trained_net
+from analysis.nets.baseline_trees import ROUNDS, boosted
+from analysis.nets.baselines import RIDGE, logistic_cells
+from analysis.nets.dataset import SampleSet
+from flows.labelling.reviewed import Labels
+from flows.learning import window_scores
+from flows.learning.samples import STEP as SAMPLES
+from flows.learning.samples import load_samples
+from flows.running import console
+from flows.running.campaigns import Collected
+from flows.running.timing import timed
+from storage.derived import Derived, make_key
+from storage.store import Store
+
+STEP = "baselines"
+EVALUATION = "evaluation"
+"""Step and name of what it is compared with (`flows.learning.evaluate`, which Prefect needs)."""
+VERSION = 2
+
+NAMES: dict[str, Any] = {
+    "logistic_cells": RIDGE,
+    "boosting": ROUNDS,
+    **dict.fromkeys(KINDS, EPOCHS),
+}
+"""Each baseline, and what bounds it."""
+
+
+def _key(store: Store, name: str) -> str:
+    """By the samples as they stand in the store."""
+    kept = Derived.of(store, SAMPLES)
+    samples = [kept.key(split) for split in ("train", "validation", "test")]
+    return make_key(STEP, VERSION, samples, [name, NAMES[name]])
+
+
+def fresh_keys(store: Store) -> list[str]:
+    """Keys of the baselines that are there and belong to today's samples."""
+    kept = Derived.of(store, STEP)
+    return [key for name in NAMES if kept.fresh(name, key := _key(store, name))]
+
+
+def beside(store: Store) -> dict[str, dict[str, Any]]:
+    """Each baseline that is there beside the network, by name; see `window_scores.compared`.
+
+    A network's figures of other windows than the baseline's are not compared.
+    """
+    kept = Derived.of(store, STEP)
+    network = window_scores.kept_counts(store, Derived.of(store, EVALUATION).key(EVALUATION))
+    found: dict[str, dict[str, Any]] = {}
+    if network is None:
+        return found
+    for name in NAMES:
+        if not kept.fresh(name, _key(store, name)):
+            continue
+        votes = kept.arrays(name)["votes"]
+        if len(votes) != len(network["y"]):
+            continue
+        row = window_scores.compared(votes, network["counts"], network["y"], network["trial"])
+        found[name] = {**row, "made": kept.read(name)["made"]}
+    return found
+
+
+def _made(name: str, train: SampleSet, validation: SampleSet, test: SampleSet) -> Any:
+    if name == "logistic_cells":
+        return logistic_cells(train.windows, train.y, test.windows)
+    if name == "boosting":
+        return boosted(train, validation, test.windows)
+
+    def told(epoch: int, strict: float) -> None:
+        console.say(f"{name}: epoch {epoch} of at most {EPOCHS}, validation {100 * strict:.1f} %")
+
+    return trained_net(name, train, validation, test.windows, on_epoch=told)
+
+
+def window_baselines(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> dict[str, Any]:
+    """Train and keep every baseline that is missing or stale.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    train, validation, test = (
+        load_samples(labels, campaigns, split) for split in ("train", "validation", "test")
+    )
+    kept = Derived.of(store, STEP)
+    stale = [name for name in NAMES if not kept.fresh(name, _key(store, name))]
+    if stale:
+        with timed(store, "baselines"):
+            for name in stale:
+                console.say(f"{name}: {len(train)} training windows")
+                votes, made = _made(name, train, validation, test)
+                result = {"made": made, "argmax": metrics.accuracy(votes, test.y).argmax}
+                kept.write(name, _key(store, name), result, {"votes": votes})
+    return {
+        "step": "baselines",
+        "done": len(stale),
+        "fresh": len(NAMES) - len(stale),
+        "argmax": {name: kept.read(name)["argmax"] for name in NAMES},
+    }

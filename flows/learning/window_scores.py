@@ -1,0 +1,240 @@
+"""The chosen windows of test trials: what the network says of them, from every side.
+
+The chosen network's figures by class, condition, phase and trial, all trained seeds beside it, what
+its leads are worth, and what it computes. Everything that is fitted here is fitted on training or
+validation trials.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.nets import metrics, model_file, reliability, synaptic, training, window_groups
+from analysis.nets.baselines import evaluate_baselines
+from analysis.nets.dataset import SampleSet, recorded_span
+from flows.learning.samples import load_samples
+from flows.learning.train import Model, training_settings
+from flows.running.campaigns import Collected, training_campaigns
+from protocols import Trial
+from storage.derived import Derived
+from storage.files import read_json
+from storage.recording import Recording
+from storage.store import Store
+
+if TYPE_CHECKING:
+    from flows.labelling.reviewed import Labels
+    from flows.learning.evaluate import Job
+
+VERSION = 1
+STEP = "windows"
+"""The network's counts of the test windows are kept under it, for what is compared later."""
+NAME = "test"
+
+Owner = tuple[Collected, Trial, Recording]
+
+
+def score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
+    """All figures of the test windows; see docs/metrics.md."""
+    settings = training_settings(job.campaigns)
+    fitted = model_file.load(job.model.path)
+    margin = settings.detection.margin
+    validation = load_samples(job.labels, job.campaigns, "validation")
+    counts = training.predict_counts(fitted, test.windows)
+    known = owners(training_campaigns(job.campaigns), "test")
+    trial = whose(known, test)
+    hits = window_groups.strict_hits(counts, test.y)
+    Derived.of(job.store, STEP).write(
+        NAME, job.key, {}, {"counts": counts, "y": test.y, "trial": trial}
+    )
+    cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
+    work = synaptic.count_work(fitted, test.windows)
+    return {
+        **metrics.score(counts, test.y, margin).as_dict(),
+        "interval": window_groups.share(hits, trial),
+        "reliability": reliability.by_lead(counts, test.y),
+        "calibration": reliability.calibration(
+            counts,
+            test.y,
+            training.predict_counts(fitted, validation.windows),
+            validation.y,
+        ),
+        "by_factor": window_groups.by_factor(
+            hits, trial, {k: item.plan.describe(of) for k, (item, of, _) in enumerate(known)}
+        ),
+        **_phases(job.labels, known, test, trial, hits, settings.windows.length_ms),
+        "by_trial": window_groups.by_trial(counts, test.y, trial, lambda k: _named(known[k])),
+        "seeds": _seeds(job, test, margin),
+        "work": None if work is None else work.as_dict(),
+        "baselines": {name: score.argmax for name, score in cheap.items()},
+        "beside": {
+            name: compared(score.votes, counts, test.y, trial) for name, score in cheap.items()
+        },
+        "samples": {"train": len(train), "test": len(test)},
+    }
+
+
+def owners(campaigns: list[Collected], split: str) -> list[Owner]:
+    """The trials of a split in the order in which their samples stand in a file."""
+    return [(item, trial, found) for item in campaigns for trial, found in item.of_split(split)]
+
+
+def whose(known: Sequence[Owner], samples: SampleSet) -> npt.NDArray[np.int64]:
+    """For each sample the place of its trial in `known`, (n,).
+
+    A sample knows only its trial's number in its campaign, which another campaign may have, too.
+    Samples stand in the order of their trials, so each run of one number belongs to the next trial
+    of that number.
+
+    Raises:
+        ValueError: the samples are not of these trials.
+    """
+    out = np.empty(len(samples), np.int64)
+    if not len(samples):
+        return out
+    edges = np.flatnonzero(np.diff(samples.trial)) + 1
+    place = -1
+    for begin, end in zip([0, *edges], [*edges, len(samples)], strict=True):
+        number = int(samples.trial[begin])
+        place += 1
+        while place < len(known) and known[place][1].index != number:
+            place += 1
+        if place == len(known):
+            raise ValueError(f"samples of the trial with number {number}, which is not there")
+        out[begin:end] = place
+    return out
+
+
+def _named(owner: Owner) -> dict[str, Any]:
+    item, trial, _ = owner
+    return {"campaign": item.name, "trial": trial.id, "condition": item.plan.describe(trial)}
+
+
+def _phases(
+    labels: Labels,
+    known: Sequence[Owner],
+    test: SampleSet,
+    trial: npt.NDArray[np.int64],
+    hits: npt.NDArray[np.float64],
+    length_ms: int,
+) -> dict[str, Any]:
+    """Recall by tenths of each class's phase, and of no slip before and during motion.
+
+    A phase ends with the recording or where the next begins; a window belongs where its middle is.
+    """
+    middle = test.start_ns + length_ms * 500_000
+    fraction = np.full(len(test), np.nan)
+    moving = np.zeros(len(test), bool)
+    for k in np.unique(trial).tolist():
+        item, _, recording = known[k]
+        label = labels.read(item, recording)
+        start, end = recorded_span(recording)
+        edges = [start, label["incipient_ns"], label["gross_ns"], end]
+        there = trial == k
+        moving |= there & (middle >= recording.step(recording.motion_phase)[0])
+        for phase, (begin, over) in enumerate(itertools.pairwise(edges)):
+            if begin is not None and over is not None and over > begin:
+                ours = there & (test.y == phase)
+                fraction[ours] = (middle[ours] - begin) / (over - begin)
+    still = test.y == metrics.NO_SLIP
+    hold, loading = still & ~moving, still & moving
+    return {
+        "by_tenth": window_groups.by_tenth(hits, test.y, trial, fraction),
+        "no_slip": {
+            "hold": window_groups.share(hits[hold], trial[hold]),
+            "loading": window_groups.share(hits[loading], trial[loading]),
+        },
+    }
+
+
+def _seeds(job: Job, test: SampleSet, margin: float) -> dict[str, Any]:
+    """Every trained seed on the same windows: each, and mean, lowest and highest."""
+    rows = []
+    for model in job.models:
+        counts = training.predict_counts(model_file.load(model.path), test.windows)
+        found = asdict(metrics.accuracy(counts, test.y, margin))
+        rows.append(
+            {
+                "seed": model.seed,
+                "chosen": model.seed == job.model.seed,
+                "validation_strict": read_json(model.info_path)["validation"]["strict"],
+                **{kind: found[kind] for kind in _KINDS},
+            }
+        )
+    spread = {}
+    for kind in _KINDS:
+        values = [row[kind] for row in rows if row[kind] is not None]
+        spread[kind] = {
+            "mean": float(np.mean(values)) if values else None,
+            "min": min(values, default=None),
+            "max": max(values, default=None),
+        }
+    return {"each": rows, "spread": spread}
+
+
+_KINDS = ("argmax", "strict", "margin")
+
+
+def key_inputs(models: Sequence[Model]) -> list[Any]:
+    """What the figures here depend on, beside the chosen model and the test trials."""
+    return [VERSION, *(model.key for model in models)]
+
+
+def compared(
+    votes: npt.NDArray[Any],
+    counts: npt.NDArray[np.int64],
+    y: npt.NDArray[np.int64],
+    trial: npt.NDArray[np.int64],
+) -> dict[str, Any]:
+    """Another method's votes (n, 3) beside the network's counts, on the same windows.
+
+    Returns:
+        ``argmax`` accuracy of the method with its interval over trials, and ``network_ahead``: the
+        network's less the method's, of the same windows, with the interval of the difference.
+    """
+    ours, theirs = window_groups.credit(counts, y), window_groups.credit(votes, y)
+    found = window_groups.share(theirs, trial)
+    return {
+        "argmax": found["share"],
+        "low": found["low"],
+        "high": found["high"],
+        "network_ahead": window_groups.share(ours - theirs, trial),
+    }
+
+
+def kept_counts(store: Store, evaluated: str | None) -> dict[str, npt.NDArray[Any]] | None:
+    """``counts`` (n, 3), ``y`` (n,) and ``trial`` (n,) of an evaluation's test windows.
+
+    None where they are not of the evaluation with this key.
+    """
+    kept = Derived.of(store, STEP)
+    return kept.arrays(NAME) if evaluated is not None and kept.fresh(NAME, evaluated) else None
+
+
+def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
+    """Accuracy, and incipient precision and recall, of the test windows with intervals over trials.
+
+    Args:
+        evaluated: the evaluation's key.
+
+    Returns:
+        by name what `analysis.nets.window_groups.share` gives; empty where the evaluation kept
+        none.
+    """
+    found = kept_counts(store, evaluated)
+    if found is None:
+        return {}
+    counts, y, trial = found["counts"], found["y"], found["trial"]
+    said = metrics.winners(counts)
+    true, called = y == metrics.INCIPIENT, said == metrics.INCIPIENT
+    both = (true & called).astype(np.float64)
+    return {
+        "accuracy": window_groups.share(window_groups.credit(counts, y), trial),
+        "incipient_precision": window_groups.share(both[called], trial[called]),
+        "incipient_recall": window_groups.share(both[true], trial[true]),
+    }

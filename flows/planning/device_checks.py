@@ -1,0 +1,115 @@
+"""What `sliplab check` asks a rig's devices: do they answer, who are they, how do clocks agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from rigs.capabilities import ArmFault, DeviceHealth, RigError
+from storage.lock import Locked
+
+if TYPE_CHECKING:
+    from flows.planning.orders import Order
+    from rigs.rig import Rig
+
+LISTEN_S = 3.0
+"""How long the pulses are listened to, s."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at."""
+
+    name: str
+    passed: bool
+    finding: str
+
+
+def check_devices(order: Order) -> list[Check]:
+    """Connect every device, hear what it says of itself, and fit the clocks; nothing moves."""
+    from rigs.rig_lock import held
+
+    try:
+        with held(order.rig, order.store):
+            return _check_held(order)
+    except Locked as error:
+        return [Check("rig", False, str(error))]
+    except RigError as error:
+        return [Check(error.device, False, _told(error))]
+
+
+def _check_held(order: Order) -> list[Check]:
+    """As `check_devices`, of a rig that nobody else uses meanwhile."""
+    from rigs.build import build_rig
+
+    found = _check_reach(order)
+    if not all(item.passed for item in found):
+        return found
+    try:
+        rig = build_rig(order.rig)
+    except RigError as error:
+        return [Check(error.device, False, _told(error))]
+    try:
+        rig.connect()
+        state = rig.arm.state()
+        if not state.healthy:
+            raise ArmFault("arm", f"is in {state.value}: {state.advice}")
+        found.append(Check("arm", True, state.value))
+        found += [Check(device.device, True, _said(device)) for device in rig.health()]
+        found += _check_clocks(order, rig)
+    except RigError as error:
+        found.append(Check(error.device, False, _told(error)))
+    finally:
+        rig.close()
+    return found
+
+
+def _check_reach(order: Order) -> list[Check]:
+    """Devices of a real rig that cannot be reached at all, each by name."""
+    if order.rig.simulated or order.rig.devices is None:
+        return []
+    from rigs.reach import reach
+
+    return [
+        Check(name, False, why) for name, why in reach(order.rig.devices).items() if why is not None
+    ]
+
+
+def _check_clocks(order: Order, rig: Rig) -> list[Check]:
+    """Every clock that can be heard without frames, fitted as a trial's would be."""
+    from analysis.timeline.synchronise import streams_of, synchronise
+    from storage.hdf5 import StreamReader
+    from storage.writer import DATA, TrialWriter
+
+    rate = order.plan.protocol.collection.recording.sync_rate
+    with TemporaryDirectory() as folder:
+        aside = Path(folder) / "check"
+        writer = TrialWriter(aside, aside.with_name("none"), None, rate)
+        rig.listen(LISTEN_S, writer, rate)
+        with StreamReader(writer.seal() / DATA) as reader:
+            streams = streams_of(reader, None)
+    heard = synchronise(streams, rig.timing, rate)
+    found = [
+        Check(
+            f"clock: {name}",
+            True,
+            f"{device.map.drift_ppm():+.1f} ppm, within {device.uncertainty_ns / 1000:.1f} us "
+            f"({device.grade})",
+        )
+        for name, device in heard.devices.items()
+    ]
+    return found + [Check(f"clock: {name}", False, why) for name, why in heard.refused.items()]
+
+
+def _said(device: DeviceHealth) -> str:
+    """What a device says of itself, in a line."""
+    parts = [device.model, f"serial {device.serial}", f"firmware {device.firmware}"]
+    if device.temperature_c is not None:
+        parts.append(f"{device.temperature_c:.0f} °C")
+    return ", ".join([*parts, f"clock: {device.clock}", *device.notes])
+
+
+def _told(error: RigError) -> str:
+    return str(error).removeprefix(f"{error.device}: ")

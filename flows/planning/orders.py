@@ -1,0 +1,232 @@
+"""What was asked for, checked before anything moves: protocol, rig and store belong together.
+
+Nothing here needs Prefect, so a wrong input is answered at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flows.planning.changes import told
+from flows.planning.estimate import check_space, plan_bytes
+from protocols import InputError, Plan, Trial, load_plan
+from protocols.yaml_file import parse_yaml, read_text
+from rigs.levels import at_level, with_level
+from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
+from storage.decisions import skipped
+from storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Who stands at the rig, and what the room is like; kept for each stretch of work."""
+
+    operator: str = ""
+    temperature_c: float | None = None
+    humidity_percent: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Order:
+    """A collection that was asked for and found possible."""
+
+    plan: Plan
+    rig: RigFile
+    rig_text: str
+    store: Path
+    campaign: str
+    enable: tuple[str, ...]
+    bench: Bench = Bench()
+    most: int | None = None
+    """Trials that were asked for at most."""
+    until: float | None = None
+    """When the rig has to be free again, seconds since 1970; None for no such time."""
+    only: frozenset[str] | None = None
+    """Ids of the trials that may be taken; None for all."""
+
+    def wanted(self, campaign: Campaign) -> list[Trial]:
+        """Trials to take now, in the plan's order."""
+        pending = pending_trials(self.plan, campaign)
+        return [t for t in pending if self.only is None or t.id in self.only][: self.most]
+
+
+def make_order(
+    protocol: Path,
+    rig: Path,
+    store: Path,
+    *,
+    enable: tuple[str, ...] = (),
+    campaign: str | None = None,
+    bench: Bench = Bench(),
+    most: int | None = None,
+    until: float | None = None,
+) -> Order:
+    """Read and check everything that can be known before anything moves.
+
+    Raises:
+        InputError: protocol, rig, or a plan that this rig or this disk cannot take.
+        StoreError: the folder is no store, or the campaign was begun under another collection.
+    """
+    plan = load_plan(protocol, enable)
+    rig_file, rig_text = load_rig_file(rig)
+    check_plan(rig_file, plan, str(rig))
+    if plan.protocol.collection.plate is not None and not rig_file.has_plate:
+        raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
+    name = campaign or plan.protocol.name
+    begun = None
+    if (store / "store.json").exists():
+        found = Store.open(store).campaign(name)
+        begun = found if found.begun else None
+    # one campaign, one physics: a level of a factor that is added later must not change it
+    level = begun.info.get("scene_level") if begun else None
+    rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
+    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most, until)
+    if begun:
+        _check_same(order, begun)
+    return order
+
+
+def _check_same(order: Order, campaign: Campaign) -> None:
+    info = campaign.info
+    if IMPORTED in info:
+        raise StoreError(
+            f"{campaign.folder}: was imported; give the new one its own name with --campaign"
+        )
+    if info["collection_hash"] != order.plan.collection_hash:
+        raise StoreError(
+            f"{campaign.folder}: was begun under another `collection:` section; changing "
+            "analysis, levels or repetitions is fine, anything else would mix two experiments. "
+            f"Give the new one its own name with --campaign.{_changed(order, campaign)}"
+        )
+    if info["rig_hash"] != rig_hash(order.rig_text) and not same_rig(
+        read_text(campaign.folder / "rig.yaml", "rig file"), order.rig_text
+    ):
+        raise StoreError(
+            f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
+            f"give the new one its own name with --campaign.{_rig_changed(order, campaign)}"
+        )
+    if missing := campaign.committed() - {trial.id for trial in order.plan}:
+        raise StoreError(
+            f"{campaign.folder}: holds trials that the protocol no longer has, such as "
+            f"{min(missing)}; a protocol may only add trials to a campaign."
+            f"{_changed(order, campaign)}"
+        )
+
+
+def _changed(order: Order, campaign: Campaign) -> str:
+    """What differs from the campaign's own copy of its protocol, if that can be read."""
+    try:
+        begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()))
+    except InputError:
+        return ""
+    old, new = begun.collection_data, order.plan.collection_data
+    for data, enabled in ((old, begun.enabled), (new, order.plan.enabled)):
+        for name, factor in data["factors"].items():  # however they were written
+            for key in ("values", "range", "optional"):
+                factor.pop(key)
+            factor["levels"] = [str(level) for level in enabled[name]]
+    changes = told(old, new, "collection")
+    return f" What changed:{changes}" if changes else ""
+
+
+def _rig_changed(order: Order, campaign: Campaign) -> str:
+    """What differs from the campaign's own copy of its rig file."""
+    old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
+    changes = told(old, parse_yaml(order.rig_text, "rig file"))
+    return f" What changed:{changes}" if changes else ""
+
+
+def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
+    """Trials that are neither committed nor set aside, in the plan's order."""
+    done = campaign.committed() | skipped(campaign).keys()
+    failed = campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
+
+
+def set_aside(
+    plan: Plan, campaign: Campaign, committed: set[str] | None = None
+) -> list[dict[str, Any]]:
+    """Trials of the plan that no collection takes, in its order, each with its cause.
+
+    By JSON names: ``trial``, ``cause``, ``attempts`` that failed, ``by`` (a person, or None for
+    the gates), ``when``. Whoever knows which trials are whole spares looking with `committed`.
+    """
+    done = campaign.committed() if committed is None else committed
+    by_person, failed = skipped(campaign), campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    causes: dict[str, list[str]] = {}
+    for item in campaign.quarantined():
+        if str(item["cause"]).startswith("gate") and FORGIVEN not in item:
+            causes.setdefault(item["trial"], []).append(str(item["cause"]))
+    found = []
+    for trial in plan:
+        if trial.id in done:
+            continue
+        attempts, known = failed.get(trial.id, 0), by_person.get(trial.id)
+        if known is not None:
+            cause = known.get("why") or "no reason given"
+        elif attempts > retakes:
+            cause = "; then ".join(dict.fromkeys(causes[trial.id]))
+        else:
+            continue
+        person = known or {}
+        found.append(
+            {"trial": trial.id, "cause": cause, "attempts": attempts,
+             "by": person.get("who"), "when": person.get("when")}
+        )  # fmt: skip
+    return found
+
+
+def describe_campaign(store: Store, order: Order) -> Campaign:
+    """Write what the campaign is; the protocol's analysis and levels may have changed."""
+    campaign = store.campaign(order.campaign)
+    info = {
+        "name": order.campaign,
+        "protocol": order.plan.protocol.name,
+        "experiment": order.plan.protocol.collection.experiment,
+        "collection_hash": order.plan.collection_hash,
+        "rig": order.rig.name,
+        "rig_hash": rig_hash(order.rig_text),
+        "simulated": order.rig.simulated,
+        "scene_level": order.rig.scene.scene.level if order.rig.simulated else None,
+        "enabled": list(order.enable),
+    }
+    campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)
+    return campaign
+
+
+def missing_bytes(order: Order) -> float:
+    """Bytes that the trials still to take are expected to need."""
+    pending = order.wanted(Store(order.store).campaign(order.campaign))
+    done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
+    return plan_bytes(order.rig, order.plan, done)
+
+
+def check_disk(orders: list[Order]) -> int:
+    """Free bytes where the orders' store is or will be.
+
+    Raises:
+        InputError: what is still to be taken does not fit.
+    """
+    return check_space(orders[0].store, sum(missing_bytes(order) for order in orders))
+
+
+def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:
+    """What a campaign holds now: planned = committed + missing."""
+    planned = {trial.id for trial in order.plan}
+    committed = campaign.committed() & planned
+    aside = set_aside(order.plan, campaign)
+    return {
+        "campaign": campaign.name,
+        "planned": len(planned),
+        "committed": len(committed),
+        "quarantined": len(campaign.quarantined()),
+        "set_aside": sorted(item["trial"] for item in aside),
+        "causes": aside,
+        "missing": len(planned) - len(committed),
+        "simulated": order.rig.simulated,
+    }

@@ -1,0 +1,1 @@
+"""The report: its sections, its numbers, and two reports compared."""

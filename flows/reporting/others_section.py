@@ -1,0 +1,197 @@
+"""The report's words on what other programs measured: other skins, and speed against error."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from analysis.pictures.figures_conditions import Share, shares
+from analysis.pictures.report import Figure, Link, Section, Table, percent
+from flows.reporting.report_extras import FILES, command
+from flows.reporting.search_section import search
+from flows.searching import tradeoff_page
+from storage.errors import StoreError
+from storage.store import Store
+
+Json = dict[str, Any]
+
+
+def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> Section:
+    """The network on skins and levels that it never saw."""
+    title = "Other skins, and levels left out"
+    if found is None:
+        return Section(
+            title,
+            ["Not measured in this store. It takes hours:"],
+            commands=[(command(store, "generalisation"), "makes it.")],
+        )
+    groups: dict[str, list[Share]] = {}
+    rows = []
+    for name, row in _checked(found, "generalisation", "results").items():
+        if "left out" in row:
+            rows.append([name, row["left out"], "", "", "", ""])
+            continue
+        group = "other skins" if name.startswith("skin ") else f"without a {name.split()[0]}"
+        groups.setdefault(group, []).append(Share(name, row["share"], row["low"], row["high"]))
+        span = "–"
+        if row["low"] is not None:
+            span = f"{percent(row['low'])} to {percent(row['high'])}"
+        rows.append([name, str(row["trials"]), str(row["n"]), percent(row["share"]), span,
+                     percent(row.get("seen"))])  # fmt: skip
+    strict = summary["kinematic"]["accuracy"]["strict"]
+    pictures = []
+    if groups:
+        drawn = [item for of in groups.values() for item in of]
+        line = None if strict is None else (strict, "this network, its own skin")
+        pictures = [
+            Figure(
+                shares(groups, "windows called rightly (%)", simulated=simulated, line=line),
+                "Strict accuracy with 95 % intervals over trials: of the network on skins that "
+                "differ by the scatter of their making, and of networks trained without one level "
+                "and tested on it. A row left of the dashed line is what was not learned.",
+                "skins",
+                _share_data(drawn),
+            )
+        ]
+    columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
+    return Section(
+        title,
+        ["Made by `python -m benchmarks.generalisation`; the report does not check its age."],
+        pictures,
+        [Table(columns, rows, "Strict accuracy on windows.")],
+    )
+
+
+def in_order(rows: Mapping[str, Json]) -> list[tuple[str, Json]]:
+    """A factor's levels by their number, words after numbers."""
+
+    def place(item: tuple[str, Json]) -> tuple[float, str]:
+        try:
+            return float(item[0].split()[0]), ""
+        except ValueError:
+            return math.inf, item[0]
+
+    return sorted(rows.items(), key=place)
+
+
+def factors(by_factor: Mapping[str, Mapping[str, Json]], strict: float | None,
+            simulated: bool) -> Figure:  # fmt: skip
+    """Accuracy by each factor's levels."""
+    groups = {
+        factor: [
+            Share(level, row["share"], row["low"], row["high"]) for level, row in in_order(rows)
+        ]
+        for factor, rows in by_factor.items()
+    }
+    named = [
+        replace(item, name=f"{factor} {item.name}") for factor, of in groups.items() for item in of
+    ]
+    return Figure(
+        shares(
+            groups, "windows called rightly (%)", simulated=simulated,
+            line=None if strict is None else (strict, "all test windows"),
+        ),
+        "Strict accuracy by each factor's levels, 95 % intervals over trials. Levels whose "
+        "interval lies off the dashed line are easier or harder than the rest.",
+        "accuracy-by-factor",
+        _share_data(named),
+    )  # fmt: skip
+
+
+def _share_data(rows: Sequence[Share]) -> dict[str, Sequence[object]]:
+    return {
+        "name": [row.name for row in rows],
+        "strict accuracy (share)": [row.value for row in rows],
+        "95 % interval, low (share)": [row.low for row in rows],
+        "95 % interval, high (share)": [row.high for row in rows],
+    }
+
+
+def tradeoff(store: Store, found: Mapping[str, Json]) -> Section:
+    """Speed against error of scene, labels and detector, as far as they were measured."""
+    said: list[str] = []
+    tables: list[Table] = []
+    pictures, commands = [], []
+    titles = {"scene": "the scene", "labels": "the labels", "labels_truth": "the labels",
+              "detector": "the detector"}  # fmt: skip
+    for name in titles:
+        if name not in found:
+            commands.append((command(store, name), f"measures {titles[name]}; not done here."))
+    if "scene" in found:
+        pictures.append(_scene(found["scene"], said, tables))
+    for name in ("labels", "labels_truth"):
+        if name in found:
+            tables.append(_figures(name, found[name]))
+    if "detector" in found:
+        try:
+            picture, table = search(found["detector"], bool(found["detector"]["simulated"]))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise _odd("detector", error) from None
+        pictures.append(picture)
+        tables.append(table)
+    pages = {"scene": "the scene's", "detector": "the detector's"}
+    links = []
+    for name, whose in pages.items():
+        file = (store.folder / FILES[name]).with_suffix(".html")
+        if name in found and file.exists():
+            address = os.path.relpath(file, store.folder / "report")
+            links.append(Link(address.replace(os.sep, "/"), f"The whole of {whose} search"))
+    return Section("Speed against error", said, pictures, tables, links, commands)
+
+
+def _scene(numbers: Json, said: list[str], tables: list[Table]) -> Figure:
+    try:
+        section = tradeoff_page.make_sections(numbers)[0]
+        rows = numbers["variants"]
+        errors = list(rows[0]["error"])
+    except (KeyError, IndexError, TypeError) as error:
+        raise _odd("scene", error) from None
+    said.append(f"The scene of {numbers['protocol']} (simulated). {section.text[0]}")
+    tables += section.tables
+    data: dict[str, list[object]] = {
+        "family": [row["family"] for row in rows],
+        "variant": [row["name"] for row in rows],
+        "wall time of a trial (s)": [row["wall_s"] for row in rows],
+    }
+    for key in errors:
+        data[_unit(key)] = [row["error"].get(key) for row in rows]
+    return replace(section.figures[0], name="tradeoff-scene", data=data)
+
+
+def _unit(key: str) -> str:
+    """A heading with its unit from a key that ends with it."""
+    for ending, unit in (("_ms", "ms"), ("_us", "µs")):
+        if key.endswith(ending):
+            return f"{key.removesuffix(ending).replace('_', ' ')} ({unit})"
+    return f"{key.replace('_', ' ')} (share)"
+
+
+def _figures(name: str, line: Json) -> Table:
+    """A benchmark's figures; their units are in their names."""
+    rows = [
+        [key, f"{value:.4g}"]
+        for key, value in _checked(line, name, "figures").items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    ]
+    words = {
+        "labels": "Following the markers: how much faster than OpenCV, and how far off (pixels)",
+        "labels_truth": "Labels against the simulation's truth (simulated)",
+    }
+    return Table(("figure, its unit in its name", "value"), rows, f"{words[name]}.")
+
+
+def _checked(found: Json, name: str, key: str) -> Json:
+    inner = found.get(key)
+    if not isinstance(inner, dict):
+        raise _odd(name, KeyError(key))
+    return inner
+
+
+def _odd(name: str, error: Exception) -> StoreError:
+    return StoreError(
+        f"{FILES[name]}: is not of the shape that this version reads ({error!r}); delete "
+        "it, or make it again"
+    )

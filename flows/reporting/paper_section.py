@@ -1,0 +1,115 @@
+"""The report's figures beside those of the paper, in one table, and what that comparison is worth.
+
+The paper's were measured on a real robot with a real skin. Nothing here says that a simulated
+figure near a published one is right, or that one far from it is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from analysis.pictures.figures import CLASS_WORDS
+from analysis.pictures.published import PAPER
+from analysis.pictures.report import Section, Table, number, percent
+
+Json = dict[str, Any]
+
+_COLUMNS = ("figure", "paper", "here", "95 % over trials", "n")
+
+
+def section(summary: Json) -> Section:
+    """Every published figure beside this one's."""
+    kind = "simulated" if summary["simulated"] else "measured on this rig"
+    words = "here" if not summary["simulated"] else "here (simulated)"
+    columns = [*_COLUMNS[:2], words, *_COLUMNS[3:]]
+    return Section(
+        "Beside the paper",
+        [
+            "The paper's figures were measured by its authors on their own robot and skin; those "
+            f"of this report are {kind}. They are different things of the same name: a figure that "
+            "agrees proves nothing about the other, and where they differ either may be right.",
+        ],
+        (),
+        [
+            Table(
+                columns, [*_windows(summary), *_times(summary)],
+                "Intervals draw whole trials again, windows of a trial together. Accuracy of raw "
+                "spike counts, ties shared.",
+            )
+        ],
+    )  # fmt: skip
+
+
+def _windows(summary: Json) -> list[list[str]]:
+    kinematic = summary["kinematic"]
+    known = kinematic["window_intervals"]
+    rows = []
+    for name, title, value in (
+        ("accuracy", "test accuracy of windows", kinematic["accuracy"]["argmax"]),
+        ("incipient_precision", "incipient precision", kinematic["precision"]["incipient"]),
+        ("incipient_recall", "incipient recall", kinematic["recall"]["incipient"]),
+    ):
+        row = known.get(name)
+        span, count = "–", "–"
+        if row is not None and row["low"] is not None:
+            span = f"{percent(row['low'])} to {percent(row['high'])}"
+        if row is not None:
+            count = f"{row['n']} windows, {row['trials']} trials"
+        rows.append([title, PAPER[name].text, percent(value), span, count])
+    rows.append(["most confused pair", PAPER["confused"].text, *_confused(kinematic["confusion"])])
+    return rows
+
+
+def _confused(confusion: Sequence[Sequence[int]]) -> list[str]:
+    """The two classes that are most often taken for each other."""
+    pairs = {(a, b): confusion[a][b] + confusion[b][a] for a in range(3) for b in range(a + 1, 3)}
+    a, b = max(pairs, key=lambda pair: pairs[pair])
+    if not pairs[a, b]:
+        return ["none", "–", "–"]
+    return [f"{CLASS_WORDS[a]} and {CLASS_WORDS[b]}", "–", f"{pairs[a, b]} windows"]
+
+
+def _times(summary: Json) -> list[list[str]]:
+    rows = []
+    kinematic = summary["kinematic"]
+    for kind in ("incipient", "gross"):
+        found = kinematic["latency_ms"][kind]
+        span = kinematic["intervals"][f"latency_{kind}_ms"]["mean"]
+        rows.append(
+            [
+                f"kinematic latency, {kind}, mean",
+                f"{PAPER[f'{kind}_latency'].text} after onset",
+                number(found["mean"], 0, "ms"),
+                _span(span),
+                f"{found['n']} trials; {found['missed']} missed, {found['false_early']} early",
+            ]
+        )
+    lead, accounts = summary["gravity"]["lead_ms"], summary["gravity"]["accounted"]
+    if accounts["planned"]:
+        first = accounts["detected_first"]
+        rows.append(
+            [
+                "gravity lead, smallest",
+                PAPER["gravity_lead"].text,
+                number(lead["min"], 0, "ms"),
+                "–",
+                f"{first} of {accounts['planned']} trials detected first",
+            ]
+        )
+    lead, accounts = summary["disturbance"]["lead_ms"], summary["disturbance"]["accounted"]
+    if accounts["planned"]:
+        rows.append(
+            [
+                "disturbance lead, mean ± standard deviation",
+                PAPER["disturbance_lead"].text,
+                f"{number(lead['mean'], 0)} ± {number(lead['std'], 0, 'ms')}",
+                _span(summary["disturbance"]["intervals"]["lead_ms"]["mean"]),
+                f"{accounts['detected_first']} of {accounts['planned']} trials detected first",
+            ]
+        )
+    return rows
+
+
+def _span(span: Sequence[float] | None) -> str:
+    return "–" if span is None else f"{span[0]:.0f} to {span[1]:.0f} ms"

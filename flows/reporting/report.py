@@ -1,0 +1,153 @@
+"""The report: `report/index.html` for people and `report/summary.json` for programs.
+
+Every figure also stands beside them as `report/figures/NAME.svg`, its data as
+`report/data/NAME.csv`; the page needs neither, nor anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+
+from analysis.nets import model_file
+from analysis.pictures import report as page
+from flows.labelling import label_errors
+from flows.learning import evaluate
+from flows.learning.train import wanted_models
+from flows.learning.window_baselines import fresh_keys
+from flows.reporting import report_against_page as against_page
+from flows.reporting import sections
+from flows.reporting.report_against import compare, load_other
+from flows.reporting.report_extras import extras
+from flows.reporting.summary import make_summary
+from flows.running import timing
+from flows.running.campaigns import Collected
+from flows.running.orchestration import Parcel, run
+from flows.syncing.sync_page import PAGE as CLOCKS
+from storage.derived import Derived, make_key
+from storage.files import make_folder, read_json, write_json, write_text
+from storage.store import Store, StoreError, safe_name
+
+STEP = "report"
+VERSION = 5
+
+
+def report_folder(store: Store) -> Path:
+    """Where the report stands."""
+    return store.folder / "report"
+
+
+def _key(store: Store, campaigns: list[Collected]) -> str:
+    """What the report is made of: the evaluation, all that was collected, a page to link to.
+
+    Raises:
+        StoreError: there is no evaluation yet.
+    """
+    evaluated = Derived.of(store, evaluate.STEP).key(evaluate.NAME)
+    if evaluated is None:
+        raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+    collected = [
+        [
+            item.name,
+            item.plan.collection_hash,
+            len(item.campaign.quarantined()),
+            [recording.checksum for _, recording in item.trials],
+        ]
+        for item in campaigns
+    ]
+    clocks = (report_folder(store) / CLOCKS).exists()
+    # commands in the page name the store's folder
+    where = str(store.folder.resolve())
+    checked = Derived.of(store, label_errors.CHECK).key(label_errors.CHECK)
+    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store), checked, where]
+    return make_key(STEP, VERSION, inputs, None)
+
+
+@flow(name="report", validate_parameters=False, persist_result=False)
+def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
+    """Write page and summary; the summary last, with the key."""
+    store, campaigns, key = wanted.content
+    folder = report_folder(store)
+    folder.mkdir(parents=True, exist_ok=True)
+    with timing.timed(store, "report"):
+        evaluation = Derived.of(store, evaluate.STEP).read(evaluate.NAME)
+        model = evaluate.choose_model(
+            wanted_models(store, campaigns, evaluation.get("reviewed") is not None)
+        )
+        fitted = model_file.load(model.path)
+        summary = make_summary(store, campaigns, evaluation)
+        made = sections.make_sections(
+            sections.Material(store, campaigns, evaluation, summary, fitted, extras(store))
+        )
+        write_figures(folder, made, simulated=summary["simulated"])
+        html = page.render(
+            [item.name for item in campaigns],
+            sections.headline(summary),
+            made,
+            simulated=summary["simulated"],
+        )
+        write_text(folder / "index.html", html)
+    summary["timing_s"] = timing.read(store)
+    write_json(folder / "summary.json", summary)
+    Derived.of(store, STEP).write(STEP, key, {})
+
+
+def write_figures(folder: Path, made: Sequence[page.Section], *, simulated: bool) -> None:
+    """Each named figure and its data as files of their own; those of an older report go.
+
+    Raises:
+        ValueError: two figures of one name.
+    """
+    named = [figure for section in made for figure in section.figures if figure.name]
+    if len({figure.name for figure in named}) < len(named):
+        raise ValueError(f"two figures of one name among {[figure.name for figure in named]}")
+    kept: set[Path] = set()
+    for figure in named:
+        name = safe_name(figure.name)
+        files = {
+            folder / "figures" / f"{name}.svg": figure.svg,
+            folder / "data" / f"{name}.csv": page.csv_text(figure.data, simulated=simulated),
+        }
+        for path, text in files.items():
+            make_folder(path.parent)
+            write_text(path, text)
+            kept.add(path)
+    for old in (*(folder / "figures").glob("*.svg"), *(folder / "data").glob("*.csv")):
+        if old not in kept:
+            old.unlink()
+
+
+def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Write the report if anything it shows has changed."""
+    key = _key(store, campaigns)
+    stale = (
+        not Derived.of(store, STEP).fresh(STEP, key)
+        or not (report_folder(store) / "index.html").exists()
+    )
+    if stale:
+        run(report_flow, Parcel((store, campaigns, key)))
+    return {"step": "report", "done": int(stale), "fresh": int(not stale)}
+
+
+def against(store: Store, other: Path) -> dict[str, Any]:
+    """Hold the last report against another one, and write `report/against.html` about it.
+
+    Args:
+        other: a store with a report, or its ``summary.json``.
+
+    Raises:
+        InputError: there is no such report.
+    """
+    theirs = load_other(other)
+    compared = compare(read_summary(store), theirs)
+    path = report_folder(store) / against_page.PAGE
+    write_text(path, against_page.render(compared, store.folder, other))
+    return {**compared, "page": str(path)}
+
+
+def read_summary(store: Store) -> dict[str, Any]:
+    """The numbers of the last report."""
+    return read_json(report_folder(store) / "summary.json")

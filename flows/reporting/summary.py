@@ -1,0 +1,176 @@
+"""The numbers of a report as one JSON: keys that other programs may rely on (docs/summary.md)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from importlib.metadata import version
+from typing import Any
+
+from flows.labelling.label_errors import read_check
+from flows.learning.window_baselines import EVALUATION, beside
+from flows.learning.window_scores import window_intervals
+from flows.planning.estimate import plan_bytes
+from flows.reporting.campaign_section import reference_rows, wear
+from flows.reporting.report_trials import accounted, intervals, told
+from flows.running import timing
+from flows.running.campaigns import Collected, training_campaigns
+from rigs.rig_file import load_rig_file
+from storage.derived import Derived
+from storage.store import Store
+
+_PACKAGES = (
+    "sliplab",
+    "numpy",
+    "numba",
+    "scipy",
+    "torch",
+    "sinabs",
+    "prefect",
+    "pandas",
+    "h5py",
+    "opencv-contrib-python-headless",
+    "scikit-learn",
+)
+_WINDOWS = (
+    "interval",
+    "seeds",
+    "reliability",
+    "calibration",
+    "by_factor",
+    "by_tenth",
+    "no_slip",
+    "by_trial",
+    "work",
+    "beside",
+)
+"""What the summary takes over from the evaluation's windows as it is; docs/metrics.md."""
+
+
+def make_summary(
+    store: Store, campaigns: list[Collected], evaluation: dict[str, Any]
+) -> dict[str, Any]:
+    """Everything `summary.json` says; only `timing_s` differs between equal runs."""
+    windows, experiments = evaluation["windows"], evaluation["experiments"]
+    kinematic = {
+        "accuracy": windows["accuracy"],
+        "confusion": windows["confusion"],
+        "precision": windows["precision"],
+        "recall": windows["recall"],
+        "baselines": windows["baselines"],
+        "samples": windows["samples"],
+        "trained_baselines": beside(store),
+        **{name: windows[name] for name in _WINDOWS},
+        "window_intervals": window_intervals(store, Derived.of(store, EVALUATION).key(EVALUATION)),
+        **experiments["kinematic"],
+    }
+    return {
+        "simulated": store.simulated,
+        "kinematic": {**kinematic, **_judged(campaigns, evaluation, "kinematic")},
+        "gravity": {**experiments["gravity"], **_judged(campaigns, evaluation, "gravity")},
+        "disturbance": {
+            **experiments["disturbance"],
+            **_judged(campaigns, evaluation, "disturbance"),
+        },
+        "trials": [told(row) for row in evaluation["trials"]],
+        "references": _references(store, campaigns),
+        "labels": {
+            "error_ms": evaluation["label_error_ms"],
+            "rules_ms": evaluation["label_rules_ms"],
+            "source": _sources(campaigns),
+            "reviewed": evaluation.get("reviewed"),
+            "check": read_check(store),
+        },
+        "detection": evaluation["detection"],
+        "choices": evaluation["choices"],
+        "detectors": evaluation["detectors"],
+        "sync": _sync(campaigns),
+        "quality": _quality(campaigns),
+        "planned": {item.name: _planned(item) for item in campaigns},
+        "timing_s": timing.read(store),
+        "versions": {name: version(name) for name in _PACKAGES},
+        "protocols": {
+            item.name: {
+                "collection": item.plan.collection_hash,
+                "analysis": item.plan.analysis_hash,
+            }
+            for item in campaigns
+        },
+        "seeds": {
+            "network": list(training_campaigns(campaigns)[0].settings.training.seeds),
+            "chosen": evaluation["seed"],
+            "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
+        },
+    }
+
+
+def _judged(
+    campaigns: list[Collected], evaluation: dict[str, Any], experiment: str
+) -> dict[str, Any]:
+    """What became of an experiment's trials, and how sure its figures are."""
+    rows = evaluation["trials"]
+    return {
+        "accounted": accounted(campaigns, rows, experiment),
+        "intervals": intervals([told(row) for row in rows if row["experiment"] == experiment]),
+    }
+
+
+def _references(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Wear by campaign, of those that take reference trials."""
+    found = {item.name: reference_rows(store, item) for item in campaigns}
+    return {name: {"trials": rows, "wear": wear(rows)} for name, rows in found.items() if rows}
+
+
+def _sources(campaigns: list[Collected]) -> dict[str, int]:
+    """How many trials there are with a video, and with tracks in its place."""
+    found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
+    return {name: found[name] for name in ("video", "tracks")}
+
+
+def _sync(campaigns: list[Collected]) -> dict[str, Any]:
+    """How the trials' devices were timed, and the worst uncertainty of events against each."""
+    grades: dict[str, set[str]] = {}
+    worst: dict[str, float] = {}
+    for item in campaigns:
+        for _, recording in item.trials:
+            clocks = recording.clocks
+            for device in ("events", "frames", "arm"):
+                if device in clocks:
+                    grades.setdefault(device, set()).add(clocks[device]["grade"])
+                    both = clocks[device]["uncertainty_ns"]
+                    both += clocks["events"]["uncertainty_ns"] if device != "events" else 0.0
+                    worst[device] = max(worst.get(device, 0.0), both / 1e3)
+    named = {device: " or ".join(sorted(found)) for device, found in grades.items()}
+    return {
+        "grade": named.get("frames", named.get("arm")),
+        "grades": named,
+        "worst_uncertainty_us": max(worst.values(), default=None),
+        "worst_against_events_us": worst,
+    }
+
+
+def _quality(campaigns: list[Collected]) -> dict[str, Any]:
+    aside = [known for item in campaigns for known in item.campaign.quarantined()]
+    return {
+        "planned": sum(len(item.plan) for item in campaigns),
+        "committed": sum(len(item.trials) for item in campaigns),
+        "retaken": sum(str(known["cause"]).startswith("gate") for known in aside),
+        "quarantined": len(aside),
+    }
+
+
+def _planned(item: Collected) -> dict[str, Any]:
+    """The plan's seconds and bytes beside what the committed trials really took."""
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml")
+    done = {trial.id for trial, _ in item.trials}
+    missing = {trial.id for trial in item.plan} - done
+    return {
+        "seconds": sum(item.plan.seconds(trial) for trial, _ in item.trials),
+        "seconds_collected": sum(r.record["motion_s"] for _, r in item.trials),
+        "bytes": round(plan_bytes(rig, item.plan, missing)),
+        "bytes_collected": sum(
+            path.stat().st_size
+            for _, r in item.trials
+            for path in r.folder.iterdir()
+            if path.name != "provenance.json"
+        ),
+    }

@@ -1,0 +1,113 @@
+"""Serves the review page on this computer only, until somebody ends it.
+
+Whoever can reach the page can decide, so: it listens on the loopback address, stands under a path
+that nobody can guess, is listed nowhere, and answers no other page's scripts (the Origin of the
+connection that carries everything is checked).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.server import Server
+from tornado.ioloop import IOLoop
+
+from flows.reviewing.review_list import TrialList
+from flows.reviewing.review_page import Page
+from protocols.errors import InputError
+from storage.process import user_name
+from storage.store import Store
+
+HOST = "127.0.0.1"
+_KEEP_MS = 60_000
+"""A tab that was closed is forgotten after this long."""
+
+
+@contextmanager
+def serving(
+    store: Store, campaigns: Sequence[str] = (), port: int = 0, who: str = ""
+) -> Iterator[tuple[str, TrialList]]:
+    """Serve the page in this thread's event loop while the block runs.
+
+    Args:
+        port: 0 takes a free one.
+
+    Yields:
+        the page's address, and the list of trials.
+
+    Raises:
+        InputError: the port is taken, or a campaign is unknown.
+        StoreError: a campaign is damaged.
+    """
+    trials = TrialList(store, campaigns)
+    with ThreadPoolExecutor(1, thread_name_prefix="review") as pool:
+
+        def make(doc: Document) -> None:
+            Page(doc, trials, pool, who or user_name())
+
+        path = f"/{secrets.token_urlsafe(24)}"
+        server = _server(path, make, port)
+        try:
+            server.start()
+            yield f"http://{HOST}:{server.port}{path}", trials
+        finally:
+            server.stop(wait=True)
+            server.unlisten()
+
+
+def _server(path: str, make: Callable[[Document], None], port: int) -> Server:
+    application = Application(FunctionHandler(make, trap_exceptions=True))
+    try:
+        # looked at before: the server does not close a socket that it could not bind
+        with socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind((HOST, port))
+        return Server(
+            {path: application},
+            io_loop=IOLoop.current(),
+            address=HOST,
+            port=port,
+            # Bokeh puts the port that was taken in place of 0
+            allow_websocket_origin=[f"{HOST}:{port}"],
+            use_index=False,
+            redirect_root=False,
+            generate_session_ids=True,
+            unused_session_lifetime_milliseconds=_KEEP_MS,
+            check_unused_sessions_milliseconds=_KEEP_MS // 4,
+        )
+    except OSError as error:
+        raise InputError("--port", "", port, f"cannot be listened on: {error.strerror}") from None
+
+
+def serve(
+    store: Store,
+    campaigns: Sequence[str],
+    port: int,
+    who: str,
+    ready: Callable[[str, TrialList], None],
+) -> None:
+    """Serve until the program is interrupted.
+
+    Args:
+        ready: told the page's address once it can be opened.
+
+    Raises:
+        KeyboardInterrupt: the way it ends.
+    """
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    try:
+        with serving(store, campaigns, port, who) as (address, trials):
+            ready(address, trials)
+            loop.run_forever()
+    finally:
+        asyncio.set_event_loop(None)
+        loop.close()

@@ -1,0 +1,277 @@
+"""What of a trial goes to Rerun, under which name; whole columns at a time.
+
+events/on, events/off      points, a row a bin of 5 ms; events/counts in their place where there
+                           are too many: pictures of how many events fell on 2 x 2 pixels
+events/rate                events a second
+camera, camera/markers     frames (JPEG), the markers in them; camera/plate the plate's marker
+arm                        tool centre point as a transform; arm/path; arm/x, y, z in mm
+pulses/sync_box, events, arm
+displacement/marker_N      px
+onsets/NAME                0 before, 1 after the incipient, 2 after the gross onset, of the label,
+                           the review and (simulated) the truth; onset_log in words
+network/no_slip ...        spike counts of the evaluated network
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from analysis.nets.dataset import recorded_span
+from analysis.nets.metrics import CLASSES
+from flows.labelling.label import STEP as LABELS
+from flows.labelling.label import label_key
+from flows.labelling.reviewed import state_of
+from flows.reviewing.review_trial import event_rate
+from flows.reviewing.view import TIMELINE, Subject
+from storage import review
+from storage.derived import Derived
+from storage.streams import I64, EventChunk, Json
+
+BIN_NS = 5_000_000
+MOST_POINTS = 5_000_000
+"""More events than this become pictures; as points they would take 40 MB and more."""
+MOST_PICTURES = 1000
+POOL = 2
+MOST_FRAMES = 2000
+"""Of more frames than this, every second, third, ... is taken."""
+_QUALITY = 90
+COUNTS = "counts"
+
+
+class _Columns:
+    """Sends columns over the trial's time line."""
+
+    def __init__(self, library: ModuleType, stream: Any) -> None:
+        self.rr, self._stream = library, stream
+        self.sent: dict[str, int] = {}
+
+    def send(self, path: str, time_ns: I64, columns: Any, count: str = "") -> None:
+        """Rows at times; `count` is the name under which they are counted."""
+        if len(time_ns):
+            index = self.rr.TimeColumn(TIMELINE, duration=time_ns.astype("timedelta64[ns]"))
+            self._stream.send_columns(path, indexes=[index], columns=columns)
+        if count:
+            self.sent[count] = self.sent.get(count, 0) + len(time_ns)
+
+    def scalars(self, path: str, time_ns: I64, values: Any, count: str = "") -> None:
+        """A curve."""
+        self.send(path, time_ns, self.rr.Scalars.columns(scalars=np.asarray(values, float)), count)
+
+    def once(self, path: str, *what: Any) -> None:
+        """Something that does not change."""
+        self._stream.log(path, *what, static=True)
+
+
+def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
+    """Send all of a trial to a recording stream; how many there are of what."""
+    recording = subject.recording
+    to = _Columns(library, stream)
+    derived = Derived.of(subject.store, LABELS, subject.item.name)
+    key = label_key(recording, subject.item.settings.labelling)
+    fresh = derived.fresh(subject.trial, key)
+    label = derived.read(subject.trial) if fresh else {}
+    arrays = derived.arrays(subject.trial) if fresh else {}
+    condition = ", ".join(f"{name} {text}" for name, text in recording.record["condition"].items())
+    told = "**simulated**" if recording.simulated else "recorded"
+    text = f"# {condition}\n\n{told}\n\n{subject.item.name} / {subject.trial}"
+    document = library.TextDocument(text, media_type=library.MediaType.MARKDOWN)
+    to.once("trial", document)
+    _events(to, subject)
+    _frames(to, subject, arrays)
+    _arm(to, subject)
+    _pulses(to, subject)
+    if "displacement_px" in arrays:
+        for marker, values in enumerate(arrays["displacement_px"].T):
+            there = np.isfinite(values)
+            to.scalars(f"displacement/marker_{marker}", arrays["frame_ns"][there], values[there])
+    _onsets(to, subject, label, key)
+    _network(to, subject)
+    return to.sent
+
+
+def _events(to: _Columns, subject: Subject) -> None:
+    recording = subject.recording
+    events = recording.events()
+    clock = recording.clock("events")
+    time_ns = np.asarray(clock.to_reference(events.t_us * 1000))
+    to.sent["events"] = len(events)
+    if len(events) <= MOST_POINTS:
+        for name, polarity in (("on", 1), ("off", 0)):
+            _points(to, f"events/{name}", events, time_ns, events.p == polarity)
+    else:
+        _pictures(to, recording.record["geometry"]["event_px"], events, time_ns)
+    start, end = recorded_span(recording)
+    rate_s, rate = event_rate(recording, start, end)
+    to.scalars("events/rate", np.round(rate_s * 1e9).astype(np.int64), rate)
+
+
+def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: Any) -> None:
+    """Events of one polarity, a row a bin, at the time of the bin's first event."""
+    times, x, y = time_ns[which], events.x[which], events.y[which]
+    if not len(times):
+        return
+    bins = times // BIN_NS
+    first = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
+    lengths = np.diff(first, append=len(times))
+    places = np.stack([x, y], axis=1).astype(np.float32)
+    columns = to.rr.Points2D.columns(positions=places).partition(lengths)
+    to.send(path, times[first], columns)
+
+
+def _pictures(to: _Columns, size: list[int], events: EventChunk, time_ns: I64) -> None:
+    """Counts of events on pooled pixels, uint16, in so many bins of equal length."""
+    shape = (-(-size[1] // POOL), -(-size[0] // POOL))
+    length = max(BIN_NS, -(-int(time_ns[-1] - time_ns[0] + 1) // MOST_PICTURES))
+    cell = (events.y // POOL).astype(np.int64) * shape[1] + events.x // POOL
+    edges = np.arange(int(time_ns[0]), int(time_ns[-1]) + 1, length)
+    cuts = [*np.searchsorted(time_ns, edges), len(time_ns)]
+    for low, high, edge in zip(cuts[:-1], cuts[1:], edges, strict=True):
+        counted = np.bincount(cell[low:high], minlength=shape[0] * shape[1]).reshape(shape)
+        picture = np.minimum(counted, 65_535).astype(np.uint16)
+        form = to.rr.components.ImageFormat(
+            width=shape[1], height=shape[0], color_model="L", channel_datatype="U16"
+        )
+        columns = to.rr.Image.columns(buffer=[picture.tobytes()], format=[form])
+        to.send("events/counts", np.array([edge], np.int64), columns, "event_pictures")
+
+
+def _frames(to: _Columns, subject: Subject, arrays: dict[str, Any]) -> None:
+    recording = subject.recording
+    if recording.frame_source == "none":
+        return
+    time_ns = recording.frame_times()
+    every = -(-len(time_ns) // MOST_FRAMES) or 1
+    if recording.has_video:
+        for index, image in enumerate(recording.frames(threads=2)):
+            if index % every or index >= len(time_ns):
+                continue
+            done, packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            if not done:
+                raise RuntimeError(f"frame {index} cannot be packed")
+            columns = to.rr.EncodedImage.columns(blob=[packed.tobytes()], media_type=["image/jpeg"])
+            to.send("camera", time_ns[index : index + 1], columns, "frames")
+    places, plate = arrays.get("xy_px"), arrays.get("plate_px")
+    if places is None and recording.has_tracks:
+        tracks = recording.tracks()
+        places, plate = tracks.markers_px, tracks.plate_px
+    if places is not None:
+        _markers(to, "camera/markers", time_ns, places)
+        to.sent["tracked_frames"] = len(places)
+    if plate is not None:
+        _markers(to, "camera/plate", time_ns, plate[:, None])
+
+
+def _markers(to: _Columns, path: str, time_ns: I64, places: Any) -> None:
+    """Places of those that were seen, a row a frame; markers keep their number as class."""
+    seen = np.isfinite(places).all(axis=2)
+    numbers = np.broadcast_to(np.arange(places.shape[1], dtype=np.uint16), seen.shape)[seen]
+    columns = [
+        *to.rr.Points2D.columns(positions=places[seen].astype(np.float32), class_ids=numbers)
+        .partition(seen.sum(axis=1))
+    ]  # fmt: skip
+    to.send(path, time_ns, columns)
+
+
+def _arm(to: _Columns, subject: Subject) -> None:
+    recording = subject.recording
+    with recording.open() as reader:
+        poses = reader.poses()
+    time_ns = np.asarray(recording.clock("arm").to_reference(poses.t_ns))
+    if not len(time_ns):
+        return
+    turned = np.deg2rad(poses.rotvec_deg)
+    angle = np.linalg.norm(turned, axis=1)
+    axis = np.divide(turned, angle[:, None], out=np.zeros_like(turned), where=angle[:, None] > 0)
+    half = np.concatenate([axis * np.sin(angle / 2)[:, None], np.cos(angle / 2)[:, None]], axis=1)
+    columns = to.rr.Transform3D.columns(translation=poses.xyz_mm, quaternion=half)
+    to.send("arm/tool", time_ns, columns, "poses")
+    to.once("arm/tool/axes", to.rr.TransformAxes3D(axis_length=10.0))
+    to.once("arm/path", to.rr.LineStrips3D([poses.xyz_mm]))
+    for name, values in zip("xyz", poses.xyz_mm.T, strict=True):
+        to.scalars(f"arm/{name}_mm", time_ns, values)
+
+
+def _pulses(to: _Columns, subject: Subject) -> None:
+    recording = subject.recording
+    with recording.open() as reader:
+        seen = {name: reader.pulses(f"{name}_pulses") for name in ("sync", "event", "arm")}
+    seen["event"], seen["arm"] = (
+        np.asarray(recording.clock(device).to_reference(seen[name]))
+        for name, device in (("event", "events"), ("arm", "arm"))
+    )
+    for height, (name, title) in enumerate(
+        (("sync", "sync_box"), ("event", "events"), ("arm", "arm"))
+    ):
+        path = f"pulses/{title}"
+        to.once(path, to.rr.SeriesPoints(markers="up", names=title))
+        to.scalars(path, seen[name], np.full(len(seen[name]), float(height)), f"pulses_{title}")
+
+
+def _onsets(to: _Columns, subject: Subject, label: Json, key: str) -> None:
+    recording = subject.recording
+    known = {"label": label}
+    decision = review.last(subject.store, subject.item.name, subject.trial)
+    if decision is not None and state_of(decision, key) in {"accepted", "adjusted"}:
+        known["review"] = vars(decision.new)
+    truth = recording.simulation_truth()
+    if truth is not None:
+        known["truth_simulated"] = truth
+    start, _ = recorded_span(recording)
+    times, texts = [], []
+    for name, onsets in known.items():
+        found = {kind: onsets.get(f"{kind}_ns") for kind in ("incipient", "gross")}
+        there = [(t, kind) for kind, t in found.items() if t is not None]
+        curve = np.array([start, *(t for t, _ in there)], np.int64)
+        to.scalars(f"onsets/{name}", curve, [0, *(1 + (k == "gross") for _, k in there)])
+        to.once(f"onsets/{name}", to.rr.SeriesLines(names=name.replace("_", " ")))
+        for time, kind in there:
+            times.append(time)
+            texts.append(f"{kind} onset: {name.replace('_', ', ')}")
+    if decision is not None:
+        to.once("review", to.rr.TextDocument(f"{decision}: {state_of(decision, key)}"))
+    order = np.argsort(times, kind="stable")
+    columns = to.rr.TextLog.columns(text=[texts[i] for i in order])
+    to.send("onset_log", np.asarray(times, np.int64)[order], columns, "onsets")
+
+
+def _network(to: _Columns, subject: Subject) -> None:
+    """Spike counts, where the trial was evaluated."""
+    counted = Derived.of(subject.store, COUNTS, subject.item.name)
+    if counted.key(subject.trial) is None:
+        return
+    arrays = counted.arrays(subject.trial)
+    for name, values in zip(CLASSES, arrays["counts"].T, strict=True):
+        to.scalars(f"network/{name}", arrays["end_ns"], values)
+    to.sent["windows"] = len(arrays["end_ns"])
+
+
+def blueprint(library: ModuleType) -> Any:
+    """What stands where in the viewer."""
+    views = library.blueprint
+    curves = [
+        views.TimeSeriesView(origin=f"/{path}", name=name)
+        for path, name in (
+            ("displacement", "displacement (px)"), ("events/rate", "events (1/s)"),
+            ("onsets", "onsets: 1 incipient, 2 gross"), ("network", "network, spikes a window"),
+            ("pulses", "sync pulses"),
+        )
+    ]  # fmt: skip
+    pictures = [
+        views.Spatial2DView(origin="/camera", name="outside camera, markers"),
+        views.Spatial2DView(origin="/events", name="events"),
+        views.Spatial3DView(origin="/arm", name="arm (mm)"),
+    ]
+    words = views.Horizontal(
+        views.TextDocumentView(origin="/trial"), views.TextLogView(origin="/onset_log")
+    )
+    return views.Blueprint(
+        views.Vertical(
+            views.Horizontal(*pictures), views.Vertical(*curves), words, row_shares=[4, 5, 1]
+        ),
+        views.TimePanel(timeline=TIMELINE),
+        collapse_panels=True,
+    )

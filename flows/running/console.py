@@ -1,0 +1,141 @@
+"""What a person or a program sees: tables and progress on standard error, one JSON on output.
+
+With ``--json`` a command prints exactly one JSON object on standard output and everything else on
+standard error. Without it, results are tables for people.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.box import SIMPLE, SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from flows.running import stopping
+from storage.secrets import masked
+
+DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+messages = Console(stderr=True, highlight=False, soft_wrap=True)
+results = Console(highlight=False)
+
+
+def say(text: str) -> None:
+    """A line for people."""
+    messages.print(masked(text), markup=False)
+
+
+def print_json(data: Any) -> None:
+    """The one JSON object of a command."""
+    sys.stdout.write(json.dumps(data, allow_nan=False, ensure_ascii=False) + "\n")
+    sys.stdout.flush()
+
+
+def print_table(
+    title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, limit: int = 0
+) -> None:
+    """A table; with a `limit`, the middle of a long one is left out and counted."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    left_out = len(rows) - limit if limit and len(rows) > limit else 0
+    head = limit // 2 if left_out else len(rows)
+    for row in rows[:head]:
+        table.add_row(*(_cell(item) for item in row))
+    if left_out:
+        table.add_row(f"... {left_out} more", *("" for _ in columns[1:]))
+        for row in rows[len(rows) - (limit - head) :]:
+            table.add_row(*(_cell(item) for item in row))
+    results.print(table)
+
+
+def print_pairs(title: str, pairs: Mapping[str, object]) -> None:
+    """Names and values, one pair a line."""
+    table = Table(title=title, title_justify="left", show_header=False, box=SIMPLE)
+    for name, value in pairs.items():
+        table.add_row(name, _cell(value))
+    results.print(table)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+class Bar:
+    """A progress bar's handle."""
+
+    def __init__(self, progress: Progress, task: Any) -> None:
+        self._progress, self._task = progress, task
+
+    def advance(self, count: float = 1, note: str = "", left: str = "") -> None:
+        """`count` more are done; a stop request is answered here.
+
+        Args:
+            left: the time that is left in words, for a bar that was told it would be.
+
+        Raises:
+            KeyboardInterrupt: somebody asked the program to stop.
+        """
+        stopping.check()
+        self._progress.update(self._task, advance=count, note=note, left=left)
+
+    def extend(self, count: float) -> None:
+        """`count` more are to be done than it was thought."""
+        for task in self._progress.tasks:
+            if task.id == self._task:
+                self._progress.update(self._task, total=(task.total or 0) + count)
+
+
+@contextmanager
+def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
+    """A progress bar on standard error while the block runs.
+
+    Args:
+        left: the time that is left in words, where the caller knows better than a count would.
+    """
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn() if left is None else TextColumn("{task.fields[left]}"),
+        TextColumn("{task.fields[note]}"),
+        console=messages,
+        transient=not messages.is_terminal,
+    )
+    with progress:
+        yield Bar(progress, progress.add_task(title, total=total, note="", left=left or ""))
+
+
+def duration(seconds: float) -> str:
+    """``3 h 05 min``, ``4 min 10 s`` or ``12 s``."""
+    whole = round(seconds)
+    if whole >= 3600:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole // 60} min {whole % 60:02d} s" if whole >= 60 else f"{whole} s"
+
+
+def size(count: float) -> str:
+    """``3.2 GB``: decimal units."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if count < 1000 or unit == "TB":
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    raise AssertionError("unreachable")

@@ -1,0 +1,164 @@
+"""The embedded Prefect server as a process of ours: it survives Ctrl-C and dies with its parent.
+
+Prefect's own embedded server shares the terminal's process group, so Ctrl-C takes it away while
+the flow still has to tell it that it crashed (a minute of retries), and it outlives a killed
+parent. This one leads a session of its own, and the kernel ends it when its parent dies.
+
+It starts while its parent does other things: only asking for its `url` waits for it. What it leaves
+out, so that it keeps up with short trials, stands in `LEAN` (docs/decisions/0039).
+
+Run as a module it is the server; imported it starts one.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from flows.running import garbage
+
+START_LIMIT_S = 120.0
+STOP_LIMIT_S = 10.0
+LEAN = {
+    # the feed of events, and what could be set off by them: runs, tasks and states are kept
+    "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
+    "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
+    # task runs are written many at once, and a second later at most
+    "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_BATCH_SIZE": "100",
+    "PREFECT_SERVER_SERVICES_TASK_RUN_RECORDER_FLUSH_INTERVAL": "1",
+    # types of blocks are for things that are set up on a page
+    "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+}
+"""Settings of a server without a page; what the user has set in the environment counts more."""
+_HEADLESS = {"PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
+_PR_SET_PDEATHSIG = 1
+
+
+class ServerError(RuntimeError):
+    """The embedded server did not start; the message says where its log is."""
+
+
+class EmbeddedServer:
+    """One server on a port of the loopback, its log in Prefect's home.
+
+    Args:
+        port: where; 0 for a free one.
+        page: whether it has Prefect's page, and all of its services with it.
+
+    Raises:
+        ServerError: the port is taken, or it did not start.
+    """
+
+    def __init__(self, home: Path, port: int = 0, *, page: bool = False) -> None:
+        self._log = home / "server.log"
+        kind = {"PREFECT_UI_ENABLED": "1"} if page else {**LEAN, **_HEADLESS}
+        kept = {name: value for name, value in os.environ.items() if name not in _HEADLESS}
+        with socket.socket() as listener, self._log.open("w") as log:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise ServerError(f"port {port} of the loopback: {error.strerror}") from None
+            self.port = int(listener.getsockname()[1])
+            # the server is given the port itself: another program could take a number meanwhile
+            handle = listener.fileno()
+            self._process = subprocess.Popen(
+                [
+                    *(sys.executable, "-P", "-m", "flows.running.embedded_server"),
+                    *(str(handle), str(os.getpid()), str(home)),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                pass_fds=[handle],
+                env={**kind, **kept},
+            )
+        self._answers = False
+        atexit.register(self.stop)
+
+    @property
+    def pid(self) -> int:
+        """The server's process."""
+        return self._process.pid
+
+    @property
+    def url(self) -> str:
+        """What PREFECT_API_URL must be; waits until the server answers there.
+
+        Raises:
+            ServerError: it did not start.
+        """
+        if not self._answers:
+            self._wait_until_healthy()
+            self._answers = True
+        return f"http://127.0.0.1:{self.port}/api"
+
+    def _wait_until_healthy(self) -> None:
+        end = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < end:
+            try:
+                self._process.wait(timeout=0.02)
+            except subprocess.TimeoutExpired:
+                if self._healthy():
+                    return
+            else:
+                break
+        self.stop()
+        raise ServerError(f"the embedded Prefect server did not start; see {self._log}")
+
+    def _healthy(self) -> bool:
+        at = f"http://127.0.0.1:{self.port}/api/health"
+        try:
+            with urllib.request.urlopen(at, timeout=5) as answer:
+                return int(answer.status) == 200
+        except (urllib.error.URLError, OSError):
+            return False
+
+    def stop(self) -> None:
+        """End the server; safe to call more than once."""
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(timeout=STOP_LIMIT_S)
+
+
+def die_with(parent: int) -> bool:
+    """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
+
+    Returns:
+        False if that one has ended already.
+    """
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    return os.getppid() == parent
+
+
+def _serve(handle: int, parent: int, home: Path) -> None:
+    """Be the server until told to end, or until the parent dies."""
+    if not die_with(parent):
+        return  # it died before it could be watched
+    garbage.seldom()
+    import uvicorn
+    from prefect.server.api.server import create_app
+
+    from flows.running.embedded_database import ready
+
+    ready(home)
+    server = uvicorn.Server(uvicorn.Config(create_app(), log_level="error"))
+    with socket.socket(fileno=handle) as listener:
+        server.run(sockets=[listener])
+
+
+if __name__ == "__main__":
+    _serve(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

@@ -1,0 +1,121 @@
+"""Prefect as this project runs it: embedded by default, at home in the store, silent off-line.
+
+`prepare` must run before Prefect is imported, because Prefect reads its settings then. A server
+that the user names with PREFECT_API_URL is used instead of the embedded one.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from flows.running import run_records
+from flows.running.embedded_server import EmbeddedServer
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+T = TypeVar("T")
+
+_DEFAULTS = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_LOGGING_LEVEL": "CRITICAL",
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
+    "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
+    "PREFECT_CLI_PROMPT": "false",
+}
+_servers: dict[str, EmbeddedServer] = {}
+_store: Path | None = None
+
+
+class Parcel(Generic[T]):
+    """Carries any object into a flow or task without Prefect validating, walking or storing it.
+
+    It stays in its process: with a task that runs elsewhere Prefect also sends what its flow was
+    called with, which that task has no use for.
+    """
+
+    def __init__(self, content: T) -> None:
+        self.content = content
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without its content."""
+        return type(self), (None,)
+
+
+class Freight(Parcel[T]):
+    """A parcel that goes to other processes with its content."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With its content."""
+        return type(self), (self.content,)
+
+
+def prepare(store: Path) -> None:
+    """Point Prefect at the store's own home, unless the user has set one; the store must exist."""
+    global _store
+    _store = store.resolve()
+    home = _store / ".prefect"
+    if "PREFECT_HOME" not in os.environ:
+        home.mkdir(exist_ok=True)
+        os.environ["PREFECT_HOME"] = str(home)
+    for name, value in _DEFAULTS.items():
+        os.environ.setdefault(name, value)
+
+
+def begin() -> None:
+    """Start the embedded server, if a flow will need it, and go on without waiting for it."""
+    if "PREFECT_API_URL" not in os.environ:
+        embedded()
+
+
+def embedded() -> EmbeddedServer:
+    """The embedded server of Prefect's home, which the first call starts."""
+    home = os.environ["PREFECT_HOME"]
+    if home not in _servers:
+        _servers[home] = EmbeddedServer(Path(home))
+    return _servers[home]
+
+
+def private() -> bool:
+    """Whether Prefect's server is this program's own, with no page that anybody could look at."""
+    from prefect.settings import PREFECT_API_URL
+
+    return PREFECT_API_URL.value() in {None, *(server.url for server in _servers.values())}
+
+
+def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
+    """Run a flow on the user's server, or on the embedded one, which the first flow starts.
+
+    Inside a flow that is served it is part of that flow's run, which has an end of its own.
+    Without heartbeats, because each would cost a flow a second of waiting for their thread; a
+    killed run is known by what the store lacks, and closed by the next one.
+
+    Args:
+        cluster: where its tasks go that are submitted, instead of threads.
+    """
+    from prefect.context import FlowRunContext
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
+        temporary_settings,
+    )
+
+    from flows.running import run_events
+
+    if FlowRunContext.get() is not None:
+        return flow.fn(parcel)
+    updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
+    server = run_records.server_name(PREFECT_API_URL.value())
+    if server == run_records.EMBEDDED:
+        updates[PREFECT_API_URL] = embedded().url
+    with temporary_settings(updates=updates):
+        run_events.install()
+        if _store is not None:
+            run_records.close_dead(_store, server)
+            flow = flow.with_options(**run_records.hooks(_store, server))
+        if cluster is not None:
+            flow = flow.with_options(task_runner=cluster.runner())
+        return flow(parcel)

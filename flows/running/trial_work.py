@@ -1,0 +1,189 @@
+"""What a step makes of every trial by itself: on all cores or a Dask cluster, each kept at once.
+
+Labels and clocks are made this way, samples and spike counts on a cluster. A stop is answered
+between two trials; what was made until then is kept, and the next run makes the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from prefect import flow
+
+from flows.running import console
+from flows.running.orchestration import Parcel, run
+from flows.running.spread import Done, spread
+from flows.running.timing import timed
+from storage.derived import Derived
+from storage.mirror import place_of, reach
+from storage.recording import Recording
+from storage.store import Store, StoreError
+from storage.streams import Json
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+FEW = 3
+"""Trials for which starting processes (about two seconds each) gains nothing."""
+Make = Callable[[Recording, Any], Any]
+"""Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
+module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
+
+
+@dataclass(frozen=True)
+class TrialWork:
+    """One result that is wanted of one trial, with the key it must have."""
+
+    recording: Recording
+    campaign: str
+    key: str
+    settings: Any = None
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A step with what it has to do.
+
+    Attributes:
+        name: where its results are kept; title: what people call it.
+    """
+
+    store: Store
+    name: str
+    title: str
+    work: list[TrialWork]
+    make: Make
+    cluster: Cluster | None
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A trial as another process, perhaps on another machine, finds it.
+
+    Attributes:
+        place: the store's path or URL.
+        checksum: what the trial and its clocks must be there, too.
+        clocks: those that were fitted again; None for the record's.
+    """
+
+    place: str
+    campaign: str
+    trial: str
+    checksum: str
+    clocks: Json | None
+    make: Make
+    settings: Any
+
+
+def stale_trials(store: Store, step: str, wanted: list[TrialWork]) -> list[TrialWork]:
+    """Those of `wanted` that have to be made."""
+    return [
+        work
+        for work in wanted
+        if not Derived.of(store, step, work.campaign).fresh(work.recording.folder.name, work.key)
+    ]
+
+
+def run_trials(
+    store: Store,
+    step: str,
+    title: str,
+    work: list[TrialWork],
+    make: Make,
+    cluster: Cluster | None = None,
+) -> None:
+    """Make every result of `work` and keep it among the derived results of `step`."""
+    if work:
+        named = _trials_flow.with_options(name=title, validate_parameters=False)
+        run(named, Parcel(_Step(store, step, title, work, make, cluster)), cluster)
+
+
+@flow(name="trials", validate_parameters=False, persist_result=False)
+def _trials_flow(wanted: Parcel[_Step]) -> int:
+    """All that is stale."""
+    step = wanted.content
+    with timed(step.store, step.title):
+        keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)
+    return len(step.work)
+
+
+def keep_trials(
+    store: Store,
+    step: str,
+    title: str,
+    work: list[TrialWork],
+    make: Make,
+    cluster: Cluster | None = None,
+    *,
+    processes: bool = True,
+) -> None:
+    """As `run_trials`, inside a flow that runs already."""
+    with console.bar(f"{title} (trials)", len(work)) as bar:
+
+        def keep(number: int, result: tuple[dict[str, Any], dict[str, Any]]) -> None:
+            item = work[number]
+            name = item.recording.folder.name
+            Derived.of(store, step, item.campaign).write(name, item.key, *result)
+            bar.advance(1, name)
+
+        each_trial(store, title, work, make, keep, cluster, processes=processes)
+
+
+def each_trial(
+    store: Store,
+    title: str,
+    work: Sequence[TrialWork],
+    make: Make,
+    done: Done,
+    cluster: Cluster | None = None,
+    *,
+    processes: bool = True,
+) -> None:
+    """Hand over what `make` gives of every trial, in any order. Stands in a flow.
+
+    Args:
+        done: called with the number of an item of `work` and what came of it.
+        processes: without a cluster, use all cores; False where `make` does that by itself, or
+            takes less time than starting processes, which is never done for a `FEW`.
+    """
+    if cluster is None and (not processes or len(work) <= FEW):
+        for number, item in enumerate(work):
+            done(number, make(item.recording, item.settings))
+        return
+    place = place_of(store)
+    jobs = [
+        _Job(
+            place, item.campaign, item.recording.folder.name, item.recording.checksum,
+            item.recording.clocks_elsewhere, make, item.settings,
+        )
+        for item in work
+    ]  # fmt: skip
+    if cluster is not None and jobs:
+        cluster.check_store(_find, jobs[0])
+    spread(title, _make, jobs, done, cluster)
+
+
+def _find(job: _Job) -> None:
+    """Asked of a worker: is the trial there?
+
+    Raises:
+        StoreError: it is not, or is another take of it.
+    """
+    _recording(job)
+
+
+def _make(job: _Job) -> Any:
+    return job.make(_recording(job), job.settings)
+
+
+def _recording(job: _Job) -> Recording:
+    store = reach(job.place, job.campaign, job.trial)
+    recording = store.campaign(job.campaign).recording(job.trial)
+    recording.use_clocks(job.clocks)
+    if recording.checksum != job.checksum:
+        raise StoreError(
+            f"{recording.folder}: is not the take that the command began with; run it again"
+        )
+    return recording

@@ -1,0 +1,215 @@
+"""`sliplab serve`: one program registers the deployments of one rig and runs what is asked for.
+
+Prefect's runner takes a single run at a time, because a rig is one thing. Each is a process of its
+own, which stops its arm and ends when this program ends, however that happens. Pause, resume and
+stop are carried past it (`flows.serving.serve_control`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from flows.running import console, run_records
+from flows.running.embedded_server import EmbeddedServer
+from flows.serving.serve_control import answer_page
+from flows.serving.serve_file import Scheduled
+from flows.serving.service import Service
+from protocols import InputError
+from storage.lock import exclusive
+from storage.store import Store
+
+LOCK = ".serve.lock"
+PORT = 4200
+"""Prefect's usual one."""
+CONTROL_POLL_S = 1.0
+"""How often the page is asked for pause, resume and stop."""
+
+
+@contextmanager
+def page_server(store: Store, port: int) -> Iterator[str]:
+    """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
+
+    Raises:
+        ServerError: ours did not start; its port may be taken.
+    """
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    url = PREFECT_API_URL.value()
+    if url is not None:
+        yield url
+        return
+    server = EmbeddedServer(Path(os.environ["PREFECT_HOME"]), port, page=True)
+    try:
+        os.environ["PREFECT_API_URL"] = server.url  # the processes of the runs read it
+        with temporary_settings(updates={PREFECT_API_URL: server.url}):
+            yield server.url
+    finally:
+        del os.environ["PREFECT_API_URL"]
+        server.stop()
+
+
+def serve(
+    store: Store,
+    rig: str,
+    name: str,
+    schedules: Sequence[Scheduled],
+    *,
+    port: int = PORT,
+    poll_s: float = 3.0,
+) -> None:
+    """Register the deployments and run what is asked for, until SIGINT or SIGTERM.
+
+    Args:
+        rig: a rig file's absolute path, or the name of one that ships.
+        name: of the deployments.
+        port: of the embedded server's page.
+        poll_s: how often the server is asked for new runs, s.
+
+    Raises:
+        Locked: another program serves this store.
+        ServerError: the embedded server did not start.
+        InputError: another program serves another store under this name.
+    """
+    from prefect.settings import PREFECT_API_URL
+
+    ours = PREFECT_API_URL.value() is None
+    with ExitStack() as stack:
+        stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
+        url = stack.enter_context(page_server(store, port))
+        server = run_records.EMBEDDED if ours else run_records.server_name(url)
+        Service(str(store.folder.resolve()), rig, name, server, os.getpid()).tell()
+        for item in run_records.close_dead(store.folder, server):
+            console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
+        asyncio.run(_serve(store, rig, name, schedules, url, poll_s))
+
+
+async def _serve(
+    store: Store, rig: str, name: str, schedules: Sequence[Scheduled], url: str, poll_s: float
+) -> None:
+    from prefect.runner import Runner
+
+    from flows.serving.serve_flows import CONTROL, ON_RIG
+
+    stopped = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    class Ours(Runner):
+        """Prefect's, with SIGTERM for the whole program."""
+
+        def handle_sigterm(self, *args: Any, **kwargs: Any) -> None:
+            loop.call_soon_threadsafe(stopped.set)
+
+    rig_runner = Ours(f"{name} rig", query_seconds=poll_s, limit=1, pause_on_shutdown=False)
+    control: dict[Any, Any] = {}
+    for flow in (*ON_RIG, *CONTROL):
+        await _refuse_another(flow.name, name, store)
+        about = {"tags": _tags(store, rig), "description": flow.description}
+        if flow in ON_RIG:
+            when = _prefects([item for item in schedules if item.flow == flow.name])
+            await rig_runner.aadd_flow(flow, name, schedules=when, **about)
+        else:
+            made = await flow.ato_deployment(name, **about)
+            control[await made.aapply()] = flow
+    await _close_stranded(name, [flow.name for flow in (*ON_RIG, *CONTROL)], store)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopped.set)
+    running = asyncio.create_task(rig_runner.start())
+    answering = asyncio.create_task(answer_page(control, min(poll_s, CONTROL_POLL_S), stopped))
+    ending = asyncio.create_task(stopped.wait())
+    console.say(f"serving {store.folder} on the rig {rig}: deployments */{name}")
+    console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
+    await asyncio.wait([ending, running, answering], return_when=asyncio.FIRST_COMPLETED)
+    console.say("ending: what runs stops, arm first")
+    stopped.set()
+    if rig_runner.started:
+        await rig_runner.astop()
+    for outcome in await asyncio.gather(running, answering, ending, return_exceptions=True):
+        if isinstance(outcome, Exception):
+            raise outcome
+
+
+def _tags(store: Store, rig: str) -> list[str]:
+    return [f"rig:{Path(rig).stem}", f"store:{store.folder.resolve()}"]
+
+
+def _prefects(schedules: list[Scheduled]) -> list[Any]:
+    from prefect.schedules import Cron
+
+    return [
+        Cron(
+            item.cron,
+            timezone=item.timezone,
+            active=item.active,
+            parameters={"wanted": item.parameters},
+            slug=item.name.replace(" ", "-"),
+        )
+        for item in schedules
+    ]
+
+
+async def _refuse_another(flow: str, name: str, store: Store) -> None:
+    """Two programs under one name would take each other's runs.
+
+    Raises:
+        InputError: the name is another store's, and is being served.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.exceptions import ObjectNotFound
+
+    async with get_client() as client:
+        try:
+            there = await client.read_deployment_by_name(f"{flow}/{name}")
+        except ObjectNotFound:
+            return
+    mine = f"store:{store.folder.resolve()}"
+    others = [tag for tag in there.tags if tag.startswith("store:") and tag != mine]
+    if others and there.status is not None and there.status.value == "READY":
+        raise InputError(
+            "--name", "", name, f"is served for {others[0].removeprefix('store:')}; give another"
+        )
+
+
+async def _close_stranded(name: str, flows: list[str], store: Store) -> None:
+    """Close runs that a service before this one had taken and that no process has any more.
+
+    A run whose process died has been closed by its record; this is about those that were killed
+    before they could write one, and would be pending for ever.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import (
+        DeploymentFilter,
+        DeploymentFilterName,
+        FlowFilter,
+        FlowFilterName,
+        FlowRunFilter,
+        FlowRunFilterState,
+        FlowRunFilterStateType,
+    )
+    from prefect.client.schemas.objects import StateType
+    from prefect.client.schemas.sorting import FlowRunSort
+    from prefect.states import Crashed
+
+    taken = [StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
+    alive = {item["run"] for item in run_records.open_runs(store.folder)}
+    async with get_client() as client:
+        runs = await client.read_flow_runs(
+            flow_filter=FlowFilter(name=FlowFilterName(any_=flows)),
+            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[name])),
+            flow_run_filter=FlowRunFilter(
+                state=FlowRunFilterState(type=FlowRunFilterStateType(any_=taken))
+            ),
+            sort=FlowRunSort.ID_DESC,  # the server takes no None, of either
+            limit=200,
+        )
+        for run in runs:
+            if str(run.id) in alive:
+                continue
+            message = "the service that had taken it was killed; found at the next start"
+            await client.set_flow_run_state(run.id, Crashed(message=message), force=True)
+            console.say(f"closed: {run.name}, whose service was killed")

@@ -1,0 +1,1 @@
+"""Clocks of stored trials fitted again, and the page that shows what they are worth."""

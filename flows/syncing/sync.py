@@ -1,0 +1,118 @@
+"""Fitting the clocks of every committed trial again, and showing what they are worth.
+
+A trial's clocks are fitted when it is taken, by the program of that day. When fitting has improved
+since, this step makes them again from the raw streams. The record stays as it was committed; where
+the new clocks differ they stand among the derived results, every later step reads them there, and
+its results become stale exactly then.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.timeline import synchronise
+from flows.running import console
+from flows.running.campaigns import Collected
+from flows.running.trial_work import TrialWork, run_trials, stale_trials
+from flows.syncing.sync_fit import fit_again
+from flows.syncing.sync_numbers import campaign_numbers
+from flows.syncing.sync_page import PAGE, render
+from flows.syncing.sync_trials import TrialClocks, read_trials
+from storage.derived import Derived, make_key
+from storage.files import write_text
+from storage.recording import Recording
+from storage.store import SYNC, Store
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+PAGE_VERSION = 1
+
+
+def sync_key(recording: Recording) -> str:
+    """The key of a trial's clocks, fitted again."""
+    return make_key(SYNC, synchronise.VERSION, recording.raw_checksum, None)
+
+
+def sync(
+    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
+) -> dict[str, Any]:
+    """Fit what is stale, and write the page if anything on it has changed."""
+    wanted = [
+        TrialWork(recording, item.name, sync_key(recording))
+        for item in campaigns
+        for _, recording in item.trials
+    ]
+    stale = stale_trials(store, SYNC, wanted)
+    run_trials(store, SYNC, "sync", stale, fit_again, cluster)
+    for work in wanted:
+        work.recording.forget_clocks()
+    trials = {item.name: read_trials(store, item) for item in campaigns}
+    page = _write_page(store, campaigns, wanted, trials)
+    fitted = {item.name: sum(work.campaign == item.name for work in stale) for item in campaigns}
+    numbers = {
+        name: {"refitted": fitted[name], **campaign_numbers(found)}
+        for name, found in trials.items()
+    }
+    for name, found in trials.items():
+        for trial in found:
+            if trial.refused:
+                console.say(f"warning: {name}: {trial.name}: {trial.doubt}")
+    return {
+        "step": SYNC,
+        "done": len(stale),
+        "fresh": len(wanted) - len(stale),
+        "changed": sum(known["changed"] for known in numbers.values()),
+        "simulated": store.simulated,
+        "page": str(page),
+        "campaigns": numbers,
+    }
+
+
+def _write_page(
+    store: Store,
+    campaigns: list[Collected],
+    wanted: list[TrialWork],
+    trials: dict[str, list[TrialClocks]],
+) -> Path:
+    path = store.folder / "report" / PAGE
+    quarantined = [[item.name, item.campaign.quarantined()] for item in campaigns]
+    shown = [[work.campaign, work.key] for work in wanted]
+    key = make_key(SYNC, PAGE_VERSION, [shown, quarantined], None)
+    kept = Derived.of(store, SYNC)
+    if not kept.fresh("page", key) or not path.exists():
+        path.parent.mkdir(exist_ok=True)
+        write_text(path, render(campaigns, trials, simulated=store.simulated))
+        kept.write("page", key, {})
+    return path
+
+
+def tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """What `sliplab sync` prints of every campaign: a title, and rows under `COLUMNS`."""
+    found = []
+    simulated = " (simulated)" if result["simulated"] else ""
+    for campaign, known in result["campaigns"].items():
+        rows = []
+        for device, numbers in known["devices"].items():
+            drift, pulses = numbers["drift_ppm"], numbers["pulses"]
+            rows.append(
+                [
+                    device,
+                    numbers["grade"],
+                    f"{numbers['uncertainty_us']['median']:.1f}",
+                    f"{numbers['uncertainty_us']['worst']:.1f}",
+                    f"{drift[0]:.1f} to {drift[1]:.1f}",
+                    "-" if pulses is None else " / ".join(map(str, pulses.values())),
+                ]
+            )
+        trials = f"{known['trials']} trials, {known['refitted']} refitted"
+        title = f"Clocks of {campaign}{simulated}: {trials}, {known['changed']} changed"
+        found.append((title, rows))
+    return found
+
+
+COLUMNS = (
+    "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
+)  # fmt: skip
+"""Uncertainties are of events against the device, both clocks together; of events, their own."""

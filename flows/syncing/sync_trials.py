@@ -1,0 +1,137 @@
+"""What is known of every trial's clocks, in one row a trial: for the page and for the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flows.running.campaigns import Collected
+from flows.syncing.sync_fit import DEVICES
+from storage.clockmap import ClockMap
+from storage.derived import Derived
+from storage.recording import Recording
+from storage.store import SYNC, Store
+
+F64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DeviceClocks:
+    """One device in one trial.
+
+    Attributes:
+        kind: ``95 %`` or ``hard bound``: what the uncertainty means.
+        against_events_us: of events against this device, both maps together; of events, their own.
+        gate_us: what the protocol allows; None where the record has no such gate.
+        drift_ppm: what the box gains on the device.
+        pulses: ``seen``, ``missed``, ``late``, ``spurious``; None without a wire.
+    """
+
+    grade: str
+    kind: str
+    against_events_us: float
+    gate_us: float | None
+    drift_ppm: float
+    pulses: dict[str, int] | None
+
+
+@dataclass(frozen=True)
+class TrialClocks:
+    """The clocks of one committed trial.
+
+    Attributes:
+        number: its place in the order in which the campaign's trials were taken, from 1.
+        changed: fitting again gave other clocks than the record has, and they are in use.
+        refused: by device, why fitting again gave no clock; the record's is still in use.
+        frames_lost: frames that the camera lost; None without a video.
+    """
+
+    campaign: str
+    name: str
+    number: int
+    devices: Mapping[str, DeviceClocks]
+    changed: bool
+    refused: Mapping[str, str]
+    frames_lost: int | None
+    results: Derived
+
+    @property
+    def worst_us(self) -> float:
+        """The largest uncertainty of events against any device."""
+        return max((device.against_events_us for device in self.devices.values()), default=0.0)
+
+    @property
+    def missed(self) -> int:
+        """Pulses that some device missed."""
+        pulses = (device.pulses for device in self.devices.values())
+        return sum(found["missed"] for found in pulses if found is not None)
+
+    @property
+    def doubt(self) -> str:
+        """Why this committed trial would not be kept today, in words; empty if it would."""
+        found = [
+            f"{device} cannot be fitted again ({reason}); the record's clock is in use"
+            for device, reason in self.refused.items()
+        ]
+        for name, device in self.devices.items():
+            if device.gate_us is not None and device.against_events_us > device.gate_us:
+                found.append(
+                    f"{name} ({device.grade}): {device.against_events_us:.1f} µs, "
+                    f"the gate is {device.gate_us:g} µs"
+                )
+        return "; ".join(found)
+
+    @cached_property
+    def residuals(self) -> dict[str, F64]:
+        """Residuals by ``DEVICE_us`` over the trial's time, ``DEVICE_s``."""
+        return self.results.arrays(self.name)
+
+
+def read_trials(store: Store, item: Collected) -> list[TrialClocks]:
+    """The trials of a campaign, in the order in which they were taken."""
+    results = Derived.of(store, SYNC, item.name)
+    taken = sorted(
+        (recording for _, recording in item.trials),
+        key=lambda recording: str(item.campaign.provenance(recording)["started"]),
+    )
+    return [_read(item, recording, k + 1, results) for k, recording in enumerate(taken)]
+
+
+def _read(item: Collected, recording: Recording, number: int, results: Derived) -> TrialClocks:
+    clocks, gates = recording.clocks, recording.record["quality"]["gates"]
+    name = recording.folder.name
+    known = recording.record["clocks"]
+    refused = results.read(name)["refused"]
+    return TrialClocks(
+        item.name,
+        name,
+        number,
+        {device: _device(clocks, gates, device) for device in DEVICES if device in clocks},
+        recording.refitted,
+        {device: reason for device, reason in refused.items() if device in known},
+        gates["frames_lost"]["value"] if "frames_lost" in gates else None,
+        results,
+    )
+
+
+def _device(clocks: Mapping[str, Any], gates: Mapping[str, Any], name: str) -> DeviceClocks:
+    known = clocks[name]
+    both = known["uncertainty_ns"]
+    both += clocks["events"]["uncertainty_ns"] if name != "events" else 0.0
+    limit = gates.get(f"sync_uncertainty_{name}_s", {}).get("limit")
+    wired = "pulses_seen" in known
+    kinds = ("seen", "missed", "late", "spurious")
+    return DeviceClocks(
+        known["grade"],
+        known["kind"],
+        both / 1e3,
+        None if limit is None else 1e6 * limit,
+        # through the host, what is recorded is the drift of one step of the way
+        known["drift_ppm"] if wired else ClockMap.from_json(known["map"]).drift_ppm(),
+        {kind: known[f"pulses_{kind}"] for kind in kinds} if wired else None,
+    )

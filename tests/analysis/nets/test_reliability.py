@@ -1,0 +1,92 @@
+"""Intervals, temperature and calibration error against closed forms."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from analysis.nets.reliability import (
+    by_lead,
+    calibration,
+    cross_entropy,
+    expected_calibration_error,
+    fit_temperature,
+    lead,
+    wilson,
+)
+
+
+@given(st.integers(0, 60), st.integers(0, 60))
+def test_wilson_is_scipys(right: int, wrong: int) -> None:
+    n = right + wrong
+    if not n:
+        assert wilson(0, 0) == (0.0, 1.0)
+        return
+    known = binomtest(right, n).proportion_ci(0.95, method="wilson")
+    assert wilson(right, n) == pytest.approx((known.low, known.high), abs=1e-12)
+
+
+def test_more_right_than_there_are_is_refused() -> None:
+    with pytest.raises(ValueError, match="4 right of 3"):
+        wilson(4, 3)
+
+
+def test_leads_are_counted_by_hand() -> None:
+    counts = np.array([[3, 3, 0], [0, 0, 0], [5, 4, 0], [2, 3, 0], [9, 0, 0], [0, 14, 1]])
+    labels = np.array([0, 0, 0, 0, 0, 1])
+    assert lead(counts).tolist() == [0, 0, 1, 1, 9, 13]
+    rows = [(r["lead"], r["n"], r["right"], r["or_more"]) for r in by_lead(counts, labels, 10)]
+    # a tie is never right, whichever class argmax would take
+    assert rows == [(0, 2, 0, False), (1, 2, 1, False), (9, 1, 1, False), (10, 1, 1, True)]
+
+
+def test_temperature_has_a_closed_form_for_one_kind_of_lead() -> None:
+    """Counts (k, 0, -inf-like): right in a share p of the cases: softmax(k / T) = p."""
+    k, right, wrong = 6.0, 80, 20
+    counts = np.tile([k, 0.0, -1e6], (right + wrong, 1))
+    labels = np.repeat([0, 1], [right, wrong])
+    found = fit_temperature(counts, labels)
+    assert found == pytest.approx(k / np.log(right / wrong), rel=1e-4)
+    # nothing else gives less
+    best = cross_entropy(counts, labels, found)
+    for factor in (0.9, 1.1):
+        assert cross_entropy(counts, labels, found * factor) > best
+
+
+def test_calibration_error_by_hand() -> None:
+    p = np.array([[0.9, 0.1, 0.0], [0.9, 0.1, 0.0], [0.5, 0.5, 0.0], [0.5, 0.3, 0.2]])
+    labels = np.array([0, 1, 0, 0])
+    # bin of 0.9: said 1.8, right 1; bin of 0.5: said 1.0, right a half (tie) and 1
+    assert expected_calibration_error(p, labels) == pytest.approx((0.8 + 0.5) / 4)
+
+
+def test_drawn_from_the_said_probabilities_there_is_little_error() -> None:
+    rng = np.random.default_rng(1)
+    counts = rng.poisson(4, (20_000, 3))
+    p = np.exp(counts / 3.0)
+    p /= p.sum(axis=1, keepdims=True)
+    labels = (rng.random(len(p))[:, None] > p.cumsum(axis=1)).sum(axis=1)
+    found = calibration(counts[:10_000], labels[:10_000], counts[10_000:], labels[10_000:])
+    assert found["temperature"] == pytest.approx(3.0, rel=0.05)
+    assert found["ece"] < 0.02 < found["uncalibrated"]["ece"]
+
+
+def test_only_validation_windows_are_fitted() -> None:
+    rng = np.random.default_rng(2)
+    counts, labels = rng.poisson(4, (300, 3)), rng.integers(0, 3, 300)
+    held = (counts[200:], labels[200:])
+    first = calibration(counts[:100], labels[:100], *held)
+    second = calibration(counts[100:200], labels[100:200], *held)
+    assert first["temperature"] == second["temperature"]
+
+
+def test_nothing_gives_none_and_plain_json() -> None:
+    none = (np.zeros((0, 3), int), np.zeros(0, int))
+    some = (np.array([[1, 0, 0]]), np.array([0]))
+    assert by_lead(*none) == []
+    assert calibration(*none, *some)["ece"] is None
+    assert calibration(*some, *none)["temperature"] is None
+    json.dumps(calibration(*some, *some), allow_nan=False)

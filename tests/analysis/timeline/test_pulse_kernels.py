@@ -1,0 +1,104 @@
+"""Compiled loops over pulses against numpy, to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from analysis.timeline.pulse_kernels import (
+    fullest,
+    median,
+    most_off,
+    normal_equations,
+    pair,
+    partners,
+    places_of,
+    quantile,
+    residuals_at,
+)
+
+Floats = NDArray[np.float64]
+TIMES = st.lists(st.integers(0, 40), min_size=1, max_size=30).map(
+    lambda times: np.sort(np.array(times, np.float64))
+)
+
+
+def nearest(grid: Floats, values: Floats) -> NDArray[np.int64]:
+    if grid.size == 1:
+        return np.zeros(values.size, np.int64)
+    right = np.clip(np.searchsorted(grid, values), 1, grid.size - 1)
+    left = right - 1
+    return np.where(values - grid[left] <= grid[right] - values, left, right).astype(np.int64)
+
+
+@given(predicted=TIMES, y=TIMES, gate=st.integers(0, 5))
+def test_pairs_are_each_others_nearest(predicted: Floats, y: Floats, gate: int) -> None:
+    there = nearest(y, predicted)
+    mutual = nearest(predicted, y)[there] == np.arange(predicted.size)
+    expected = np.flatnonzero(mutual & (np.abs(y[there] - predicted) <= gate))
+    i, j = pair(predicted, y, float(gate))
+    assert i.tolist() == expected.tolist()
+    assert j.tolist() == there[expected].tolist()
+
+
+@given(predicted=TIMES, y=TIMES, reach=st.integers(1, 9))
+def test_partners_lie_within_reach(predicted: Floats, y: Floats, reach: int) -> None:
+    apart = y[None, :] - predicted[:, None]
+    expected = np.nonzero((apart >= -reach) & (apart < reach))
+    which, partner = partners(predicted, y, float(reach))
+    assert which.tolist() == expected[0].tolist()
+    assert partner.tolist() == expected[1].tolist()
+
+
+@given(ordered=TIMES, window=st.integers(0, 9))
+def test_the_fullest_window_is_the_first_of_the_best(ordered: Floats, window: int) -> None:
+    held = np.searchsorted(ordered, ordered + window, side="right") - np.arange(ordered.size)
+    assert fullest(ordered, float(window)) == ordered[int(held.argmax())]
+
+
+@given(values=st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=50), share=st.floats(0, 1))
+def test_median_and_quantile_are_numpys(values: list[float], share: float) -> None:
+    array = np.array(values)
+    assert median(array) == np.median(array)
+    assert quantile(array, share) == np.quantile(array, share)
+
+
+@pytest.mark.parametrize("n", [2, 3, 9])
+def test_normal_equations_are_weighted_sums(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x, y = np.sort(rng.uniform(0, 100, 400)), rng.normal(0, 3, 400)
+    knots = np.linspace(x[0], x[-1], n)
+    piece, share = places_of(x, knots)
+    at = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, n - 2)
+    assert piece.tolist() == at.tolist()
+    assert share.tolist() == ((x - knots[at]) / (knots[at + 1] - knots[at])).tolist()
+    matrix, right = normal_equations(piece, share, y, y, 5.0, 2.0, n)
+    weights = np.where(np.abs(y) <= 5.0, np.minimum(1.0, 2.0 / np.maximum(np.abs(y), 1e-9)), 0.0)
+    assert matrix[0, 0] == np.bincount(piece, weights * (1 - share) ** 2, n - 1)[0]
+    assert matrix[-1, -1] == np.bincount(piece, weights * share**2, n - 1)[-1]
+    between = np.bincount(piece, weights * share * (1 - share), n - 1)
+    assert np.diag(matrix, 1).tolist() == np.diag(matrix, -1).tolist() == between.tolist()
+    assert right[0] == np.bincount(piece, weights * (1 - share) * y, n - 1)[0]
+    assert right[-1] == np.bincount(piece, weights * share * y, n - 1)[-1]
+    values = rng.normal(0, 1, n)
+    line = values[piece] + share * (values[piece + 1] - values[piece])
+    assert residuals_at(piece, share, y, values).tolist() == (y - line).tolist()
+
+
+@pytest.mark.parametrize("at_ends", [False, True])
+def test_most_off_looks_at_every_window(at_ends: bool) -> None:
+    rng = np.random.default_rng(3)
+    on_line = rng.random(60) < 0.6
+    fits = np.concatenate([[0], np.cumsum(on_line)])
+    low = np.sort(rng.integers(0, 70, 60))
+    high = low + rng.integers(0, 3, 60)
+    for width in (8, 60):
+        off = [0]
+        for first in [0, 60 - width] if at_ends else range(61 - width):
+            there = high[first + width - 1] - low[first]
+            if there <= 1.5 * width:
+                off.append(min(width, there) - (fits[first + width] - fits[first]))
+        assert most_off(width, fits, low, high, at_ends) == max(off)

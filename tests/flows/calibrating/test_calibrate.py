@@ -1,0 +1,447 @@
+"""Teaching and calibrating from end to end on the simulated rig, as its commands do it."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from analysis.calibration.charuco import Board, find_corners
+from flows import __main__ as entry
+from flows.calibrating import calibrate, measuring, teach
+from flows.calibrating.board_print import PNG_PX_PER_MM, print_board
+from flows.running import console, stopping
+from protocols import InputError
+from protocols.program import Position
+from rigs.build import build_rig
+from rigs.capabilities import ArmState, Pose, RigError
+from rigs.plate_frame import PlateFrame
+from rigs.rig import Rig, StopRequested
+from rigs.rig_file import load_rig_file
+from rigs.teaching import Creep
+from tests.command_line import sliplab
+from tests.conftest import ROOT
+
+MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
+QUICK = Creep(clearance_mm=2.5, search_mm=2.0)
+TRUE_PLANE = build_rig(load_rig_file(Path("mock"))[0]).frame
+"""The shipped file's plane, which is the true one to 0.01 mm."""
+
+
+def lab(folder: Path, *, moved_mm: float = 0.0, leant_mm: float = 0.0, mock: str = "") -> Path:
+    """A rig file whose plane lies `moved_mm` too deep, and leans by `leant_mm` over 60 mm."""
+    text = MOCK.replace("400.35 mm, 0", f"{400.35 + moved_mm:.3f} mm, 0")
+    text = text.replace("400.17 mm, 60", f"{400.17 + moved_mm + leant_mm:.3f} mm, 60")
+    text = text.replace("400.73 mm, 0", f"{400.73 + moved_mm:.3f} mm, 0")
+    path = folder / "lab.yaml"
+    path.write_text(text + f"  frame_camera: {{level: tracks}}\n{mock}")
+    return path
+
+
+def bench(path: Path, **attributes: Any) -> measuring.Bench:
+    file, _ = load_rig_file(path)
+    rig = build_rig(file)
+    rig.connect()
+    for name, value in attributes.items():
+        setattr(rig, name, value)
+    return measuring.Bench(file, rig, date(2026, 12, 1))
+
+
+def taught(finding: measuring.Finding) -> PlateFrame:
+    plane = finding.changes["calibration.contact_plane"]
+    points = [
+        [float(v.removesuffix(" mm")) for v in plane[k]] for k in ("centre", "right", "above")
+    ]
+    return PlateFrame.taught(points)
+
+
+def error_of(frame: PlateFrame) -> tuple[float, float]:
+    """How far a plane is from the true one: mm over 12 mm round the centre, and degrees."""
+    far = [
+        TRUE_PLANE.position(frame.pose(Position(x, y, 0.0)).xyz_mm).depth_mm
+        for x, y in ((0.0, 0.0), (12.0, 0.0), (0.0, 12.0), (-12.0, 0.0), (0.0, -12.0))
+    ]
+    turned = np.degrees(np.arccos(min(float(frame.axes[2] @ TRUE_PLANE.axes[2]), 1.0)))
+    return float(np.abs(far).max()), float(turned)
+
+
+@pytest.mark.parametrize(
+    ("moved_mm", "leant_mm"), [(1.2, 0.0), (-1.5, 0.0), (0.5, 1.5), (0.0, 0.0)]
+)
+def test_a_wrong_plane_is_mended(tmp_path: Path, moved_mm: float, leant_mm: float) -> None:
+    found = teach.teach_plane(bench(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
+                              QUICK, 2)  # fmt: skip
+    off, turned = error_of(taught(found))
+    assert off < 0.12
+    assert turned < 0.5
+    assert found.figures["moved_mm"] == pytest.approx(-moved_mm, abs=0.08)
+    assert found.figures["residual_mm"] <= teach.MOST_PLANE_MM
+    assert found.remove == ("calibration.depth_zero",)
+
+
+def test_a_plane_by_hand_is_found_too(tmp_path: Path) -> None:
+    found = teach.teach_plane_by_hand(bench(lab(tmp_path, moved_mm=8.0, leant_mm=6.0)))
+    off, turned = error_of(taught(found))
+    assert off < 0.15
+    assert turned < 0.5
+    assert found.changes["calibration.contact_plane"]["method"] == "jogged by hand and confirmed"
+
+
+def by_hand(points: dict[str, tuple[float, float, float]]) -> Any:
+    """A person who jogs to places in the true plane's coordinates."""
+
+    def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
+        return [
+            TRUE_PLANE.pose(Position(*points[word.removeprefix("touched ")])) for _, word in prompts
+        ]
+
+    return jogged
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (
+            {"centre": (0, 0, 0), "right": (12, 0, 0), "above": (-9, 0.5, 0), "check": (3, 3, 0)},
+            "almost on one line",
+        ),
+        (
+            {"centre": (0, 0, 0), "right": (2, 0, 0), "above": (0, 12, 0), "check": (3, 3, 0)},
+            "at least 5 mm",
+        ),
+        (
+            {"centre": (0, 0, 0), "right": (12, 0, 0), "above": (0, 12, 0), "check": (-9, -9, 0.3)},
+            r"fourth touch is \+0.300 mm off",
+        ),
+    ],
+)
+def test_points_that_make_no_plane_write_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: Any, says: str
+) -> None:
+    monkeypatch.setattr(teach, "jogged", by_hand(points))
+    with pytest.raises(RigError, match=says):
+        teach.teach_plane_by_hand(bench(lab(tmp_path)))
+
+
+def test_depth_zero_by_both_ways_is_the_truth(tmp_path: Path) -> None:
+    found = teach.teach_zero(bench(lab(tmp_path, moved_mm=-0.6)), QUICK, 3, True)
+    entry_ = found.changes["calibration.depth_zero"]
+    assert found.figures["zero_mm"] == pytest.approx(0.6, abs=0.06)
+    assert np.mean(found.figures["by_markers_mm"]) == pytest.approx(0.6, abs=0.06)
+    assert abs(found.figures["difference_mm"]) < 0.1
+    assert set(entry_) >= {"zero", "by_events", "by_markers", "difference", "residual", "taught"}
+
+
+def test_a_touch_depth_that_is_wrong_is_told_by_the_markers(tmp_path: Path) -> None:
+    path = lab(tmp_path)
+    path.write_text(path.read_text().replace("touch_depth: 0.34 mm", "touch_depth: 0.04 mm"))
+    with pytest.raises(RigError, match=r"apart. Is calibration.touch_depth = 0.04 mm right"):
+        teach.teach_zero(bench(path), QUICK, 1, True)
+    found = teach.teach_zero(bench(path), QUICK, 1, False)
+    assert found.figures["by_markers_mm"] is None
+
+
+def test_depth_zero_from_a_video(tmp_path: Path) -> None:
+    path = lab(tmp_path)
+    path.write_text(path.read_text().replace("level: tracks", "level: video"))
+    found = teach.teach_zero(bench(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
+    assert abs(found.figures["by_markers_mm"][0]) < 0.08
+
+
+@pytest.mark.parametrize("tip", [(0.0, 0.0, 0.0), (0.8, -1.5, 3.0)])
+def test_the_tip_is_found_by_pivoting(tmp_path: Path, tip: tuple[float, float, float]) -> None:
+    path = lab(tmp_path, mock=f"  arm: {{tip_offset_mm: {list(tip)}}}\n")
+    found = teach.teach_tool(bench(path), 8, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    assert np.linalg.norm(np.array(found.figures["offset_mm"]) - tip) < 0.1
+    assert found.figures["residual_mm"] < 0.1
+    assert found.figures["off_the_tool_set_mm"] == pytest.approx(np.linalg.norm(tip), abs=0.1)
+
+
+def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> None:
+    """Poses are those of a tool; what is found is from the flange."""
+    path = lab(tmp_path, mock="  arm: {tip_offset_mm: [0.5, 0, 1]}\n")
+    tool = Pose((10.0, -5.0, 80.0), (0.0, 0.0, 90.0))
+    found = teach.teach_tool(bench(path), 8, tool)
+    # the tip in the tool's axes, turned by 90 degrees about z into the flange's
+    assert np.allclose(found.figures["offset_mm"], [10.0, -5.0 + 0.5, 81.0], atol=0.1)
+
+
+def test_poses_that_are_all_alike_write_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = bench(lab(tmp_path))
+    here.rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
+    with pytest.raises(RigError, match="too much alike"):
+        teach.teach_tool(here, 5, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+def test_the_crop_is_where_the_skin_is(tmp_path: Path) -> None:
+    found = calibrate.calibrate_crop(bench(lab(tmp_path)), 2.4, 1.0)
+    assert np.hypot(*(np.array(found.figures["centre_px"]) - [319.5, 239.5])) < 4.0
+    # the outer ring's markers, and what they move
+    assert 2 * (11.2 + 1.2) * 14 - 10 < found.figures["diameter_px"] < 400
+    with pytest.raises(RigError, match="event camera"):
+        calibrate.calibrate_crop(bench(lab(tmp_path)), 0.01, 0.1)
+
+
+def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(MOCK + "  frame_camera: {k1: -0.2}\n")
+    here = bench(path)
+    pictures = calibrate.see_boards(here, 8)
+    assert len(pictures) == 8
+    found = calibrate.calibrate_lens(pictures, Board(), here.today)
+    assert found.figures["scale_px_per_mm"] == pytest.approx(20.0, rel=3e-4)
+    assert found.figures["distortion"][0] == pytest.approx(-0.2, abs=0.02)
+    assert found.changes["frame_camera.scale_px_per_mm"] == found.figures["scale_px_per_mm"]
+    assert here.rig.simulation is not None
+    # another size of square than was printed: the scale follows, the picture cannot tell
+    large = calibrate.calibrate_lens(pictures, Board(square_mm=6.06, marker_mm=4.545), here.today)
+    assert large.figures["scale_px_per_mm"] == pytest.approx(20.0 * 6.0 / 6.06, rel=3e-4)
+
+
+def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match="tracks and no pictures"):
+        calibrate.see_boards(bench(lab(tmp_path)), 4)
+
+
+@pytest.mark.parametrize("name", ["board.png", "board.pdf"])
+def test_the_printed_board_has_its_true_size(tmp_path: Path, name: str) -> None:
+    sizes = print_board(Board(), tmp_path / name)
+    assert (sizes["width_mm"], sizes["height_mm"]) == (66.0, 42.0)
+    data = (tmp_path / name).read_bytes()
+    if name.endswith("pdf"):
+        assert data.startswith(b"%PDF")
+        width, height = (sizes[f"page_{side}_mm"] / 25.4 * 72 for side in ("width", "height"))
+        box = data.split(b"/MediaBox [")[1].split(b"]")[0].split()
+        assert [float(v) for v in box[2:]] == pytest.approx([width, height], abs=0.01)
+        return
+    picture = cv2.imread(str(tmp_path / name), cv2.IMREAD_GRAYSCALE)
+    small = cv2.resize(picture, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+    corners = find_corners(small, Board())
+    assert len(corners) == 60
+    places = Board().opencv().getChessboardCorners()[corners.ids][:, :2]
+    across = np.ptp(corners.px, axis=0) / np.ptp(places, axis=0)
+    assert np.allclose(across, 0.4 * PNG_PX_PER_MM, rtol=1e-4)
+    # the file says how large a pixel is: px a metre, in the chunk pHYs
+    where = data.index(b"pHYs") + 4
+    assert int.from_bytes(data[where : where + 4], "big") == pytest.approx(50_000, abs=30)
+
+
+def test_a_board_of_another_kind_of_file_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "b.svg", tmp_path / "nowhere" / "b.pdf"):
+        with pytest.raises(InputError):
+            print_board(Board(), path)
+
+
+def run(*arguments: object) -> int:
+    """The command line in this process, signals left alone."""
+    before = sys.argv
+    sys.argv = ["sliplab", *map(str, arguments)]
+    try:
+        return entry._run()
+    finally:
+        sys.argv = before
+
+
+def test_a_command_writes_and_says_what(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = lab(tmp_path, moved_mm=1.0)
+    before = path.read_text()
+    assert run("teach", "plane", "--rig", path, "--yes", "--json", "--repeats", 1) == 0
+    said = capsys.readouterr()
+    data = json.loads(said.out)
+    assert data["simulated"] is True
+    assert data["written"] == str(path)
+    assert Path(data["kept"]).read_text() == before
+    assert data["moved_mm"] == pytest.approx(-1.0, abs=0.1)
+    assert "simulated" in said.err
+    assert "mm/s" in said.err
+    file, _ = load_rig_file(path)
+    assert file.calibration.contact_plane.taught == date.today()
+    assert run("teach", "zero", "--rig", path, "--yes", "--by", "events", "--repeats", 1) == 0
+    assert "zero_mm" in capsys.readouterr().out
+    assert load_rig_file(path)[0].calibration.depth_zero is not None
+    # the zero belonged to the plane that was there
+    assert run("teach", "plane", "--rig", path, "--yes", "--by", "hand", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["removed"] == ["calibration.depth_zero"]
+    assert load_rig_file(path)[0].calibration.depth_zero is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("teach", "plane", "--rig", "mock", "--yes"), "--out: is needed: mock.yaml ships"),
+        (("teach", "plane", "--rig", "LAB"), "--yes: is needed where there is no terminal"),
+        (("teach", "plane", "--rig", "LAB", "--yes", "--search", 4.5), "limits.depth = 4 mm"),
+        (("teach", "plane", "--rig", "LAB", "--yes", "--span", 20), "limits.reach = 15 mm"),
+        (("teach", "plane", "--rig", "LAB", "--yes", "--span", 2), "at least 5 mm"),
+        (("teach", "plane", "--rig", "LAB", "--yes", "--speed", 5), "--speed"),
+        (("teach", "tool", "--rig", "LAB", "--yes", "--tool", "1,2"), "must be x,y,z"),
+        (("calibrate", "crop", "--rig", "LAB", "--yes", "--depth", 5), "limits.depth = 4 mm"),
+        (("calibrate", "lens", "--rig", "LAB", "--columns", 60), "3 to 40"),
+        (("calibrate", "lens", "--rig", "LAB", "--images", "FOLDER"), "holds no .png"),
+        (("calibrate", "board", "--out", "board.svg"), "must end in .pdf or .png"),
+        (("teach", "plane", "--rig", "abacus"), "nor a rig that ships"),
+    ],
+)
+def test_wrong_input_is_exit_2_and_moves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[object, ...], says: str,
+) -> None:  # fmt: skip
+    path = lab(tmp_path)
+    (tmp_path / "empty").mkdir()
+    places = {"LAB": path, "FOLDER": tmp_path / "empty"}
+    moved: list[object] = []
+    monkeypatch.setattr(teach, "touch", lambda *_: moved.append(1))
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert run(*(places.get(str(a), a) for a in arguments)) == console.WRONG_INPUT
+    said = capsys.readouterr()
+    assert says in " ".join(said.err.split())
+    assert said.out == ""
+    assert not moved
+    assert [p.name for p in tmp_path.iterdir() if p.suffix] == ["lab.yaml"]
+
+
+@pytest.mark.parametrize("what", ["plane", "zero", "tool"])
+def test_a_dry_run_says_where_and_connects_to_nothing(
+    what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object) -> None:
+        raise AssertionError("a dry run builds no rig")
+
+    monkeypatch.setattr("rigs.build.build_rig", never)
+    assert run("teach", what, "--rig", "mock", "--dry-run", "--json") == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["dry_run"] is True
+    assert len(data["moves"]) == {"plane": 4, "zero": 2, "tool": 0}[what]
+    for move in data["moves"]:
+        assert move["to_mm"] == 2.0
+        x = TRUE_PLANE.position(move["base_mm"])
+        assert x.depth_mm == pytest.approx(2.0, abs=0.01)
+    assert run("teach", what, "--rig", "mock", "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "dry run" in said
+
+
+def test_a_failed_measurement_is_exit_1_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = lab(tmp_path, moved_mm=-6.0)
+    before = path.read_text()
+    assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
+    assert "met nothing within the hard limit" in capsys.readouterr().err
+    assert path.read_text() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["lab.yaml"]
+
+
+def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = lab(tmp_path)
+    before = path.read_text()
+    rigs: list[Rig] = []
+    asked = iter([False] * 250)
+
+    def built(file: Any) -> Rig:
+        rigs.append(build_rig(file))
+        return rigs[-1]
+
+    monkeypatch.setattr("rigs.build.build_rig", built)
+    monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
+    assert run("teach", "plane", "--rig", path, "--yes") == console.INTERRUPTED
+    said = capsys.readouterr().err
+    assert "the arm stands still, nothing was written" in said
+    (rig,) = rigs
+    assert rig.arm.progress().done
+    assert rig.position().depth_mm <= -2.9
+    assert path.read_text() == before
+
+
+def test_a_protective_stop_in_the_middle_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fault = "  faults: [{kind: arm_protective_stop, trial: 2, at_s: 2, since: trial}]\n"
+    path = lab(tmp_path, mock=fault)
+    before = path.read_text()
+    assert run("teach", "plane", "--rig", path, "--yes") == console.FAILED
+    said = " ".join(capsys.readouterr().err.split())
+    assert "unlock the stop at the pendant" in said
+    assert path.read_text() == before
+
+
+def test_a_person_who_says_stop_ends_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stops(*_: object) -> None:
+        raise StopRequested
+
+    monkeypatch.setattr(teach, "jogged", stops)
+    path = lab(tmp_path)
+    assert run("teach", "tool", "--rig", path, "--yes") == console.INTERRUPTED
+    assert "stopped" in capsys.readouterr().err
+
+
+def test_the_arm_is_asked_for_before_it_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    class Terminal:
+        def isatty(self) -> bool:
+            return True
+
+    def answer(text: str, **_: object) -> bool:
+        asked.append(text)
+        raise measuring.typer.Abort
+
+    monkeypatch.setattr("sys.stdin", Terminal())
+    monkeypatch.setattr(measuring.typer, "confirm", answer)
+    assert run("teach", "zero", "--rig", lab(tmp_path)) == console.INTERRUPTED
+    assert "Move the arm?" in asked[0]
+
+
+def test_the_commands_from_outside(tmp_path: Path) -> None:
+    done = sliplab("calibrate", "board", "--out", tmp_path / "board.pdf", "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["width_mm"] == 66.0
+    done = sliplab("teach", "plane", "--rig", "mock", "--dry-run", "--json")
+    assert done.returncode == 0
+    assert len(json.loads(done.stdout)["moves"]) == 4
+
+
+def check(rig: Path, store: Path) -> subprocess.CompletedProcess[str]:
+    return sliplab("check", "protocols/pilot.yaml", "--rig", rig, "--store", store, "--json")
+
+
+def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
+    path = lab(tmp_path)
+    path.write_text(
+        path.read_text()
+        .replace("taught: 2026-11-21", "taught: 2024-01-01")
+        .replace("  touch_depth", "  max_age: {contact_plane: 30 d, lens: 90 d}\n  touch_depth")
+    )
+    done = check(path, tmp_path / "s")
+    assert done.returncode == 1
+    said = [c["finding"] for c in json.loads(done.stdout)["checks"] if not c["passed"]]
+    assert len(said) == 2
+    assert said[0].startswith(f"{path}: calibration.contact_plane.taught = 2024-01-01: is ")
+    assert f"run `sliplab teach plane --rig {path}`" in said[0]
+    assert f"calibration.lens: is missing: run `sliplab calibrate lens --rig {path}`" in said[1]
+
+
+def test_an_arm_that_is_stopped_stays_so(tmp_path: Path) -> None:
+    """Nothing here unlocks anything."""
+    here = bench(lab(tmp_path, mock=(
+        "  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"
+    )))  # fmt: skip
+    with pytest.raises(RigError, match="protective stop"):
+        teach.teach_zero(here, QUICK, 1, False)
+    assert here.rig.arm.state() is ArmState.PROTECTIVE_STOP

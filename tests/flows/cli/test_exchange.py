@@ -1,0 +1,105 @@
+"""`sliplab import` and `export` as a person meets them, and what follows for other commands."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from flows.__main__ import _run
+from flows.planning.orders import make_order
+from flows.running.campaigns import collected
+from protocols import InputError
+from storage.store import Store, StoreError
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, write
+from tests.storage.exchange.files import lab_hdf5
+from tests.storage.trials import campaign, commit
+
+
+@pytest.fixture
+def sliplab(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Run a command in this process: its exit code, what it printed, what it said."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["sliplab", *map(str, arguments)])
+        code = _run()
+        told = capsys.readouterr()
+        return code, told.out, told.err
+
+    return run
+
+
+def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
+    lab_hdf5(tmp_path / "slide.h5")
+    store, out = tmp_path / "store", tmp_path / "out"
+    path = tmp_path / "slide.h5"
+    code, told, _ = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    assert code == 0
+    assert json.loads(told) == {
+        "campaign": "a", "imported": ["slide"], "there": [], "events": 50, "frames": 0,
+    }  # fmt: skip
+    code, told, said = sliplab("verify", store, "--json")
+    assert (code, json.loads(told)["whole"]) == (0, 1)
+    code, told, said = sliplab("trials", store, "--output", tmp_path / "t.parquet")
+    assert code == 0
+    assert "left out" not in said
+    assert pd.read_parquet(tmp_path / "t.parquet")["trial"].tolist() == ["slide"]
+    code, told, _ = sliplab("export", store, "slide", "--output", out, "--json")
+    assert (code, json.loads(told)["events"]) == (0, 50)
+    code, told, _ = sliplab("import", "aedat4", out, "--store", store, "--name", "b", "--json")
+    assert (code, json.loads(told)["imported"]) == (0, ["slide"])
+    assert not Store.open(store).simulated
+    code, *_ = sliplab("export", store, "a", "--labels", "--output", tmp_path / "l.csv")
+    assert code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("import", "none.aedat4", "--store", "s", "--name", "a"), "no such file"),
+        (("import", "bad.aedat4", "--store", "s", "--name", "a"), "is no AEDAT4 file"),
+        (("import", "bad.h5", "--store", "s", "--name", "a"), "is no HDF5 file"),
+        (("import", "bad.aedat4", "--store", "s", "--name", "../a"), "--name"),
+        (("import", "word", "bad.aedat4", "--store", "s", "--name", "a"), "must be one of"),
+        (("import", ".", "--store", "s", "--name", "a"), "is no HDF5 file"),
+        (("export", "ours", "nothing", "--output", "o"), "is no campaign"),
+        (("export", "ours", "c", "--output", "o", "--format", "word"), "must be one of"),
+        (("export", "ours", "c", "--labels", "--output", "o.xls"), "must end in"),
+    ],
+)
+def test_wrong_input_is_exit_2(
+    arguments: tuple[str, ...],
+    says: str,
+    tmp_path: Path,
+    sliplab: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("bad.aedat4", "bad.h5"):
+        (tmp_path / name).write_text("hello")
+    campaign(tmp_path / "ours")
+    code, told, said = sliplab(*arguments)
+    assert (code, told) == (2, "")
+    assert says in said
+    assert not list(tmp_path.glob("s/campaigns/*"))
+
+
+def test_an_imported_campaign_has_no_protocol(tmp_path: Path, sliplab: Any) -> None:
+    lab_hdf5(tmp_path / "slide.h5")
+    store = tmp_path / "store"
+    assert sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
+    with pytest.raises(StoreError, match="was imported"):
+        make_order(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
+    with pytest.raises(StoreError, match="imported campaigns only"):
+        collected(Store.open(store))
+    where = Store.open(store).campaign("c")
+    where.update({"name": "c", "simulated": True}, "protocol: 1\n", "rig: 1\n")
+    commit(where, "t")
+    assert [item.name for item in collected(Store.open(store))] == ["c"]
+    with pytest.raises(InputError, match="has no protocol"):
+        collected(Store.open(store), ["tiny"])

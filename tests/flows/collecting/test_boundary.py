@@ -1,0 +1,219 @@
+"""Between two trials: what people ask for from another terminal; on the mock rig, no waiting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.collecting import boundary as boundary_module
+from flows.collecting.boundary import Boundary, carry_out, refuse_paused
+from flows.collecting.session import Session
+from flows.collecting.stops import CampaignStopped
+from flows.collecting.stretch import stretch
+from flows.planning.orders import make_order, pending_trials, set_aside
+from flows.running import stopping
+from protocols import Trial
+from storage import control
+from storage.decisions import skipped
+from storage.store import Campaign, Store
+from storage.verify import verify
+from tests.flows.collecting.test_session import checksums, session, short
+
+
+@pytest.fixture(autouse=True)
+def forget() -> Iterator[None]:
+    """No stop request outlives its test."""
+    yield
+    with stopping.signals():
+        pass
+
+
+def guarded(
+    folder: Path, data: dict[str, Any] | None = None, **mock: Any
+) -> tuple[Session, Campaign, Store]:
+    """A session with a boundary, whose waits fail unless a test says what happens in them."""
+    work, campaign = session(folder, data or short(), **mock)
+    store = Store.open(folder / "store")
+    order = make_order(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+    work.boundary = Boundary(order, store, campaign)
+    work.boundary.fresh_start = work.fresh_start
+
+    def never(seconds: float) -> None:
+        raise AssertionError("waits")
+
+    work.boundary.wait = never
+    return work, campaign, store
+
+
+def after_first(work: Session, do: Callable[[], object]) -> list[tuple[str, str]]:
+    """Take what is pending; somebody does something during the first trial. What was told."""
+    told: list[tuple[str, str]] = []
+
+    def on_trial(trial: Trial, outcome: str) -> None:
+        if not told:
+            do()
+        told.append((trial.id, outcome))
+
+    work.on_trial = on_trial
+    work.take(pending_trials(work.plan, work.campaign))
+    return told
+
+
+def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path) -> None:
+    plain, untouched = session(tmp_path / "plain", short())
+    plain.take(pending_trials(plain.plan, untouched))
+    work, campaign, store = guarded(tmp_path / "a")
+    waits: list[float] = []
+    pauses: list[float] = []
+    during: list[int] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        during.append(len(campaign.committed()))
+        if len(waits) == 3:
+            control.ask(store, "resume", who="ben")
+
+    assert work.boundary is not None
+    work.boundary.wait, work.boundary.on_pause = wait, pauses.append
+    after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
+    assert during == [1, 1, 1]
+    assert pauses == [3 * boundary_module.LOOK_S]
+    asked = control.requests(store)
+    assert [(item.kind, item.who, item.why) for item in asked] == [
+        ("pause", "anna", "lunch"), ("resume", "ben", ""),
+    ]  # fmt: skip
+    answers = [control.answered(store, item) for item in asked]
+    assert [answer and answer["did"]["paused"] for answer in answers] == [True, False]
+    assert checksums(campaign) == checksums(untouched)
+
+
+def test_a_pause_that_nobody_ends_ends_the_stretch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(boundary_module, "PAUSE_LIMIT_S", 2.0)
+    work, campaign, store = guarded(tmp_path / "a")
+    assert work.boundary is not None
+    work.boundary.wait = lambda seconds: None
+    with pytest.raises(CampaignStopped, match=r"pause by anna.*nobody resumed it: `sliplab resume"):
+        after_first(work, lambda: control.ask(store, "pause", who="anna"))
+    assert len(campaign.committed()) == 1
+    with pytest.raises(CampaignStopped, match="is paused"):
+        refuse_paused(store)
+    control.ask(store, "resume")
+    refuse_paused(store)
+
+
+def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["maintenance"]["warm_up"] = {
+        "presses": 1, "depth": "2.4 mm", "speed": "2 mm/s", "clearance": "5 mm",
+    }  # fmt: skip
+    work, campaign, store = guarded(tmp_path / "a", data)
+    done: list[str] = []
+    press, touch_off = work.rig.press, work.rig.touch_off
+    work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
+    work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
+    assert work.boundary is not None
+    work.boundary.wait = lambda seconds: control.ask(store, "resume") and None
+    after_first(work, lambda: control.ask(store, "pause"))
+    assert done == ["warm up", "zero"] * 2
+    assert len(campaign.committed()) == 3
+
+
+def test_a_stop_that_came_by_file_is_heeded_at_the_next_boundary(tmp_path: Path) -> None:
+    work, campaign, store = guarded(tmp_path / "a")
+    with pytest.raises(KeyboardInterrupt):
+        after_first(work, lambda: control.ask(store, "stop", why="smoke"))
+    assert stopping.requested()
+    assert len(campaign.committed()) == 1
+    assert campaign.quarantined() == []
+    (request,) = control.requests(store)
+    answer = control.answered(store, request)
+    assert answer is not None
+    assert answer["did"]["stopped"]
+
+
+def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
+    work, _, store = guarded(tmp_path / "a")
+    work.rig.close()
+    control.ask(store, "stop")
+    order = make_order(
+        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
+    )
+    with stretch(order) as work_now:
+        work_now.session.rig.connect()
+        work_now.session.take(work_now.trials)
+        assert work_now.session.taken == 3
+
+
+def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> None:
+    work, campaign, store = guarded(tmp_path / "a")
+    first, second, third = (trial.id for trial in work.plan)
+    by = {"who": "anna", "why": "cable in the way"}
+
+    def ask() -> None:
+        control.ask(store, "skip", campaign="tiny", trials=(second, first), **by)
+        control.ask(store, "again", campaign="tiny", trials=(first,), who="ben", why="dust")
+
+    told = after_first(work, ask)
+    assert told == [(first, "committed"), (second, "skipped"), (third, "committed")]
+    (request, _) = control.requests(store)
+    answer = control.answered(store, request)
+    assert answer is not None
+    assert answer["did"]["trials"] == {
+        second: "set aside", first: "is committed: left as it is",
+    }  # fmt: skip
+    (aside,) = set_aside(work.plan, campaign)
+    assert (aside["trial"], aside["cause"], aside["by"]) == (second, "cable in the way", "anna")
+    assert skipped(campaign)[second]["request"] == 1
+    (kept,) = campaign.quarantined()
+    assert (kept["cause"], kept["asked"]["who"]) == ("again: dust", "ben")
+    assert work.boundary is not None
+    again = work.boundary.more()
+    assert [trial.id for trial in again] == [first]
+    work.take(again)
+    assert work.boundary.more() == []
+    assert campaign.recording(first).record["attempt"] == 1  # another take, another seed
+    assert campaign.committed() == {first, third}
+    assert verify(store) == []
+    control.ask(store, "again", campaign="tiny", trials=(second,), why="cable is gone")
+    work.take(work.boundary.more())
+    assert campaign.committed() == {first, second, third}
+    assert set_aside(work.plan, campaign) == []
+
+
+def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["gates"]["retakes"] = 1
+    fault = {"kind": "event_gap", "at_s": 0.6, "seconds": 0.2}
+    work, campaign, store = guarded(tmp_path / "a", data, faults=[fault])
+    work.take(list(work.plan)[:1])
+    (aside,) = set_aside(work.plan, campaign)
+    assert aside["cause"].startswith("gate: event_gap_s = 0.2")
+    assert (aside["attempts"], aside["by"]) == (2, None)
+    control.ask(store, "again", campaign="tiny", trials=(aside["trial"],), why="cable mended")
+    carry_out(store)
+    assert len(pending_trials(work.plan, campaign)) == 3
+    mended, campaign = session(tmp_path / "a", data)
+    mended.take(list(mended.plan)[:1])
+    assert mended.taken == 1
+    assert campaign.recording(aside["trial"]).record["attempt"] == 2
+    assert len(campaign.quarantined()) == 2
+
+
+def test_a_request_is_done_once_even_after_a_crash(tmp_path: Path) -> None:
+    """Killed between doing and answering: done again, it changes nothing."""
+    work, campaign, store = guarded(tmp_path / "a")
+    work.take(list(work.plan)[:1])
+    (first,) = campaign.committed()
+    request = control.ask(store, "again", campaign="tiny", trials=(first,), why="dust")
+    carry_out(store)
+    (store.folder / control.FOLDER / "000001.done.json").unlink()
+    ((_, answer),) = carry_out(store)
+    assert answer["did"]["trials"] == {first: "was pending already"}
+    assert control.answered(store, request) == answer
+    assert carry_out(store) == []
+    assert len(campaign.quarantined()) == 1

@@ -1,0 +1,170 @@
+"""Every fault by name, once each in a campaign of 30 trials: docs/faults.md says what comes of it.
+
+The table there is held to what happens: what the arm did, what became of the trial, and what the
+person at the rig reads. A row that is not true any more fails here and shows the true one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from analysis.labels.labelling import label_recording
+from flows.planning.orders import campaign_counts, make_order, pending_trials
+from protocols.settings import Labelling
+from rigs.capabilities import ArmFault, ArmState, RigError
+from rigs.mock.fault_settings import KINDS
+from rigs.rig import Rig
+from storage.errors import StoreError
+from storage.store import Campaign, Store
+from storage.verify import verify
+from tests.conftest import ROOT
+from tests.flows.collecting.test_session import checksums, session, short
+from tests.flows.conftest import tiny_gravity
+
+PLANNED = 30
+CLEAR_MM = -0.5
+"""Depth above which the tip stands clear of the plate."""
+
+FAULTS: list[dict[str, Any]] = [
+    {"kind": "arm_protective_stop", "at_mm": 0.8},
+    {"kind": "arm_off_path", "mm": 0.3, "seconds": 0.5},
+    {"kind": "frames_lost", "count": 3},
+    {"kind": "frame_late", "seconds": 0.05},
+    {"kind": "event_gap"},
+    {"kind": "event_stall", "seconds": 0.3},
+    {"kind": "event_burst", "seconds": 0.02},
+    {"kind": "clock_drift", "device": "event_camera", "ppm": 20},
+    {"kind": "clock_drift", "device": "sync_box", "ppm": 2000},
+    {"kind": "clock_jump", "device": "arm", "seconds": 0.25},
+    {"kind": "clock_jump", "device": "frame_camera", "seconds": -5000},
+    {"kind": "clock_restart", "device": "event_camera"},
+    {"kind": "pulses_lost", "count": 5},
+    {"kind": "pulses_duplicated", "count": 5, "device": "arm"},
+    {"kind": "pulses_late", "count": 5},
+    {"kind": "pulses_late", "count": 30, "device": "arm"},
+    {"kind": "papilla_torn", "papilla": 0},
+    {"kind": "marker_occluded", "papilla": 0},
+    {"kind": "disk_full"},
+    {"kind": "device_gone", "device": "arm"},
+    {"kind": "device_gone", "device": "event_camera"},
+    {"kind": "device_gone", "device": "frame_camera"},
+    {"kind": "device_gone", "device": "sync_box"},
+]
+"""Each happens once, in the middle of a trial of its own; a plate sticks only where one falls."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of a fault, in the words of docs/faults.md."""
+
+    fault: str
+    arm: str
+    trial: str
+    reads: str
+
+
+def _shown(fault: dict[str, Any]) -> str:
+    """A fault as it stands in a rig file."""
+    return "{" + ", ".join(f"{key}: {value}" for key, value in fault.items()) + "}"
+
+
+def _numbers_aside(text: str) -> str:
+    """Words without their figures, which another processor may give in another last digit."""
+    return re.sub(r"-?\d+(\.\d+)?(e-?\d+)?", "#", text)
+
+
+def _arm(rig: Rig) -> str:
+    """What the arm did when its trial ended early."""
+    try:
+        clear = rig.frame.position(rig.arm.pose().xyz_mm).depth_mm < CLEAR_MM
+        ready = rig.arm.state() is ArmState.READY
+    except ArmFault:
+        return "stands still, and is not asked to move"
+    assert clear is ready  # it moves if, and only if, it is healthy
+    return "stops, then clears the plate" if clear else "stops and stays where it is"
+
+
+def _suffer(
+    folder: Path, data: dict[str, Any], fault: dict[str, Any]
+) -> tuple[Row, Campaign, set[str]]:
+    """The next trial of a campaign with a fault in it; the trials that it committed, too."""
+    at = {} if fault["kind"] == "plate_stuck" or "at_mm" in fault else {"at_s": 0.8}
+    work, campaign = session(
+        folder, data, faults=[{**fault, "trial": 1, **at}], frame_camera={"level": "tracks"}
+    )
+    before = campaign.committed()
+    (trial, *_) = pending_trials(work.plan, campaign)
+    aside = {item["folder"] for item in campaign.quarantined()}
+    error = ""
+    try:
+        work.take([trial])
+    except (RigError, StoreError) as ended:
+        error = str(ended).replace(f"{folder}/", "")
+    arm = _arm(work.rig) if error else "finishes its motion"
+    work.rig.close()
+    made = campaign.committed() - before
+    causes = [str(item["cause"]) for item in campaign.quarantined() if item["folder"] not in aside]
+    if error:
+        assert len(causes) == 1
+        row = Row(_shown(fault), arm, "set aside, taken when the campaign goes on", error)
+    elif causes:
+        row = Row(_shown(fault), arm, "taken again at once", "; ".join(causes))
+    else:
+        (recording,) = [each for each in campaign.recordings() if each.trial_id in made]
+        doubts = label_recording(recording, Labelling()).as_json()["doubts"]
+        told = "; ".join(sorted({str(why) for why in doubts.values() if why is not None}))
+        row = Row(_shown(fault), arm, "good", f"label: {told}" if told else "nothing")
+    return row, campaign, made
+
+
+def _table() -> dict[str, Row]:
+    """The rows of docs/faults.md, by fault."""
+    text = (ROOT / "docs" / "faults.md").read_text()
+    lines = text.split("## Once each, in a campaign of 30 trials")[1].splitlines()
+    cells = [
+        [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+        for line in lines
+        if line.startswith("| `")
+    ]
+    return {row[0]: Row(*row) for row in cells}
+
+
+def test_every_fault_once_in_a_campaign_and_the_table_in_the_docs(tmp_path: Path) -> None:
+    data = short()
+    directions = [round(137.508 * number % 360, 2) for number in range(PLANNED)]
+    data["collection"]["factors"]["direction"]["values"] = directions
+    data["collection"]["maintenance"] = {}  # a trial is the first thing that the rig does
+    rows = []
+    kept: dict[str, str] = {}
+    for fault in FAULTS:
+        row, campaign, _ = _suffer(tmp_path, data, fault)
+        rows.append(row)
+        now = checksums(campaign)
+        assert kept.items() <= now.items()  # what was committed stays as it was
+        kept = now
+    assert {fault["kind"] for fault in FAULTS} | {"plate_stuck"} == set(KINDS)
+    sound, campaign = session(tmp_path, data, frame_camera={"level": "tracks"})
+    sound.take(pending_trials(sound.plan, campaign))
+    assert len(sound.plan) == len(campaign.committed()) == PLANNED
+    assert kept.items() <= checksums(campaign).items()
+    assert verify(Store.open(tmp_path / "store")) == []
+    order = make_order(tmp_path / "p.yaml", tmp_path / "rig.yaml", tmp_path / "store")
+    counts = campaign_counts(order, campaign)
+    assert (counts["planned"], counts["missing"], counts["set_aside"]) == (PLANNED, 0, [])
+
+    falling = tiny_gravity()
+    falling["collection"]["motion"][6]["distance"] = "0.5 mm"
+    row, _, _ = _suffer(tmp_path / "falling", falling, {"kind": "plate_stuck"})
+    rows.append(row)
+
+    told = _table()
+    for row in rows:
+        true = f"| `{row.fault}` | {row.arm} | {row.trial} | {row.reads} |"
+        assert row.fault in told, true
+        said = told[row.fault]
+        assert (said.arm, said.trial) == (row.arm, row.trial), true
+        assert _numbers_aside(said.reads) == _numbers_aside(row.reads), true
+    assert told.keys() == {row.fault for row in rows}

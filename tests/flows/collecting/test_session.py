@@ -1,0 +1,170 @@
+"""Collection below Prefect: gates, retakes, quarantine, changeovers, and data that never vary."""
+
+from __future__ import annotations
+
+import json
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.collecting.session import Session
+from flows.planning.orders import campaign_counts, describe_campaign, make_order, pending_trials
+from protocols.yaml_file import parse_yaml
+from rigs.build import build_rig
+from rigs.capabilities import ArmFault, RigError
+from storage.store import Campaign, Store, StoreError
+from storage.verify import verify
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, tiny_gravity, write
+
+
+def short() -> dict[str, Any]:
+    """Three slides that are over in a second: for collection only."""
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
+    data["collection"]["motion"][3]["distance"] = "1.6 mm"
+    data["collection"]["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
+    data["analysis"]["split"] = {"method": "ranked"}
+    return data
+
+
+def session(
+    folder: Path, data: dict[str, Any], timing: dict[str, Any] | None = None, **mock: Any
+) -> tuple[Session, Campaign]:
+    """A connected session on a mock rig with other mock settings, and other timing."""
+    folder.mkdir(exist_ok=True)
+    rig_data = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
+    text = json.dumps(
+        {**rig_data, "mock": {**rig_data["mock"], **mock}, "timing": timing or {}},
+        default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
+    )
+    (folder / "rig.yaml").write_text(text)
+    order = make_order(write(folder / "p.yaml", data), folder / "rig.yaml", folder / "store")
+    campaign = describe_campaign(Store.create(folder / "store"), order)
+    rig = build_rig(order.rig)
+    rig.connect()
+    return Session(order.plan, order.rig, rig, campaign), campaign
+
+
+def take_all(work: Session) -> None:
+    """Take what is pending."""
+    work.take(pending_trials(work.plan, work.campaign))
+
+
+def checksums(campaign: Campaign) -> dict[str, str]:
+    """One hash a committed trial."""
+    return {recording.trial_id: recording.checksum for recording in campaign.recordings()}
+
+
+def test_a_campaign_in_pieces_is_the_campaign_in_one(tmp_path: Path) -> None:
+    whole, campaign = session(tmp_path / "a", short())
+    take_all(whole)
+    expected = checksums(campaign)
+    assert len(expected) == 3
+    pieces: Campaign | None = None
+    for _ in range(3):
+        part, pieces = session(tmp_path / "b", short())
+        part.take(pending_trials(part.plan, pieces)[:1])
+        assert part.taken == 1
+    assert pieces is not None
+    assert checksums(pieces) == expected
+    assert verify(Store.open(tmp_path / "b" / "store")) == []
+
+
+def test_a_trial_that_fails_a_gate_is_taken_again(tmp_path: Path) -> None:
+    # begun on this rig: 1 is touching off, 2 the first trial
+    fault = {"kind": "frames_lost", "trial": 2, "at_s": 0.3, "count": 3}
+    work, campaign = session(tmp_path / "a", short(), faults=[fault])
+    take_all(work)
+    assert (work.taken, work.retaken) == (4, 1)
+    assert len(campaign.committed()) == 3
+    (failed,) = campaign.quarantined()
+    assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
+    again = campaign.recording(failed["trial"])
+    assert again.record["attempt"] == 1
+    assert again.record["quality"]["passed"]
+    assert verify(Store.open(tmp_path / "a" / "store")) == []
+
+
+def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
+    data = short()
+    data["collection"]["gates"]["retakes"] = 1
+    fault = {"kind": "event_gap", "at_s": 0.6, "seconds": 0.2}
+    work, campaign = session(tmp_path / "a", data, faults=[fault])
+    take_all(work)
+    assert campaign.committed() == set()
+    assert len(campaign.quarantined()) == 6
+    assert pending_trials(work.plan, campaign) == []
+    order = make_order(
+        tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
+    )
+    counts = campaign_counts(order, campaign)
+    assert counts["planned"] == counts["committed"] + counts["missing"] == 3
+    assert len(counts["set_aside"]) == 3
+
+
+def test_a_protective_stop_ends_the_stretch_and_loses_nothing(tmp_path: Path) -> None:
+    fault = {"kind": "arm_protective_stop", "trial": 3, "at_s": 0.7}
+    work, campaign = session(tmp_path / "a", short(), faults=[fault])
+    with pytest.raises(ArmFault, match="protective stop"):
+        take_all(work)
+    assert len(campaign.committed()) == 1
+    (kept,) = campaign.quarantined()
+    assert kept["cause"].startswith("ArmFault: arm: protective stop")
+    assert campaign.failed_attempts() == {}
+    again, campaign = session(tmp_path / "c", short())
+    take_all(again)
+    assert len(campaign.committed()) == 3
+
+
+def test_a_person_changes_the_plate_once_a_block(tmp_path: Path) -> None:
+    data = tiny_gravity()
+    data["collection"]["motion"][6]["distance"] = "0.5 mm"
+    work, campaign = session(tmp_path / "a", data)
+    asked: list[str] = []
+    operator = work.rig.operator
+
+    class Asked:
+        def ask(self, task: str, prompt: str, expected: str) -> bool:
+            asked.append(expected)
+            return operator.ask(task, prompt, expected)
+
+    work.rig.operator = Asked()
+    take_all(work)
+    assert asked == ["0.165 kg", "0.245 kg"]
+    assert len(campaign.committed()) == 2
+
+
+def test_a_change_that_was_not_made_is_noticed(tmp_path: Path) -> None:
+    work, campaign = session(tmp_path / "a", tiny_gravity())
+
+    class Absent:
+        def ask(self, task: str, prompt: str, expected: str) -> bool:
+            return True
+
+    work.rig.operator = Absent()
+    with pytest.raises(RigError, match="another mass mounted"):
+        take_all(work)
+    assert campaign.committed() == set()
+
+
+def test_another_collection_or_rig_is_refused_and_new_trials_are_not(tmp_path: Path) -> None:
+    work, _ = session(tmp_path / "a", short())
+    take_all(work)
+    store, rig = tmp_path / "a" / "store", tmp_path / "a" / "rig.yaml"
+    data = short()
+    data["analysis"]["detection"]["margin"] = 5
+    data["collection"]["factors"]["direction"]["values"].append(300)
+    order = make_order(write(tmp_path / "more.yaml", data), rig, store)
+    assert len(pending_trials(order.plan, Store.open(store).campaign("tiny"))) == 1
+    data["collection"]["motion"][1]["speed"] = "1 mm/s"
+    with pytest.raises(StoreError, match="another `collection:` section"):
+        make_order(write(tmp_path / "other.yaml", data), rig, store)
+    fewer = short()
+    fewer["collection"]["factors"]["direction"]["values"] = [0, 120]
+    with pytest.raises(StoreError, match="may only add trials"):
+        make_order(write(tmp_path / "fewer.yaml", fewer), rig, store)
+    with pytest.raises(StoreError, match="another rig file"):
+        make_order(tmp_path / "more.yaml", ROOT / "rigs" / "mock.yaml", store)

@@ -1,0 +1,76 @@
+"""What tests of live detection share: a model file, a short trial, networks that obey."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.detect.live import Counting
+from analysis.nets import model_file
+from analysis.nets.network import SPIKING, build, weights
+from analysis.nets.training import EpochRecord, Fitted
+from flows.detecting.detect_order import DetectOrder, make_detect_order
+from protocols.settings import Network, Training, Windows
+from rigs.build import build_rig
+from rigs.rig import Rig
+from rigs.rig_file import RigFile
+from tests.conftest import ROOT
+from tests.flows.live import quick
+
+RIG = ROOT / "rigs" / "rehearsal.yaml"
+MANY = 300
+"""Events of a 30 ms window that only a moving sensor gives."""
+
+
+def untrained(seed: int = 0) -> Fitted:
+    """A network as it is before training; it spikes, and knows nothing."""
+    network, windows, training = Network(), Windows(), Training(epochs=1)
+    record = EpochRecord(1, 1.0, 0.3, 1.0, 0.3, 0.3, 0.3, dict.fromkeys(SPIKING, 0.1))
+    state = weights(build(network, windows, seed))
+    return Fitted(state, network, windows, training, seed, (record,), 1, ())
+
+
+def model_in(folder: Path) -> Path:
+    """A model file."""
+    path = folder / "model.pt"
+    model_file.save(path, untrained())
+    return path
+
+
+def slip_when_busy(most: int = MANY) -> Counting:
+    """Says incipient slip in a window with more than so many counts, no slip otherwise."""
+
+    def count(x: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+        busy = int(x.sum()) > most
+        return np.array([[0, 9, 0] if busy else [9, 0, 0]], np.int64)
+
+    return count
+
+
+def short_slide() -> dict[str, Any]:
+    """A slide of 7 mm at 6 mm/s after half a second of hold."""
+    return quick()
+
+
+def ordered(model: Path, protocol: Path, **options: Any) -> DetectOrder:
+    """The first trial of a protocol on the simulated rig."""
+    return make_detect_order(RIG, model, protocol=protocol, trial="", **options)
+
+
+def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:
+    """Builds rigs and keeps them to be looked at."""
+
+    def build(file: RigFile) -> Rig:
+        rigs.append(build_rig(file))
+        return rigs[-1]
+
+    return build
+
+
+def stands_clear(rig: Rig) -> bool:
+    """Whether the arm stands still off the plate."""
+    return rig.arm.progress().done and rig.position().depth_mm < 0

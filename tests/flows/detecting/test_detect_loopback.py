@@ -1,0 +1,47 @@
+"""The detector through the real drivers, in real time: what it sees, and a reflex."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flows.detecting.detect import detect
+from flows.detecting.detect_order import make_detect_order
+from rigs.build import loopback_rig
+from rigs.rig import Rig
+from rigs.rig_file import RigFile
+from tests.flows.conftest import write
+from tests.flows.detecting.detecting import model_in, short_slide, slip_when_busy
+from tests.flows.live import rig_yaml, stage_of
+
+pytestmark = pytest.mark.realtime
+
+BEHIND_MS = 500.0
+"""How late a decision may be on a busy machine before something is wrong."""
+
+
+def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
+    order = make_detect_order(
+        rig_yaml(tmp_path), model_in(tmp_path), protocol=write(tmp_path / "p.yaml", short_slide()),
+        trial="", reflex="press:0.3", hold_s=0.3,
+    )  # fmt: skip
+    with stage_of(order.rig) as stage:
+
+        def build(file: RigFile) -> Rig:
+            return loopback_rig(file, stage)
+
+        result = detect(order, counting=slip_when_busy(), build=build)
+        assert stage.arm_place()[2] < 0
+    assert result["simulated"] is True
+    assert result["virtual_time"] is False
+    assert result["losses"]["late"] == result["losses"]["gaps"] == 0
+    assert result["windows"] > 15
+    reflex = result["reflex"]
+    assert reflex["done"]
+    x, _, depth = reflex["stopped_mm"]
+    assert -3.5 < x < 3.0
+    assert depth == pytest.approx(2.4, abs=0.05)
+    assert reflex["depth_mm"] == pytest.approx(2.7, abs=0.05)
+    assert 0 < result["latency_ms"]["median"] < BEHIND_MS
+    print(f"simulated: latency {result['latency_ms']}, compute {result['compute_ms']}, {reflex}")

@@ -1,0 +1,191 @@
+"""What people decided, applied to labels: only on the label they saw, and only when asked."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from flows.labelling.label import STEP
+from flows.labelling.reviewed import Labels
+from flows.learning import evaluate, train
+from flows.reviewing.review_list import TrialList, chosen, doubts_of
+from flows.reviewing.review_trial import load
+from protocols.errors import InputError
+from storage import review
+from storage.derived import Derived
+from storage.errors import StoreError
+from storage.recording import Recording
+from storage.review import Onsets, Verdict
+from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
+
+NEW = Onsets(300_000_000, 500_000_000)
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Reviewable:
+    """Twelve trials."""
+    return Reviewable(tmp_path / "s", 12)
+
+
+def decide(made: Reviewable, trial: str, verdict: Verdict, new: Onsets = NEW) -> None:
+    known = label()
+    old = Onsets(known["incipient_ns"], known["gross_ns"])
+    seen = review.counts(made.store, NAME).get(trial, 0)
+    review.decide(
+        made.store, NAME, trial, verdict, label=made.keys[trial], old=old, new=new, seen=seen,
+        who="anna", why="because",
+    )  # fmt: skip
+
+
+def recording(made: Reviewable, trial: str) -> Recording:
+    return made.item.campaign.recording(trial)
+
+
+def test_decisions_count_only_when_asked(made: Reviewable) -> None:
+    one, two, three, four = made.ids[:4]
+    decide(made, one, "adjust")
+    decide(made, two, "reject", Onsets())
+    decide(made, three, "accept", Onsets())
+    decide(made, four, "reject", Onsets())
+    decide(made, four, "reopen", Onsets())
+    plain, reviewed = Labels(made.store), Labels(made.store, reviewed=True)
+    for trial in made.ids[:5]:
+        found = plain.read(made.item, recording(made, trial))
+        assert found == {"key": made.keys[trial], **label()}
+        assert plain.key(made.item, recording(made, trial)) == made.keys[trial]
+    assert plain.states([made.item]) is None
+    assert plain.told([made.item]) == {}
+
+    found = reviewed.read(made.item, recording(made, one))
+    assert (found["incipient_ns"], found["gross_ns"]) == (NEW.incipient_ns, NEW.gross_ns)
+    assert found["per_marker_ns"] == label()["per_marker_ns"]
+    found = reviewed.read(made.item, recording(made, two))
+    assert (found["incipient_ns"], found["gross_ns"]) == (None, None)
+    assert found["doubts"]["incipient"] == "rejected: because"
+    for trial in made.ids[2:5]:
+        assert reviewed.read(made.item, recording(made, trial))["gross_ns"] == label()["gross_ns"]
+        assert reviewed.key(made.item, recording(made, trial)) == made.keys[trial]
+    assert reviewed.states([made.item]) == {
+        "open": 9, "accepted": 1, "adjusted": 1, "rejected": 1, "stale": 0
+    }  # fmt: skip
+
+
+def test_keys_follow_from_the_onsets_that_were_decided(made: Reviewable) -> None:
+    labels, trial = Labels(made.store, reviewed=True), made.ids[0]
+    keys = [labels.key(made.item, recording(made, trial))]
+    for verdict, new in (
+        ("adjust", NEW), ("adjust", Onsets(300_000_000, 500_000_001)), ("adjust", NEW),
+        ("reject", Onsets()), ("accept", Onsets()),
+    ):  # fmt: skip
+        decide(made, trial, verdict, new)  # type: ignore[arg-type]  # of the two verdicts
+        keys.append(labels.key(made.item, recording(made, trial)))
+    assert keys[0] == keys[5] == made.keys[trial]
+    assert keys[1] == keys[3]
+    assert len(set(keys)) == 4
+
+
+def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
+    made: Reviewable, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trial = made.ids[0]
+    made.keys[trial] = "of an older label"
+    decide(made, trial, "adjust")
+    labels = Labels(made.store, reviewed=True)
+    found = labels.read(made.item, recording(made, trial))
+    assert found["incipient_ns"] == label()["incipient_ns"]
+    assert labels.told([made.item])["reviewed"]["stale"] == 1
+    assert (
+        "decisions on 1 trials were made on labels that have changed since"
+        in capsys.readouterr().err
+    )
+    rows = TrialList(made.store).rows
+    assert rows[0].state == "stale"
+    assert chosen(rows, state="stale") == [rows[0]]
+
+
+def test_models_and_evaluation_know_whose_labels_they_stand_on(made: Reviewable) -> None:
+    items = [made.item]
+    used = next(t for t, _ in made.item.trials if t.split == "train").id
+    before = train.wanted_models(made.store, items)[0].key
+    assert train.wanted_models(made.store, items, reviewed=True)[0].key == before
+    decide(made, used, "adjust")
+    assert train.wanted_models(made.store, items)[0].key == before
+    assert train.wanted_models(made.store, items, reviewed=True)[0].key != before
+    with pytest.raises(StoreError, match="with `--reviewed`"):
+        evaluate.make_job(made.store, items, reviewed=True)
+
+
+def test_a_damaged_decision_stops_what_would_use_it(made: Reviewable) -> None:
+    trial = made.ids[0]
+    decide(made, trial, "adjust")
+    path = made.store.folder / "review" / NAME / trial / "000001.json"
+    path.write_text("{")
+    with pytest.raises(StoreError, match=r"000001\.json"):
+        Labels(made.store, reviewed=True).key(made.item, recording(made, trial))
+    assert Labels(made.store).key(made.item, recording(made, trial)) == made.keys[trial]
+    assert "000001.json" in TrialList(made.store).rows[0].problem
+
+
+def test_the_list_follows_the_store(made: Reviewable) -> None:
+    trials = TrialList(made.store)
+    assert [row.trial for row in trials.rows] == made.ids
+    assert {(row.label, row.state, row.severity) for row in trials.rows} == {("fresh", "open", 0)}
+    assert not trials.refresh()
+    decide(made, made.ids[3], "adjust")  # by another program
+    assert trials.refresh()
+    assert (trials.rows[3].state, trials.rows[3].who) == ("adjusted", "anna")
+    derived = Derived.of(made.store, STEP, NAME)
+    derived.write(made.ids[5], "other", {**label(), "gross_ns": None, "flags": ["knocked"]})
+    (derived.folder / f"{made.ids[6]}.json").unlink()
+    assert trials.refresh()
+    assert [row.label for row in trials.rows[4:7]] == ["fresh", "stale", "missing"]
+    assert trials.rows[5].reasons == ("no gross slip was found", "knocked")
+    first = chosen(trials.rows)
+    assert first[0] == trials.rows[5]
+    assert first[-1] == trials.rows[3]
+    assert [row.trial for row in chosen(trials.rows, doubtful_first=False)] == made.ids
+    assert chosen(trials.rows, state="doubtful") == [trials.rows[5]]
+
+
+def test_doubts_are_told_once_and_gravest_first() -> None:
+    data = {"incipient_ns": None, "gross_ns": None, "markers_lost": 2, "plate_lost": 1,
+            "doubts": {"incipient": None, "gross": "hidden"}}  # fmt: skip
+    assert [text for _, text in doubts_of(data)] == [
+        "gross: hidden", "no slip was found", "2 times a marker was not seen",
+        "the plate's marker was not seen in 1 frames",
+    ]  # fmt: skip
+
+
+def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
+    trials = TrialList(made.store)
+    shown = load(made.store, made.item, trials.rows[0])
+    assert shown.displacement_px == pytest.approx(displacements(), abs=1e-6)
+    assert shown.xy_px is not None
+    assert (shown.xy_px == places()).all()
+    assert 0 < shown.rate.sum() / 100 <= EVENTS
+    assert shown.rate[:19].sum() / 100 <= 200
+    assert shown.motion_s == (0.2, 0.6)
+    assert shown.frame_at(0.2551) == 25
+    picture = shown.picture(25)
+    assert picture is not None
+    assert picture.shape == (120, 120)
+    assert picture[60, 60] == 220
+    shown.close()
+    # without a label there are still events and frames to see
+    Derived.of(made.store, STEP, NAME).folder.joinpath(f"{made.ids[1]}.json").unlink()
+    assert trials.refresh()
+    bare = load(made.store, made.item, trials.rows[1])
+    assert bare.displacement_px.shape == (60, 0)
+    assert bare.suggested == Onsets()
+
+
+def test_a_port_that_is_taken_and_a_campaign_that_is_not_there(made: Reviewable) -> None:
+    from flows.cli.app import app
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for arguments, said in (["--port", port], "--port"), (["--campaign", "x"], "are kinematic"):
+            with pytest.raises(InputError, match=said):
+                app(["review", str(made.store.folder), *arguments], standalone_mode=False)

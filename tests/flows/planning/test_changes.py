@@ -1,0 +1,117 @@
+"""A changed protocol is refused with what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.planning.changes import MOST, differences, told
+from flows.planning.orders import describe_campaign, make_order
+from protocols import load_plan
+from rigs.rig_file import load_rig_file
+from storage.store import Store, StoreError
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, write
+from tests.storage.trials import commit
+
+
+def test_differences_name_key_old_and_new() -> None:
+    old = {"a": 1, "b": [{"c": 1}, {"c": 2}], "d": [1, 2], "e": {"f": 1}, "g": None}
+    new = {"a": 1, "b": [{"c": 1}, {"c": 3}, {"c": 4}], "d": [1, 3], "h": {"i": 1}, "g": 2}
+    assert list(differences(old, new)) == [
+        ("b[1].c", "2", "3"),
+        ("b[2]", "not there", "{c: 4}"),
+        ("d", "[1, 2]", "[1, 3]"),
+        ("e", "{f: 1}", "not there"),
+        ("g", "not there", "2"),
+        ("h", "not there", "{i: 1}"),
+    ]
+    assert told(old, old) == ""
+    many = {str(number): number for number in range(MOST + 3)}
+    assert told(many, {}).endswith("\n  and 3 more")
+
+
+RIG = ROOT / "rigs" / "rehearsal.yaml"
+
+
+def begin(folder: Path, data: dict[str, Any]) -> Store:
+    """A store in which a campaign under `data` was begun."""
+    order = make_order(write(folder / "p.yaml", data), RIG, folder / "store")
+    store = Store.create(folder / "store")
+    describe_campaign(store, order)
+    return store
+
+
+def refused(folder: Path, data: dict[str, Any], rig: Path = RIG) -> str:
+    with pytest.raises(StoreError) as error:
+        make_order(write(folder / "new.yaml", data), rig, folder / "store")
+    return str(error.value)
+
+
+def test_what_changed_in_the_collection_is_said(tmp_path: Path) -> None:
+    begin(tmp_path, tiny())
+    data = tiny()
+    data["collection"]["motion"][1]["speed"] = "1 mm/s"
+    data["collection"]["gates"]["retakes"] = 5
+    data["collection"]["maintenance"]["rezero"]["every"] = 4
+    data["collection"]["factors"]["direction"]["values"].append(330)  # this alone would do
+    message = refused(tmp_path, data)
+    assert "was begun under another `collection:` section" in message
+    for line in (
+        "collection.motion[1].speed: 2 mm/s -> 1 mm/s",
+        "collection.gates.retakes: 2 -> 5",
+        "collection.maintenance.rezero.every: 3 -> 4",
+    ):
+        assert f"\n  {line}" in message
+
+
+def test_another_way_to_write_the_same_is_no_change(tmp_path: Path) -> None:
+    begin(tmp_path, tiny())
+    data = tiny()
+    data["collection"]["motion"][1]["speed"] = "0.2 cm/s"
+    data["collection"]["gates"]["path_deviation"] = "0.1 mm"  # the default
+    make_order(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
+
+
+def test_the_gate_of_references_is_a_change_only_where_it_is_set(tmp_path: Path) -> None:
+    begin(tmp_path, tiny())
+    data = tiny()
+    condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
+    data["collection"]["references"] = {"every": 3, "condition": condition}
+    make_order(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
+    data["collection"]["gates"]["reference"] = {"event_rate": "20 %"}
+    assert "collection.gates.reference: not there -> {event_rate: 20 percent}" in refused(
+        tmp_path, data
+    )
+
+
+def test_hashes_of_protocols_that_ship_stay() -> None:
+    """Campaigns that were begun before a key came go on."""
+    known = {
+        "kinematic": "a3e25ea978e4264238f892545d9bf72cd3fdedd908a3109a2e7768918d960a4b",
+        "gravity": "216c0d7da5cdb00f69778b43dc3ee162182afd0e40aecd176d9ba4a4651909de",
+        "disturbance": "373b0f9ad136bbd656036b6b4ebbefa777a53ba8925e8781a5f1bcca7a0652b2",
+    }
+    for name, expected in known.items():
+        assert load_plan(ROOT / "protocols" / f"{name}.yaml").collection_hash == expected
+
+
+def test_a_changed_rig_and_levels_that_are_gone_are_said(tmp_path: Path) -> None:
+    store = begin(tmp_path, tiny())
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"extends: {RIG}\nsensor: another\n")
+    sensor = load_rig_file(RIG)[0].sensor
+    assert f"\n  sensor: {sensor} -> another" in refused(tmp_path, tiny(), rig)
+    commit(store.campaign("tiny"), "depth=2.4mm,direction=300deg,speed=1.6mmps,r=1")
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"].remove(300)
+    split = data["analysis"]["split"]
+    split["test_levels"]["direction"].remove("300 deg")
+    message = refused(tmp_path, data)
+    assert "may only add trials" in message
+    assert (
+        "collection.factors.direction.levels: [0, 60, 120, 180, 240, 300] -> "
+        "[0, 60, 120, 180, 240]" in message
+    )

@@ -1,0 +1,391 @@
+"""The report of a small study: whole, self-contained, every trial in one place."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.nets.metrics import CLASSES
+from analysis.statistics.scene_windows import PHASES
+from flows.collecting.collect import collect
+from flows.labelling.label import label
+from flows.planning.orders import Order, make_order
+from flows.reporting import campaign_section, others_section
+from flows.reporting.report import read_summary, report, write_figures
+from flows.reporting.report_against import compare
+from flows.reporting.report_extras import FILES
+from flows.reporting.report_trials import OUTCOMES, Conditions, accounted, intervals, told
+from flows.running import trial_work
+from flows.running.campaigns import collected
+from flows.searching.tradeoff_page import ERRORS
+from flows.study import Outcome
+from storage.derived import Derived
+from storage.files import write_json
+from storage.store import Store, StoreError
+from tests.command_line import here
+from tests.flows.collecting.test_session import short
+from tests.flows.conftest import write
+
+Json = dict[str, Any]
+UNITLESS = {
+    "trial", "name", "row", "class", "detector", "stride", "true class", "tightest gate", "windows",
+    "failed attempts", "place in the plan", "epoch", "side", "simulated", "family", "variant",
+    "on the front", "precision", "width",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study, with its report."""
+    folder = tmp_path_factory.mktemp("report") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    found = Store.open(folder)
+    report(found, collected(found))
+    return found
+
+
+def page(store: Store) -> str:
+    return (store.folder / "report" / "index.html").read_text()
+
+
+def test_every_trial_is_counted_once(store: Store) -> None:
+    summary = read_summary(store)
+    for experiment, planned in (("kinematic", 2), ("gravity", 2), ("disturbance", 0)):
+        accounts = summary[experiment]["accounted"]
+        assert accounts["planned"] == planned
+        assert sum(accounts[name] for name in OUTCOMES) == planned
+        lead = summary[experiment]["lead_ms"]
+        assert accounts["detected_first"] == lead["detected_first"]
+        assert accounts["missed"] == lead["missed"]
+        assert accounts["false_early"] == lead["false_early"]
+        assert accounts["late"] == lead["n"] - lead["detected_first"]
+    assert [row["campaign"] for row in summary["trials"]].count("tiny") == 2
+    known = [row["lead_ms"] for row in summary["trials"] if row["experiment"] == "gravity"]
+    least = min((value for value in known if value is not None), default=None)
+    assert least == summary["gravity"]["lead_ms"]["min"]
+
+
+def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
+    campaigns = collected(store)
+    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    later = accounted(campaigns, [row for row in rows if row["campaign"] != "tiny"], "kinematic")
+    assert (later["planned"], later["not_evaluated"]) == (2, 2)
+    lost = copy.copy(campaigns[0])
+    lost.__dict__["trials"] = lost.trials[:0]
+    missing = accounted([lost], [], "kinematic")
+    assert (missing["planned"], missing["not_taken"]) == (2, 2)
+
+
+FOUND = {
+    "latency_incipient_ms": 90.0, "latency_gross_ms": 40.0, "lead_ms": 900.0,
+    "missed_incipient": False, "missed_gross": False, "false_early_incipient": False,
+    "false_early_gross": False, "detected_first": True,
+}  # fmt: skip
+
+
+def judged(**changed: Any) -> Json:
+    """An evaluated trial."""
+    return {
+        "campaign": "g", "experiment": "gravity", "trial": "t", "condition": {},
+        "incipient_ns": 10**9, "gross_ns": 2 * 10**9, "latency": {**FOUND, **changed},
+    }  # fmt: skip
+
+
+def test_what_became_of_a_trial() -> None:
+    assert told(judged())["outcome"] == "detected_first"
+    assert told(judged())["duration_ms"] == 1000.0
+    assert told(judged(detected_first=False, lead_ms=-20.0))["outcome"] == "late"
+    assert told(judged(missed_incipient=True))["outcome"] == "missed"
+    assert told(judged(false_early_incipient=True))["outcome"] == "false_early"
+    assert told(judged(false_early_gross=True))["gross"] == "false_early"
+    assert told(judged(missed_gross=True))["gross"] == "missed"
+    none = told({**judged(), "latency": None, "gross_ns": None})
+    assert (none["outcome"], none["gross"], none["lead_ms"]) == (
+        "without_onsets", "without_onsets", None
+    )  # fmt: skip
+    found = intervals([told(judged()), told(judged(lead_ms=1000.0)), none])
+    assert found["lead_ms"]["n"] == 2
+    assert found["lead_ms"]["mean"] == [900.0, 1000.0]
+
+
+def test_trials_stand_under_their_conditions(store: Store) -> None:
+    campaigns = collected(store)
+    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    found = Conditions(campaigns, rows, "gravity")
+    cells = found.cells(list(found.factors))
+    assert sum(map(len, cells.values())) == 2
+    for name, trials in cells.items():
+        assert all(", ".join(trial["condition"].values()) == name for trial in trials)
+    both = Conditions(campaigns, rows, "kinematic")
+    assert both.varied() == ["direction"]
+    assert both.breaks(["direction"]) == []
+    assert len(both.level("direction", "240 deg")) == 1
+    both.factors = {"a": ["1", "2"], "b": ["x", "y", "z"]}
+    assert list(both.cells(["a", "b"])) == ["1, x", "1, y", "1, z", "2, x", "2, y", "2, z"]
+    assert both.breaks(["a", "b"]) == [3]
+
+
+def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
+    folder = store.folder / "report"
+    text = page(store)
+    names = re.findall(r'<figure id="([^"]+)">', text)
+    assert len(names) == text.count("<figure") == len(set(names))
+    assert sorted(path.stem for path in (folder / "figures").iterdir()) == sorted(names)
+    assert sorted(path.stem for path in (folder / "data").iterdir()) == sorted(names)
+    assert {"trial", "confusion", "outputs", "latency-kinematic", "gravity-incipient",
+            "gravity-gross", "labels", "clocks", "quality-tiny"} <= set(names)  # fmt: skip
+    for name in names:
+        svg = (folder / "figures" / f"{name}.svg").read_text()
+        assert svg in text
+        with (folder / "data" / f"{name}.csv").open(newline="") as file:
+            head, *rows = list(csv.reader(file))
+        assert rows
+        assert all(row[-1] == "yes" for row in rows)
+        for heading in head:
+            assert heading in UNITLESS or re.search(r"\(.+\)$", heading), (name, heading)
+    lines = (folder / "data" / "gravity-incipient.csv").read_text().splitlines()
+    known = {row["trial"]: row for row in read_summary(store)["trials"]}
+    for line in csv.DictReader(lines):
+        late = known[line["trial"]]["latency_incipient_ms"]
+        assert line["incipient latency (ms)"] == ("" if late is None else str(late))
+
+
+def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
+    folder = store.folder / "report"
+    text = page(store)
+    assert not re.search(r"<(script|img|iframe|link rel=.stylesheet)", text)
+    for address in re.findall(r'<a href="([^"]+)"', text):
+        if address.startswith("#"):
+            assert f'id="{address[1:]}"' in text
+        else:
+            assert (folder / address).is_file()
+    assert "88 ms after onset" in text
+    assert "measured by its authors on their own robot" in text
+    assert "here (simulated)" in text
+    assert f"sliplab review {store.folder.resolve()}" in text
+    assert "no campaign takes reference trials" in text
+    assert f"benchmarks.generalisation {store.folder.resolve()}" in text
+
+
+def test_failures_have_a_command_that_shows_them(store: Store) -> None:
+    from flows.reporting.failures_section import MOST, section
+
+    summary = read_summary(store)
+    row = {**summary["trials"][0], "trial": "a=1,r=1", "outcome": "late", "gross": "missed"}
+    early = {**row, "outcome": "detected_first", "gross": "false_early", "campaign": "b"}
+    fine = {**row, "trial": "fine", "outcome": "detected_first", "gross": "detected"}
+    found = section(store, {"trials": [early, fine, row]})
+    (table,) = found.tables
+    assert [line[1].split(":")[0] for line in table.rows] == [row["campaign"], "b"]
+    assert "incipient detected late" in table.rows[0][1]
+    assert "gross missed" in table.rows[0][1]
+    command = f"sliplab view {store.folder.resolve()} a=1,r=1 --campaign {row['campaign']}"
+    assert table.rows[0][0] == command  # two campaigns have this trial
+    assert found.text[0].startswith("2 of 3 judged trials failed")
+    many = section(store, {"trials": [row] * (MOST + 1)})
+    assert len(many.tables[0].rows) == MOST
+    assert "summary.json" in many.text[1]
+    assert section(store, {"trials": [fine]}).tables == []
+
+
+def scene() -> Json:
+    """Numbers of the shape that `sliplab tradeoff --scene` writes."""
+    error = {**dict.fromkeys(ERRORS, 0.5), "early_p95_us": 3.0}
+    variants = [
+        {"family": family, "name": name, "level": "L3", "step_ms": step, "path": "cubic",
+         "rows_per_s": 500, "wall_s": 0.2, "error": error}
+        for family, name, step in (("levels", "L3", 2), ("cubic", "4", 4))
+    ]  # fmt: skip
+    choice = {"level": "L1", "reason": "enough"}
+    windows = {
+        "samples": dict.fromkeys(CLASSES, 9), "silent_share": dict.fromkeys(CLASSES, 0.1),
+        "events_per_s": dict.fromkeys(PHASES, 1e3), "hold_share": 0.5, "ceiling": 0.8,
+    }  # fmt: skip
+    return {
+        "simulated": True, "protocol": "tiny", "rig": "r", "rig_step_ms": 2, "trials": ["a"],
+        "variants": variants, "seeds": error, "levels": {},
+        "choice": {"measured": choice, "closed_form": choice, "agree": True},
+        "windows": windows, "left_out": [],
+    }  # fmt: skip
+
+
+def detector() -> Json:
+    """Numbers of the shape that `flows.reporting.search_section` reads."""
+    rows = [
+        {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "precision": "as trained",
+         "stride_ms": 30, "smoothing": 4, "margin": 2.0, "front": paper, "paper": paper,
+         "test": {"strict": [0.9, 0.92], "mean_ms": [90.0, late], "p95_ms": [200.0, 210.0],
+                  "false_early_either": [0.0, 0.01], "missed_either": [0.0, 0.0]},
+         "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]}}
+        for paper, late in ((True, 100.0), (False, None))
+    ]  # fmt: skip
+    return {"simulated": True, "rows": rows}
+
+
+def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81}
+    results = {"skin 101": skin, "depth 2.4 mm": {**skin, "seen": 0.9},
+               "speed 1 mm/s": {"left out": "no train trials"}}  # fmt: skip
+    found = {
+        "generalisation": {"simulated": True, "results": results},
+        "scene": scene(),
+        "labels": {"name": "labels", "figures": {"x_blob_detector": 41.25}},
+        "labels_truth": {"name": "labels_truth", "figures": {"paper_incipient_ms": 4.5}},
+        "detector": detector(),
+    }
+    for name, data in found.items():
+        path = other.folder / FILES[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, data)
+    assert report(other, collected(other))["done"] == 1
+    assert report(other, collected(other))["done"] == 0
+    text = page(other)
+    for word in (
+        "skin 101",
+        "no train trials",
+        "x_blob_detector",
+        "41.25",
+        "4.5",
+        "without a depth",
+    ):
+        assert word in text
+    assert "not done here" not in text
+    data = other.folder / "report" / "data"
+    assert (data / "skins.csv").read_text().splitlines()[2] == "skin 101,0.8,0.7,0.9,yes"
+    lines = list(csv.DictReader((data / "tradeoff-detector.csv").read_text().splitlines()))
+    assert [line["mean latency (ms)"] for line in lines] == ["95.0", ""]
+    assert [line["strict accuracy (%)"] for line in lines] == ["91.0", "91.0"]
+    assert (data / "tradeoff-scene.csv").exists()
+
+    path = other.folder / FILES["detector"]
+    path.write_text("{")
+    with pytest.raises(StoreError, match=r"delete .*detector_tradeoff\.json"):
+        report(other, collected(other))
+    with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
+        others_section.tradeoff(other, {"detector": {"rows": [{}]}})
+    with pytest.raises(StoreError, match=r"derived/tradeoff/tradeoff\.json: is not of the shape"):
+        others_section.tradeoff(other, {"scene": {"variants": []}})
+    with pytest.raises(StoreError, match=r"results\.json: is not of the shape"):
+        others_section.skins(other, {}, read_summary(other), simulated=True)
+    absent = others_section.tradeoff(other, {})
+    assert absent.commands[0][0].startswith("sliplab tradeoff --scene PROTOCOL --out ")
+    write_figures(other.folder / "report", [absent], simulated=True)
+    assert list(data.iterdir()) == []  # an older report's figures go
+
+
+def test_wear_is_the_slope_of_reference_trials(
+    tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial_work, "FEW", 8)  # here, without processes
+    rows = [
+        {"trial": str(k), "place": 1 + 10 * k, "hold_events_per_s": 1000.0 + 2 * k,
+         "first_slip_ms": None if k else 900.0}
+        for k in range(8)
+    ]  # fmt: skip
+    found = campaign_section.wear(rows)
+    slope = found["hold_events_per_s"]["percent_per_100_trials"]
+    assert slope == pytest.approx(100 * 20.0 / 1007.0)
+    assert found["hold_events_per_s"]["low"] == pytest.approx(slope)
+    assert found["first_slip_ms"] == {
+        "n": 1, "percent_per_100_trials": None, "low": None, "high": None
+    }  # fmt: skip
+    data = short()
+    data["collection"]["factors"]["direction"]["values"] = [0, 120]
+    data["collection"]["references"] = {
+        "every": 1, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
+    }  # fmt: skip
+    order = make_order(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
+    collect(order)
+    store = Store.open(order.store)
+    (item,) = collected(store)
+    before = campaign_section.reference_rows(store, item)
+    assert [row["first_slip_ms"] for row in before] == [None, None]
+    label(store, [item])
+    after = campaign_section.reference_rows(store, item)
+    assert [row["hold_events_per_s"] for row in after] == [
+        row["hold_events_per_s"] for row in before
+    ]
+    slips = [row["first_slip_ms"] for row in after]
+    assert min(slips) > 0
+    assert max(slips) - min(slips) < 40.0  # the same condition: within some frames
+    section = campaign_section.quality(store, [item], simulated=True)
+    assert [figure.name for figure in section.figures] == ["quality-tiny", "references-tiny"]
+    assert section.text[1] == (
+        "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
+    )
+
+
+def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:
+    summary = read_summary(store)
+    found = compare(summary, copy.deepcopy(summary))
+    assert found["settings"] == []
+    assert len(found["figures"]) > 10
+    for row in found["figures"]:
+        assert row["difference"] == 0
+        assert row["beyond"] in {False, None}
+
+
+def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store) -> None:
+    ours, theirs = read_summary(store), read_summary(store)
+    rng = np.random.default_rng(1)
+    for summary, late in ((ours, 120.0), (theirs, 80.0)):
+        rows = [row for row in summary["trials"] if row["experiment"] == "gravity"]
+        summary["trials"] = [
+            {**rows[0], "trial": str(k), "outcome": "detected_first", "gross": "detected",
+             "latency_incipient_ms": late + noise, "latency_gross_ms": 50.0 + 400 * noise,
+             "lead_ms": None if k == 3 else 900.0 - noise}
+            for k, noise in enumerate(rng.normal(0, 10, 40))
+        ]  # fmt: skip
+    for kind in ("strict", "argmax", "margin"):
+        ours["kinematic"]["seeds"]["each"] = [{kind: 0.9, "strict": 0.9, "argmax": 0.9,
+                                               "margin": 0.8}] * 1  # fmt: skip
+    theirs["kinematic"]["seeds"]["each"] = [
+        {"strict": value, "argmax": value, "margin": value} for value in (0.88, 0.90, 0.91)
+    ]
+    theirs["versions"] = {**theirs["versions"], "numpy": "0"}
+    found = {row["name"]: row for row in compare(ours, theirs)["figures"]}
+    late = found["gravity: incipient latency, mean"]
+    assert (late["basis"], late["beyond"]) == ("same trials", True)
+    assert late["low"] < late["difference"] < late["high"]
+    assert late["difference"] == pytest.approx(40.0, abs=6)
+    assert found["gravity: gross latency, mean"]["beyond"] is False
+    assert found["accuracy, strict, mean of seeds"]["basis"] == "seeds"
+    assert found["accuracy, strict, mean of seeds"]["beyond"] is False
+    assert found["accuracy, margin, mean of seeds"]["beyond"] is True
+    assert compare(ours, theirs)["settings"] == [
+        {"what": "versions.numpy", "here": ours["versions"]["numpy"], "there": "0"}
+    ]
+    # trials of another protocol only have the same names
+    theirs["protocols"]["tiny_gravity"]["collection"] = "another"
+    found = {row["name"]: row for row in compare(ours, theirs)["figures"]}
+    assert found["gravity: incipient latency, mean"]["basis"] == "trials"
+
+
+def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
+    other = tmp_path / "summary.json"
+    shutil.copy(store.folder / "report" / "summary.json", other)
+    done = here("report", store.folder, "--against", other, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["against"]
+    assert found["settings"] == []
+    text = (store.folder / "report" / "against.html").read_text()
+    assert "Both reports are simulated." in text
+    assert "Protocols, settings, seeds and versions are the same." in text
+    done = here("report", store.folder, "--against", store.folder)
+    assert done.returncode == 0
+    assert "Two reports (simulated)" in done.stdout
+    other.write_text('{"simulated": true}')
+    for wrong in (tmp_path / "nowhere", other):
+        done = here("report", store.folder, "--against", wrong)
+        assert done.returncode == 2
+        assert "--against" in done.stderr

@@ -1,0 +1,206 @@
+"""Steps on a Dask cluster of two worker processes: the same bytes, whatever happens to a worker."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import distributed
+import pytest
+
+from flows.collecting.collect import collect
+from flows.labelling.label import label
+from flows.learning.evaluate import evaluate
+from flows.learning.train import train
+from flows.planning.orders import make_order
+from flows.running import cluster as clusters
+from flows.running import stopping, trial_work
+from flows.running.campaigns import collected
+from flows.running.cluster import Cluster, ClusterError, connected
+from flows.searching.tradeoff_runs import everywhere
+from protocols.errors import InputError
+from storage.mirror import open_mirror
+from storage.push import push
+from storage.remote import Remote
+from storage.store import Store
+from tests.flows.conftest import tiny, write
+from tests.storage.remotes import tree
+
+WAIT_S = 30.0
+STEPS = (label, train, evaluate)
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
+    """A store with six trials, and nothing derived from them."""
+    folder = tmp_path_factory.mktemp("dask")
+    data = tiny()
+    data["collection"]["motion"][3]["distance"] = "5 mm"
+    collect(make_order(write(folder / "tiny.yaml", data), rig_path, folder / "store"))
+    return folder / "store"
+
+
+@pytest.fixture(scope="module")
+def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What the steps make of it without a cluster, and in this process alone."""
+    folder = tmp_path_factory.mktemp("here") / "store"
+    shutil.copytree(taken, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trial_work, "FEW", 6)
+        return run_steps(folder, None)
+
+
+@pytest.fixture(scope="module")
+def workers_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the workers keep what they fetch: not where this process does."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def address(workers_cache: Path) -> Iterator[str]:
+    """The scheduler of two workers in processes of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SLIPLAB_CACHE", str(workers_cache))
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+        ) as cluster:  # fmt: skip
+            yield cluster.scheduler_address
+
+
+@pytest.fixture
+def cluster(address: str) -> Iterator[Cluster]:
+    """The two workers, looked at, once one that a test ended has been replaced."""
+    with distributed.Client(address, timeout="30s") as client:
+        client.wait_for_workers(2, timeout=60)
+    with connected(address) as found:
+        assert found is not None
+        assert found.cores == 2
+        yield found
+
+
+def run_steps(folder: Path, cluster: Cluster | None) -> dict[str, bytes]:
+    """Every file that the steps made."""
+    store = Store.open(folder)
+    for step in STEPS:
+        result = step(store, collected(store), cluster=cluster)
+        assert result["done"]
+    made = tree(folder, "derived", "models")
+    return {name: data for name, data in made.items() if name != "derived/timing.json"}
+
+
+def test_two_workers_make_the_same_bytes(
+    taken: Path, here: dict[str, bytes], tmp_path: Path, cluster: Cluster
+) -> None:
+    shutil.copytree(taken, tmp_path / "there")
+    there = run_steps(tmp_path / "there", cluster)
+    assert {"derived/evaluation/evaluation.json", "models/seed0.pt"} <= here.keys()
+    assert len([name for name in here if name.startswith("derived/counts/")]) == 4
+    assert len([name for name in here if name.startswith("derived/labels/")]) == 12
+    assert here == there
+
+
+def met(folder: str) -> int:
+    """The number of this process, once two processes have come here."""
+    (Path(folder) / str(os.getpid())).touch()
+    for _ in range(round(WAIT_S / 0.05)):
+        if len(list(Path(folder).iterdir())) == 2:
+            return os.getpid()
+        threading.Event().wait(0.05)
+    raise TimeoutError("nobody else came")
+
+
+def test_both_workers_work_at_once(tmp_path: Path, cluster: Cluster) -> None:
+    pids = everywhere(met, [str(tmp_path)] * 8, cluster, lambda: None)
+    assert len(set(pids)) == 2
+    assert os.getpid() not in pids
+
+
+def square_or_die(job: tuple[int, str]) -> int:
+    """A number's square; whoever gets 5 first is killed."""
+    number, marker = job
+    if number == 5:
+        try:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            pass
+        else:
+            os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning:distributed")
+def test_a_worker_that_dies_is_replaced(tmp_path: Path, cluster: Cluster) -> None:
+    jobs = [(number, str(tmp_path / "died")) for number in range(24)]
+    assert everywhere(square_or_die, jobs, cluster, lambda: None) == [n**2 for n in range(24)]
+    assert (tmp_path / "died").exists()
+
+
+def mark(job: tuple[str, int]) -> None:
+    """Leave a file, and go on once somebody has asked for it, or time is up."""
+    folder, number = Path(job[0]), job[1]
+    (folder / str(number)).touch()
+    if number:
+        for _ in range(round(WAIT_S / 0.05)):
+            if (folder / "go").exists():
+                return
+            threading.Event().wait(0.05)
+
+
+def test_a_stop_cancels_what_is_queued(tmp_path: Path, cluster: Cluster) -> None:
+    jobs = [(str(tmp_path), k) for k in range(15)]  # few enough to be a chunk each
+    with pytest.raises(KeyboardInterrupt):
+        everywhere(mark, jobs, cluster, stopping.stop)
+    stopping._requested.clear()
+    (tmp_path / "go").touch()
+    begun = len(list(tmp_path.iterdir())) - 1
+    assert everywhere(abs, [-1, -2], cluster, lambda: None) == [1, 2]
+    assert len(list(tmp_path.iterdir())) - 1 <= begun + 1
+    assert begun < 8
+
+
+def test_a_pushed_store_is_labelled_where_its_trials_are_fetched(
+    taken: Path, here: dict[str, bytes], tmp_path: Path, cluster: Cluster, workers_cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "cache"))
+    url = f"file://{tmp_path}/shared"
+    push(Store.open(taken), Remote(url))
+    store, _ = open_mirror(url)
+    assert label(store, collected(store), cluster)["done"] == 6
+    labels = {name: data for name, data in here.items() if name.startswith("derived/labels")}
+    assert tree(store.folder, "derived/labels") == labels
+    assert not list(store.folder.rglob("data.h5"))
+    assert len(list(workers_cache.rglob("data.h5"))) == 6
+
+
+def test_what_cannot_be_used_is_said_at_once(
+    taken: Path, tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match="HOST:PORT"), connected("nonsense"):
+        pass
+    store = Store.open(taken)
+    with connected(address) as found, monkeypatch.context() as patch:
+        patch.setattr(trial_work, "place_of", lambda _: str(tmp_path / "elsewhere"))
+        with pytest.raises(ClusterError, match=r"worker tcp://.* is not a store .*same path"):
+            label(store, collected(store), found)
+    with monkeypatch.context() as patch:
+        patch.setattr(clusters, "this_program", lambda: {"numpy": "1.0"})
+        with pytest.raises(ClusterError, match=r"numpy .* instead of 1\.0; install"):
+            connected(address).__enter__()
+    monkeypatch.setattr(clusters, "CONNECT_S", 0.5)
+    with pytest.raises(ClusterError, match="no scheduler answers there"), connected("127.0.0.1:1"):
+        pass
+    with (
+        distributed.LocalCluster(
+            n_workers=0, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+        ) as empty,
+        pytest.raises(ClusterError, match="has no worker; start some"),
+        connected(empty.scheduler_address),
+    ):
+        pass
+    assert not (taken / "derived" / "labels").exists()

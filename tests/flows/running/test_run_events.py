@@ -1,0 +1,101 @@
+"""What the embedded server is told of quick tasks, and where its tables come from."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import urllib.request
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+from prefect.runtime import flow_run
+
+from benchmarks.orchestration import _drained
+from flows.running import embedded_database
+from flows.running.orchestration import Parcel, embedded, run
+
+COUNT = 120
+
+
+@task(name="quick", cache_policy=NO_CACHE, persist_result=False)
+def quick(number: int) -> int:
+    """One of many."""
+    if number == COUNT - 1:
+        raise ValueError("the last one fails")
+    return number
+
+
+@flow(name="many", validate_parameters=False, persist_result=False)
+def many(told: Parcel[list[str]]) -> None:
+    """Many quick tasks, of which the last fails."""
+    told.content.append(str(flow_run.id))
+    for number in range(COUNT):
+        quick(number)
+
+
+def test_every_quick_task_run_is_kept_with_its_end() -> None:
+    told: list[str] = []
+    with pytest.raises(ValueError, match="the last one fails"):
+        run(many, Parcel(told))
+    _drained(told[0], COUNT - 1)
+    found: list[dict[str, Any]] = []
+    for offset in (0, 100):
+        wanted = {"flow_runs": {"id": {"any_": told}}, "limit": 100, "offset": offset}
+        question = urllib.request.Request(
+            f"{embedded().url}/task_runs/filter",
+            json.dumps(wanted).encode(),
+            {"Content-Type": "application/json"},
+        )
+        with urllib.request.urlopen(question, timeout=60) as answer:
+            found += json.load(answer)
+    assert len(found) == COUNT
+    assert {each["run_count"] for each in found} == {1}
+    assert all(each["start_time"] <= each["end_time"] for each in found)
+    states = [each["state_type"] for each in found]
+    assert (states.count("COMPLETED"), states.count("FAILED")) == (COUNT - 1, 1)
+
+
+def _tables(path: Path) -> set[str]:
+    with closing(sqlite3.connect(path)) as file:
+        return {name for (name,) in file.execute("select name from sqlite_master")}
+
+
+@pytest.mark.parametrize("kept", ["none", "sound", "damaged", "used"])
+def test_a_new_file_begins_as_a_copy_only_of_one_that_is_sound(
+    kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made: list[str] = []
+
+    def make() -> None:
+        made.append("made")
+        _fill(tmp_path / "home" / embedded_database.NAME)
+
+    monkeypatch.setattr(embedded_database, "_make", make)
+    (tmp_path / "home").mkdir()
+    template = embedded_database._template()
+    assert template is not None
+    template.parent.mkdir(parents=True)
+    if kept == "damaged":
+        template.write_bytes(b"not a database at all" * 1000)
+    elif kept != "none":
+        _fill(template, runs=kept == "used")
+    embedded_database.ready(tmp_path / "home")
+    assert made == ([] if kept == "sound" else ["made"])
+    assert _tables(tmp_path / "home" / embedded_database.NAME) >= {"flow_run", "task_run"}
+    assert embedded_database._sound(template)  # the next one begins with it
+    embedded_database.ready(tmp_path / "home")  # which is there now
+    assert made == ([] if kept == "sound" else ["made"])
+
+
+def _fill(path: Path, runs: bool = False) -> None:
+    with closing(sqlite3.connect(path)) as file, file:
+        for name in ("alembic_version", "flow_run", "task_run"):
+            file.execute(f"create table {name} (id text)")
+        file.execute("insert into alembic_version values ('1')")
+        if runs:
+            file.execute("insert into flow_run values ('1')")

@@ -1,0 +1,323 @@
+"""The search over the detector's settings: what it tries, keeps, goes on with and tells."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.detect.detection import detect
+from analysis.detect.latency import score_trial, summarise_latency
+from analysis.nets import dataset, training
+from flows.labelling.label import STEP, label_key
+from flows.running import stopping
+from flows.running.campaigns import Collected, collected
+from flows.searching.detector_tradeoff import NUMBERS, PAGE, TABLE, Search, detector_tradeoff
+from flows.searching.detector_tradeoff_data import Ask
+from flows.searching.detector_tradeoff_grid import (
+    PAPER,
+    Axes,
+    Setting,
+    counted_stride,
+    make_grid,
+    strides,
+)
+from flows.searching.detector_tradeoff_rows import OBJECTIVES, RULES, mean, objective, short_list
+from flows.searching.detector_tradeoff_runs import PRECISIONS, trial_counts
+from protocols.errors import InputError
+from protocols.settings import Detection, Network, Windows
+from storage.derived import Derived
+from storage.errors import StoreError
+from storage.store import Store
+from tests.command_line import here
+from tests.conftest import ROOT
+from tests.flows.reviewable import Reviewable, label
+
+ASK = Ask(samples=40, epochs=2, trials=2, seeds=2, stride_ms=15)
+AXES = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(0.5, 1.0))
+TRIALS = 20
+
+
+def made(folder: Path) -> Store:
+    """A kinematic campaign, and a gravity trial with the same events."""
+    kinematic = Reviewable(folder, TRIALS)
+    campaign = kinematic.store.campaign("gravity")
+    protocol = (ROOT / "protocols" / "pilot_gravity.yaml").read_text()
+    campaign.update({"name": "gravity", "simulated": True}, protocol, "rig: 1\n")
+    item = Collected(campaign)
+    trial = next(trial for trial in item.plan if trial.split == "test")
+    (campaign.folder / "trials").mkdir(exist_ok=True)
+    kinematic._link(campaign, trial.id, item.plan.describe(trial))
+    recording = campaign.recording(trial.id)
+    key = label_key(recording, item.settings.labelling)
+    Derived.of(kinematic.store, STEP, "gravity").write(trial.id, key, label())
+    return kinematic.store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return made(tmp_path_factory.mktemp("tradeoff") / "store")
+
+
+@pytest.fixture(scope="module")
+def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("out") / "new"
+    return detector_tradeoff(store, collected(store), folder, ASK, AXES), folder
+
+
+def test_lines_and_the_small_cross_are_tried_once_each() -> None:
+    grid = make_grid(Axes(), Windows(), Network())
+    assert grid.settings[0] == PAPER
+    assert len(grid.settings) == len(set(grid.settings)) == 16
+    assert Setting(length_ms=5, pool_px=10) in grid.settings
+    assert Setting(length_ms=10, pool_px=10) not in grid.settings
+    assert grid.left_out == {}
+    whole = make_grid(Axes(), Windows(), Network(), full=True)
+    # 6 x 3 x 3 x 3, without steps of 2 ms in windows of 5 ms
+    assert len(whole.settings) == 162 - 9
+    assert len(whole.left_out) == 9
+    assert all("do not divide a window of 5 ms" in why for why in whole.left_out.values())
+    assert set(grid.settings) <= set(whole.settings)
+
+
+def test_what_no_network_can_have_is_refused_by_name() -> None:
+    for axes, words in (
+        (Axes(pool_px=(30,)), "--pool = 30: must divide the crop of 400 px"),
+        (Axes(width=(0.01,)), "--width = 0.01: must leave each layer"),
+        (Axes(width=(100.0,)), "--width"),
+        (Axes(length_ms=(0,)), "--length = 0: must lie between 1 and 1000"),
+    ):
+        with pytest.raises(InputError, match=words):
+            make_grid(axes, Windows(), Network())
+
+
+def test_widths_and_windows_are_those_asked_for() -> None:
+    setting = Setting(length_ms=10, step_ms=5, pool_px=40, width=0.5)
+    assert setting.windows(Windows()).steps == 2
+    assert setting.windows(Windows()).cells == 10
+    network = setting.network(Network())
+    assert (network.conv1_channels, network.conv2_channels, network.hidden) == (4, 8, 16)
+
+
+def test_strides_are_multiples_of_the_finest_and_the_length() -> None:
+    assert strides(30, 10) == [10, 20, 30]
+    assert strides(5, 10) == [5]
+    assert strides(25, 10) == [10, 20, 25]
+    assert [counted_stride(length, 10) for length in (30, 5, 25)] == [10, 5, 5]
+
+
+def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> None:
+    found, _ = result
+    assert found["simulated"]
+    assert (found["runs"], found["kept"], found["pending"]) == (6, 6, 0)
+    keys = ("length_ms", "step_ms", "pool_px", "width", "precision", "stride_ms", "rule")
+    rows = {tuple(row[key] for key in keys) for row in found["rows"]}
+    expected = set()
+    for setting in found["settings"]:
+        for stride in strides(setting["length_ms"], 15):
+            for precision in PRECISIONS:
+                for rule in RULES:
+                    expected.add((*setting.values(), precision, stride, rule))
+    assert rows == expected
+    assert len(found["rows"]) == len(rows)
+    assert [row["seeds"] for row in found["rows"]] == [[0, 1]] * len(rows)
+    (paper,) = [row for row in found["rows"] if row["paper"]]
+    assert [paper[key] for key in keys] == [30, 1, 20, 1.0, "trained", 30, "paper's"]
+    assert (paper["smoothing"], paper["margin"]) == (4, 2.0)
+    assert found["trials"]["falling"] == 1
+    # true gross onset of the plate is 0.5 s; the first window of it ends at 35 ms
+    leads = [v for row in found["rows"] for v in row["falling"]["lead_min_ms"] if v is not None]
+    assert all(lead <= 500 for lead in leads)
+
+
+def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, result: Any) -> None:
+    found, _ = result
+    (paper,) = [row for row in found["rows"] if row["paper"]]
+    search = Search(store, collected(store), ASK, AXES)
+    run = next(run for run in search.runs if run.setting == PAPER and run.seed == 1)
+    fitted = search.kept.fitted(run, lambda share, note: None)
+    scored, hits = [], []
+    for used in search.data.test:
+        x, ends = dataset.trial_windows(used.recording, run.windows)
+        counts = training.predict_counts(fitted, x)
+        said = detect(counts, ends, Detection())
+        onsets = (used.label["incipient_ns"], used.label["gross_ns"])
+        scored.append(score_trial(said, *onsets, 30_000_000))
+        kept = trial_counts(search.kept.read(run)[1], "trained", 15)
+        place = search.data.judged.index(used)
+        assert np.array_equal(kept[place][0][::2], counts)
+        assert np.array_equal(kept[place][1][::2], ends)
+        hits.append(len(counts))
+    assert min(hits) > 5
+    summary = summarise_latency(scored)["incipient"]
+    assert paper["test"]["mean_ms"][1] == summary["mean"]
+    assert paper["test"]["missed"][1] == summary["missed"] / len(scored)
+    assert paper["test"]["false_early"][1] == summary["false_early"] / len(scored)
+
+
+def test_the_front_is_the_definitions(result: Any) -> None:
+    rows = result[0]["rows"]
+
+    def costs(row: Any) -> list[float]:
+        values = [(objective(row, name), sign) for name, sign in OBJECTIVES.items()]
+        return [float("inf") if value is None else sign * value for value, sign in values]
+
+    for row in rows:
+        mine = costs(row)
+        beaten = any(
+            all(a <= b for a, b in zip(other, mine, strict=True)) and other != mine
+            for other in map(costs, rows)
+        )
+        assert row["front"] == (not beaten)
+    assert 0 < sum(row["front"] for row in rows) < len(rows)
+
+
+def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
+    def row(late: float, early: float, missed: float, work: float, test: float) -> dict[str, Any]:
+        figures = {"mean_ms": [late], "false_early_either": [early], "missed_either": [missed]}
+        return {
+            "validation": figures,
+            "test": {"mean_ms": [test]},
+            "work": {"synaptic_operations_per_s": [work]},
+        }
+
+    rows = [
+        row(100, 0.02, 0.0, 5, 1),
+        row(90, 0.03, 0.0, 5, 900),
+        row(90, 0.05, 0.05, 4, 900),
+        row(10, 0.0, 0.06, 1, 1),
+        row(5, 0.21, 0.0, 1, 1),
+    ]
+    found = [(budget, rows.index(one)) for budget, one in short_list(rows)]
+    assert found == [(0.02, 0), (0.05, 2), (0.1, 2), (0.2, 2)]
+    assert short_list(rows[3:]) == []
+
+
+def test_page_numbers_and_table_say_the_same(result: Any) -> None:
+    found, folder = result
+    assert sorted(item.name for item in folder.iterdir()) == sorted([PAGE, NUMBERS, TABLE])
+    assert json.loads((folder / NUMBERS).read_text()) == json.loads(json.dumps(found))
+    page = (folder / PAGE).read_text()
+    assert page.count("<svg") == 2
+    assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 7
+    assert "★" in page
+    table = list(csv.DictReader(io.StringIO((folder / TABLE).read_text())))
+    assert len(table) == len(found["rows"])
+    for line, row in zip(table, found["rows"], strict=True):
+        assert line["simulated"] == "True"
+        assert line["stride_ms"] == str(row["stride_ms"])
+        assert float(line["test_strict_share"]) == mean(row["test"]["strict"])
+        assert float(line["us_single_per_window"]) > 0
+        assert line["front"] == str(row["front"])
+    factors = {item["factor"] for item in found["comparisons"]}
+    assert factors == {
+        "length_ms", "step_ms", "pool_px", "width", "stride_ms", "precision", "rule",
+    }  # fmt: skip
+    for item in found["comparisons"]:
+        if item["paper"]:
+            assert item["difference"]["strict"]["mean"] == 0
+    assert sum(item["paper"] for item in found["comparisons"]) == len(factors)
+
+
+def test_a_kept_search_is_not_made_again_and_grows(
+    store: Store, result: Any, tmp_path: Path
+) -> None:
+    plan = detector_tradeoff(store, collected(store), tmp_path / "o", ASK, AXES, dry_run=True)
+    assert (plan["pending"], plan["estimated_s"]) == (0, 0)
+    assert not (tmp_path / "o").exists()
+    more = Ask(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
+    plan = detector_tradeoff(store, collected(store), tmp_path / "o", more, AXES, dry_run=True)
+    assert (plan["kept"], plan["pending"]) == (6, 3)
+    assert plan["estimated_s"] > 0
+    # other samples are another search beside it
+    other = Ask(samples=41, epochs=2, trials=2, seeds=1, stride_ms=15)
+    found = detector_tradeoff(
+        store, collected(store), tmp_path / "o", other, AXES, minutes=0
+    )  # fmt: skip
+    assert (found["kept"], found["rows"]) == (0, [])
+    assert (tmp_path / "o" / PAGE).exists()
+
+
+def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
+    axes = Axes(length_ms=(30,), step_ms=(5,), pool_px=(40,), width=(0.5,))
+    ask = Ask(samples=30, epochs=3, trials=1, seeds=1, stride_ms=30)
+    stores = [made(tmp_path / name) for name in ("whole", "stopped")]
+    models = []
+    for store in stores:
+        search = Search(store, collected(store), ask, axes)
+        run = search.runs[0]
+        if store is stores[1]:
+            epochs: list[float] = []
+
+            def stop(part: str, share: float, note: str, epochs: list[float] = epochs) -> None:
+                epochs.append(share)
+                if len(epochs) == 2:
+                    raise KeyboardInterrupt
+
+            with pytest.raises(KeyboardInterrupt):
+                search.kept.make(run, stop)
+            assert len(list(search.kept.derived.folder.glob("*.state"))) == 1
+            assert not search.kept.done(run)
+        told: list[tuple[str, float]] = []
+        search.kept.make(run, lambda part, share, note, told=told: told.append((part, share)))
+        assert sum(share for part, share in told if part == "train") == pytest.approx(1)
+        assert sum(share for part, share in told if part == "count") == pytest.approx(1)
+        assert search.kept.done(run)
+        assert not list(search.kept.derived.folder.glob("*.state"))
+        models.append(search.kept.model_path(run).read_bytes())
+    assert models[0] == models[1]
+
+
+def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
+    data = Search(store, collected(store), ASK, AXES).data
+    for setting in (PAPER, Setting(length_ms=15)):
+        found = data.samples(setting, data.train, 10_000)
+        whole = data.samples(setting, data.train, 25)
+        assert len(whole) == 25
+        assert set(np.unique(found.trial)) == set(range(len(data.train)))
+        label_ns = data.train[0].label
+        ours = (found.trial == 0) & (found.y == 0)
+        ends = found.start_ns[ours] + setting.length_ms * 1_000_000
+        assert ends.max() == label_ns["incipient_ns"]
+        assert found.start_ns[(found.trial == 0) & (found.y == 2)].min() == label_ns["gross_ns"]
+
+
+def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) -> None:
+    campaigns = [item for item in collected(store) if item.name == "gravity"]
+    with pytest.raises(StoreError, match="no kinematic campaign"):
+        Search(store, campaigns, ASK, AXES)
+
+    def check() -> None:
+        raise KeyboardInterrupt
+
+    more = Ask(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
+    search = Search(store, collected(store), more, AXES)
+    monkeypatch.setattr(stopping, "check", check)
+    with pytest.raises(KeyboardInterrupt):
+        search.make(lambda: False)
+
+
+def test_the_command_takes_one_of_its_two_subjects(store: Store, tmp_path: Path) -> None:
+    for words, message in (
+        ((), "exactly one of --scene"),
+        (("--scene", "p.yaml", "--detector", store.folder), "exactly one of --scene"),
+        (("--scene", "p.yaml", "--samples", 5), "--samples: belongs to --detector"),
+        (("--detector", store.folder, "--sensitivity"), "--sensitivity: belongs to --scene"),
+        (("--detector", store.folder, "--pool", 30), "--pool = 30: must divide"),
+    ):
+        done = here("tradeoff", *words)
+        assert done.returncode == 2, done.stderr
+        assert message in done.stderr.replace("\n", " ")
+    done = here(
+        "tradeoff", "--detector", store.folder, "--dry-run", "--json", "--samples", 40, "--epochs",
+        2, "--trials", 2, "--seeds", 1, "--stride", 15, "--length", 15, "--length", 30,
+        "--step", 1, "--pool", 20, "--width", 0.5, "--width", 1,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["runs"], told["simulated"]) == (3, True)

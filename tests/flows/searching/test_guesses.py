@@ -1,0 +1,137 @@
+"""What guesses decide: nothing changed gives the study's own figures, and each change is kept."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.planning.orders import Order
+from flows.reporting import guesses_section
+from flows.reporting.report import report
+from flows.running.campaigns import collected
+from flows.searching import guesses
+from flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
+from flows.searching.guesses import Guesses, Setting, measure_guesses
+from flows.study import Outcome
+from storage.derived import Derived
+from storage.files import read_json
+from storage.store import Store, StoreError
+from tests.command_line import here
+
+Json = dict[str, Any]
+GUESS = "event_camera.contrast"
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study, its contrast measured down and up."""
+    folder = tmp_path_factory.mktemp("guesses") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    found = Store.open(folder)
+    measure_guesses(found, collected(found), (GUESS,), 20)
+    return found
+
+
+def kept(store: Store) -> dict[str, Json]:
+    found: dict[str, Json] = read_json(store.folder / "derived/guesses/results.json")["settings"]
+    return found
+
+
+def test_the_scene_as_it_is_gives_the_study_s_own_trials(store: Store) -> None:
+    ours = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    again = [
+        {key: value for key, value in row.items() if key != "depth_zero_mm"}
+        for row in kept(store)[AS_IT_IS]["trials"]
+    ]
+    assert len(again) == 4
+    assert sorted(again, key=lambda row: row["trial"]) == sorted(ours, key=lambda row: row["trial"])
+
+
+def test_a_change_is_seen_and_compared_trial_by_trial(store: Store) -> None:
+    settings = kept(store)
+    assert list(settings) == [AS_IT_IS, f"{GUESS} x 0.8", f"{GUESS} x 1.2"]
+    base, lower, higher = settings.values()
+    assert (lower["value"], higher["value"]) == pytest.approx((0.8 * 2.08, 1.2 * 2.08))
+    for setting in (lower, higher):
+        # the contact does not know of the camera, but by where the rig found the plate
+        pairs = list(zip(base["trials"], setting["trials"], strict=True))
+        assert all(row["trial"] == other["trial"] for row, other in pairs)
+        same = [(a, b) for a, b in pairs if a["depth_zero_mm"] == b["depth_zero_mm"]]
+        assert all(a["incipient_ns"] == b["incipient_ns"] for a, b in same)
+        assert setting["windows"].keys() == base["windows"].keys()
+        assert set(figures(setting)) == set(FIGURES)
+    assert lower["windows"] != higher["windows"]
+    none = changes(base, base)
+    assert none["strict"] == (0.0, 0.0)
+    assert all(span in (None, (0.0, 0.0)) for span in none.values())
+
+
+def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: Store) -> None:
+    again = measure_guesses(store, collected(store), (GUESS,), 20)
+    assert again["measured"] == 0
+    folder = store.folder / "derived" / "guesses"
+    assert [path.name for path in folder.iterdir()] == ["results.json"]
+
+
+def test_stopped_between_two_settings_it_goes_on(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    (other.folder / "derived/guesses/results.json").unlink()
+    first = Guesses.measure
+
+    def stopped(self: Guesses, setting: Setting) -> None:
+        if setting.factor > 1:
+            raise KeyboardInterrupt
+        first(self, setting)
+
+    monkeypatch.setattr(Guesses, "measure", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        measure_guesses(other, collected(other), (GUESS,), 20)
+    monkeypatch.undo()
+    assert len(kept(other)) == 2
+    assert measure_guesses(other, collected(other), (GUESS,), 20)["measured"] == 1
+    assert kept(other) == kept(store)
+
+
+def test_another_network_is_another_measurement(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = Guesses(store, collected(store))
+    assert work.missing(work.settings((GUESS,))) == []
+    monkeypatch.setattr(guesses, "VERSION", 99)
+    assert len(work.missing(work.settings((GUESS,)))) == 3
+
+
+def test_the_report_shows_them(store: Store) -> None:
+    report(store, collected(store))
+    page = (store.folder / "report" / "index.html").read_text()
+    assert guesses_section.TITLE in page
+    assert "contrast of the markers" in page
+    data = (store.folder / "report/data/guesses.csv").read_text().splitlines()
+    assert data[0].startswith("simulated,guess") or "guess" in data[0]
+    assert len(data) == 3
+
+
+def test_a_file_of_another_shape_is_named(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"derived/guesses/results\.json"):
+        guesses_section.section(store, {"settings": {AS_IT_IS: {}}})
+
+
+def test_how_it_is_said_on_the_command_line(store: Store) -> None:
+    done = here("guesses", store.folder, "--guess", GUESS, "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["trials"] == {"tiny": 2, "tiny_gravity": 2}
+    assert list(told["settings"]) == list(kept(store))
+    table = here("guesses", store.folder, "--guess", GUESS)
+    assert "simulated" in table.stdout
+    wrong = here("guesses", store.folder, "--guess", "scene.friction.kinetc")
+    assert wrong.returncode == 2
+    assert "scene.friction.kinetc" in wrong.stderr
+    assert "scene.friction.kinetic" in wrong.stderr

@@ -1,0 +1,270 @@
+"""Served flows on the embedded server: how they end, what the page shows, what is closed later."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from flows.collecting import showing
+from flows.collecting.stops import WindowOver
+from flows.planning.orders import make_order
+from flows.running import orchestration, run_records
+from flows.serving import serve, serve_runs
+from flows.serving.serve_file import Scheduled
+from flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
+from flows.serving.serve_runs import until_of
+from flows.serving.service import Service
+from protocols import InputError
+from storage.derived import Derived
+from storage.files import read_json, write_json
+from storage.lock import Locked, exclusive
+from storage.store import Store
+from tests.conftest import ROOT
+from tests.crash import campaign
+from tests.flows.serving.serving import Page
+
+RIG = ROOT / "rigs" / "rehearsal.yaml"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """The embedded server of the tests; the settings point at it."""
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    url = orchestration.embedded().url
+    with temporary_settings(updates={PREFECT_API_URL: url}):
+        yield url
+
+
+@pytest.fixture
+def service(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
+    """This process as the one that serves a store that is not there yet."""
+    monkeypatch.setenv("SLIPLAB_SERVICE", "")
+    monkeypatch.setattr(orchestration, "private", lambda: False)  # as if somebody could look
+    store = Store.create(tmp_path / "store")
+    found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid())
+    found.tell()
+    return found
+
+
+@pytest.fixture
+def protocol(tmp_path: Path) -> Path:
+    path = tmp_path / "protocol.yaml"
+    path.write_text(yaml.safe_dump(campaign.protocol(4)))
+    return path
+
+
+def ends(service: Service) -> list[dict[str, Any]]:
+    folder = service.folder / "control" / "runs"
+    return [read_json(path) for path in sorted(folder.glob("*.end.json"))]
+
+
+def test_a_collection_ends_with_a_record_and_shows_itself(
+    service: Service, server: str, protocol: Path
+) -> None:
+    from prefect.client.orchestration import get_client
+
+    from flows.serving.serve_flows import collect
+
+    with get_client(sync_client=True) as client:
+        showing.sign_rig(client, "rehearsal", True)  # as a killed program left it
+        state = collect(Collect(protocol=protocol, trials=3), return_state=True)
+        limit = client.read_global_concurrency_limit_by_name("rig rehearsal")
+    assert state.type.value == "COMPLETED"
+    assert "3 of 4 committed, 1 missing" in state.message
+    (end,) = ends(service)
+    assert (end["state"], end["by"], end["message"]) == ("COMPLETED", "flow", state.message)
+    made = Page(server, "here").artifacts(str(state.state_details.flow_run_id))
+    assert made["progress"]["data"] == 100
+    table = {row["outcome"]: row for row in yaml.safe_load(made["table"]["data"])}
+    assert (table["committed"]["this run"], table["committed"]["campaign"]) == (3, 3)
+    assert table["missing"]["campaign"] == 1
+    assert made["image"]["data"].startswith("data:image/svg+xml;base64,")
+    assert "(simulated)" in made["image"]["description"]
+    assert (limit.limit, limit.active_slots) == (1, 0)
+
+
+def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> None:
+    from flows.serving.serve_flows import chain, collect, pause, resume
+
+    state = collect(Collect(protocol=protocol.with_name("none.yaml")), return_state=True)
+    assert state.type.value == "FAILED"
+    assert "none.yaml: no such file" in state.message
+
+    assert pause(Ask(who="anna"), return_state=True).type.value == "COMPLETED"
+    state = collect(Collect(protocol=protocol), return_state=True)
+    assert (state.type.value, "is paused (pause by anna" in state.message) == ("FAILED", True)
+    assert resume(Ask(), return_state=True).type.value == "COMPLETED"
+
+    # collected and labelled; and nothing was trained that could be evaluated
+    state = chain(Chain(protocol=protocol, trials=2, train=False), return_state=True)
+    assert (state.type.value, "run `sliplab train` first" in state.message) == ("FAILED", True)
+    store = Store.open(service.folder)
+    labels = Derived.of(store, "labels", campaign.NAME)
+    assert all(labels.read(trial) for trial in store.campaign(campaign.NAME).committed())
+    assert sorted(end["state"] for end in ends(service)) == [*["COMPLETED"] * 2, *["FAILED"] * 3]
+
+
+def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protocol: Path) -> None:
+    from flows.serving.serve_flows import collect
+
+    with ExitStack() as stack:
+        stack.enter_context(exclusive(service.folder / ".lock", "the store"))
+        state = collect(Collect(protocol=protocol, patience_min=0), return_state=True)
+    assert (state.type.value, "is in use by another program" in state.message) == ("FAILED", True)
+
+
+def test_a_rig_that_is_free_again_is_taken(
+    service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serve_runs, "LOOK_S", 0.01)
+    order = make_order(protocol, RIG, service.folder)
+    answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
+    told: list[str] = []
+    monkeypatch.setattr(serve_runs, "_tell_waiting", lambda run, why: told.append(why))
+
+    def work() -> dict[str, Any]:
+        answer = answers.pop(0)
+        if isinstance(answer, Locked):
+            raise answer
+        return answer
+
+    assert serve_runs.when_free(order, 10.0, work, None) == {"taken": 1}
+    assert told == ["the rig is in use by anna"]
+    answers[:] = [Locked("the rig is in use by anna")]
+    with pytest.raises(WindowOver, match="nothing was taken: the rig is in use by anna"):
+        serve_runs.when_free(replace(order, until=0.0), 10.0, work, None)
+
+
+def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:
+    class Run:
+        expected_start_time = datetime.now(UTC) - timedelta(days=2)
+
+    with pytest.raises(WindowOver, match="before the run began"):
+        until_of(OnRig(until="06:00", timezone="Europe/Rome"), Run())
+    assert until_of(OnRig(), Run()) is None
+    Run.expected_start_time = datetime.now(UTC)
+    end = until_of(OnRig(until="06:00", timezone="UTC"), Run())
+    assert end is not None
+    assert 0 < end - Run.expected_start_time.timestamp() <= 86400
+
+
+def test_runs_of_killed_processes_are_closed_at_the_next_start(
+    service: Service, server: str, tmp_path: Path
+) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.states import Completed, Running
+
+    from flows.serving.serve_flows import label
+
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    with get_client(sync_client=True) as client:
+        runs = [str(client.create_flow_run(label, state=Running()).id) for _ in range(4)]
+        for run in runs:
+            run_records.begin(service.folder, run, "label", "embedded")
+        folder = service.folder / "control" / "runs"
+        for number, (pid, host) in enumerate([(gone.pid, None), (gone.pid, "elsewhere")]):
+            path = folder / f"{runs[number]}.json"
+            told = read_json(path)
+            told["process"] |= {"pid": pid, "host": host or told["process"]["host"]}
+            write_json(path, told)
+        run_records.end(service.folder, runs[3], "COMPLETED", "", "flow")
+        client.set_flow_run_state(runs[3], Completed(), force=True)
+
+        closed = run_records.close_dead(service.folder, "embedded")
+        states = [client.read_flow_run(run).state for run in runs]
+    assert [item["run"] for item in closed] == runs[:1]  # on this machine, and gone
+    assert [state.type.value for state in states] == ["CRASHED", *["RUNNING"] * 2, "COMPLETED"]
+    assert f"its process was killed (pid {gone.pid}" in states[0].message
+    assert read_json(folder / f"{runs[0]}.end.json")["by"] == "next start"
+    assert run_records.close_dead(service.folder, "embedded") == []
+    assert not run_records.end(service.folder, runs[0], "COMPLETED", "", "flow")  # the first stands
+
+
+def test_a_servers_name_has_no_secrets() -> None:
+    url = "https://anna:secret@lab.example:4200/api?key=secret"
+    assert run_records.server_name(url) == "https://lab.example:4200"
+    assert run_records.server_name(None) == "embedded"
+
+
+def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
+    service: Service, server: str, tmp_path: Path
+) -> None:
+    from flows.serving.serve_flows import collect
+
+    when = serve._prefects(
+        [
+            Scheduled(
+                name="nights", flow="collect", cron="0 22 * * *", timezone="Europe/Rome",
+                active=True, parameters={"protocol": "p.yaml", "until": "06:00"},
+            )
+        ]
+    )  # fmt: skip
+    store = Store.open(service.folder)
+
+    async def register() -> None:
+        made = await collect.ato_deployment("here", schedules=when, tags=serve._tags(store, "r"))
+        await made.aapply()
+
+    asyncio.run(register())
+    page = Page(server, "here")
+    for wanted, said in (
+        ({}, "'protocol' is a required property"),
+        ({"protocol": "p.yaml", "protcol": "x"}, "'protcol' was unexpected"),
+        ({"protocol": "p.yaml", "trials": 0}, "0 is less than the minimum of 1"),
+        ({"protocol": "p.yaml", "store": "/etc"}, "'store' was unexpected"),
+    ):
+        refused = page.run("collect", **wanted)
+        assert (refused["status"], said in refused["detail"]) == (409, True), refused
+
+    there = page.deployment("collect")
+    assert page.call(f"/deployments/{there['id']}/schedule", {}) is None
+    runs = page.call(
+        "/flow_runs/filter",
+        {
+            "flow_runs": {"deployment_id": {"any_": [there["id"]]}},
+            "sort": "EXPECTED_START_TIME_ASC",
+        },
+    )
+    assert runs
+    assert runs[0]["auto_scheduled"]
+    assert runs[0]["parameters"] == {"wanted": {"protocol": "p.yaml", "until": "06:00"}}
+
+    asyncio.run(serve._refuse_another("collect", "here", store))  # it is ours
+    page.call("/deployments/get_scheduled_flow_runs", {"deployment_ids": [there["id"]]})
+    with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
+        asyncio.run(serve._refuse_another("collect", "here", Store.create(tmp_path / "other")))
+
+
+def test_what_a_killed_service_had_taken_is_closed(service: Service, server: str) -> None:
+    from prefect.client.orchestration import get_client
+    from prefect.states import Pending
+
+    from flows.serving.serve_flows import label
+
+    async def register() -> None:
+        await (await label.ato_deployment("stranded")).aapply()
+
+    asyncio.run(register())
+    page, store = Page(server, "stranded"), Store.open(service.folder)
+    taken, ours, waiting = (page.run("label")["id"] for _ in range(3))
+    with get_client(sync_client=True) as client:
+        for run in (taken, ours):
+            client.set_flow_run_state(run, Pending(), force=True)
+    run_records.begin(service.folder, ours, "label", "embedded")  # by a process that is alive
+    asyncio.run(serve._close_stranded("stranded", ["label"], store))
+    assert page.state(taken)["type"] == "CRASHED"
+    assert "was killed" in page.state(taken)["message"]
+    assert [page.state(run)["type"] for run in (ours, waiting)] == ["PENDING", "SCHEDULED"]

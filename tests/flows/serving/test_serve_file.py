@@ -1,0 +1,118 @@
+"""The file of schedules, windows by the clock on the wall, and the compose file."""
+
+from __future__ import annotations
+
+import copy
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flows.serving.serve_file import load_schedules
+from flows.serving.serve_windows import DAYS, window_end
+from protocols import InputError
+from tests.conftest import ROOT
+
+ROME = "Europe/Rome"
+NIGHT: dict[str, Any] = {
+    "name": "nights", "flow": "collect", "protocol": str(ROOT / "protocols" / "pilot.yaml"),
+    "days": ["mon", "thu"], "from": "22:00", "until": "06:00",
+}  # fmt: skip
+
+
+def write(folder: Path, *schedules: dict[str, Any], timezone: str = ROME) -> Path:
+    path = folder / "schedules.yaml"
+    path.write_text(yaml.safe_dump({"timezone": timezone, "schedules": list(schedules)}))
+    return path
+
+
+def test_the_shipped_example_is_right() -> None:
+    nights, weekend, report = load_schedules(ROOT / "docs" / "schedules.yaml")
+    assert (nights.flow, nights.cron) == ("collect", "0 22 * * mon,tue,wed,thu")
+    assert nights.parameters == {
+        "protocol": str(ROOT / "protocols" / "kinematic.yaml"), "until": "06:00", "timezone": ROME,
+    }  # fmt: skip
+    assert (weekend.flow, weekend.parameters["until"]) == ("chain", "mon 06:00")
+    assert (report.cron, report.active, report.parameters) == ("30 8 * * tue-sat", False, {})
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"flow": "colect"}, "schedules[0].flow = colect: must be one of collect, label"),
+        ({"protcol": "x"}, "schedules[0].protcol = x: unknown key; did you mean 'protocol'?"),
+        ({"protocol": "none.yaml"}, "schedules[0].protocol = none.yaml: is no file"),
+        ({"days": ["mo"]}, "schedules[0].days[0] = mo"),
+        ({"days": []}, "schedules[0].days = []"),
+        ({"days": None}, "schedules[0].days: is missing"),
+        ({"from": None}, "schedules[0].from: is missing"),
+        ({"from": "24:00"}, 'schedules[0].from = 24:00: must be a time like "22:00"'),
+        ({"until": "monday 6:00"}, "schedules[0].until = monday 6:00: must be a time like"),
+        ({"cron": "0 22 * * *"}, "schedules[0].days"),
+        ({"cron": "0 25 * * *", "days": None, "from": None}, "is no cron line"),
+        ({"timezone": "UTC"}, "schedules[0].timezone = UTC: stands once"),
+        ({"trials": 0}, "schedules[0].trials = 0"),
+        ({"name": "Nights!"}, "schedules[0].name = Nights!"),
+        ({"flow": "pause"}, "schedules[0].flow = pause: must be one of"),
+        ({"flow": "label"}, "schedules[0].protocol"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    wrong = {key: value for key, value in {**NIGHT, **change}.items() if value is not None}
+    with pytest.raises(InputError) as error:
+        load_schedules(write(tmp_path, wrong))
+    assert said in error.value.message
+
+
+def test_names_and_zones_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"schedules\[1\]\.name = nights: stands twice"):
+        load_schedules(write(tmp_path, NIGHT, copy.deepcopy(NIGHT)))
+    with pytest.raises(InputError, match=r"timezone = Europe/Rom: is no time zone"):
+        load_schedules(write(tmp_path, NIGHT, timezone="Europe/Rom"))
+
+
+@pytest.mark.parametrize(
+    ("due", "until", "end"),
+    [
+        ("2026-11-21 22:00", "06:00", "2026-11-22 06:00:00+01:00"),
+        ("2026-11-21 06:00", "06:00", "2026-11-22 06:00:00+01:00"),  # a whole day
+        ("2026-11-20 18:00", "mon 06:00", "2026-11-23 06:00:00+01:00"),
+        ("2026-11-23 06:00", "mon 06:00", "2026-11-30 06:00:00+01:00"),
+        ("2026-03-28 22:00", "06:00", "2026-03-29 06:00:00+02:00"),  # a night of seven hours
+        ("2026-03-28 22:00", "02:30", "2026-03-29 03:30:00+02:00"),  # which that night has not
+        ("2026-10-24 22:00", "06:00", "2026-10-25 06:00:00+01:00"),  # one of nine
+    ],
+)
+def test_a_window_ends_by_the_clock_on_the_wall(due: str, until: str, end: str) -> None:
+    begin = datetime.fromisoformat(due).replace(tzinfo=ZoneInfo(ROME))
+    assert str(window_end(begin, until, ROME)) == end
+
+
+@given(
+    st.datetimes(datetime(2020, 1, 1), datetime(2035, 1, 1), timezones=st.just(UTC)),
+    st.sampled_from(["", *(f"{day} " for day in DAYS)]),
+    st.integers(0, 1439),
+    st.sampled_from([ROME, "UTC", "America/New_York", "Australia/Lord_Howe", "Asia/Kathmandu"]),
+)
+def test_a_window_ends_after_it_began_and_once(due: datetime, day: str, m: int, zone: str) -> None:
+    end = window_end(due, f"{day}{m // 60:02d}:{m % 60:02d}", zone)
+    days = 7 if day else 1
+    assert timedelta(0) < end.astimezone(UTC) - due <= timedelta(days=days, hours=1)
+    shown = end.hour * 60 + end.minute
+    assert shown == m or (shown - m) % 1440 in {30, 60}  # an hour that the clocks left out
+
+
+def test_the_compose_file_binds_to_the_loopback_and_holds_no_secret() -> None:
+    compose = yaml.safe_load((ROOT / "compose.yaml").read_text())
+    ports = [port for service in compose["services"].values() for port in service.get("ports", ())]
+    assert ports
+    assert all(str(port).startswith("127.0.0.1:") for port in ports)
+    assert compose["secrets"] == {"postgres-password": {"file": "./secrets/postgres-password"}}
+    assert "/secrets/" in (ROOT / ".gitignore").read_text().split()
+    environments = [service.get("environment", {}) for service in compose["services"].values()]
+    assert "POSTGRES_PASSWORD" not in {name for each in environments for name in each}

@@ -1,0 +1,270 @@
+"""Clocks fitted again: the same as the record's, or new ones that every later step reads."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.timeline import synchronise
+from flows.__main__ import main
+from flows.collecting.collect import collect
+from flows.labelling.label import label
+from flows.planning.orders import make_order
+from flows.reporting.summary import _sync as sync_summary
+from flows.running.campaigns import Collected, collected
+from flows.syncing.sync import sync
+from flows.syncing.sync_fit import fit_again, same_clocks
+from storage.catalogue import catalogue
+from storage.derived import Derived
+from storage.files import read_json, sha256, write_json
+from storage.recording import Recording
+from storage.store import Store
+from storage.writer import CHECKSUMS, RECORD
+from tests.flows.conftest import tiny, write
+
+SHIFT_NS = 3_000_000
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+    """Three slides, taken and not looked at yet."""
+    folder = tmp_path_factory.mktemp("sync")
+    data = tiny()
+    data["collection"]["factors"]["direction"]["values"] = [0, 120, 240]
+    data["analysis"]["split"] |= {
+        "validation_levels": {"direction": ["120 deg"]},
+        "test_levels": {"direction": ["240 deg"]},
+    }
+    order = make_order(write(folder / "tiny.yaml", data), rig_path, folder / "store")
+    collect(order)
+    return Store.open(folder / "store")
+
+
+def recordings(store: Store) -> list[Recording]:
+    """The store's trials, freshly opened."""
+    return list(store.campaign("tiny").recordings())
+
+
+def sliplab(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """The command line, in this process."""
+    monkeypatch.setattr("sys.argv", ["sliplab", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(str(ended.value.code))
+
+
+def results(store: Store) -> list[dict[str, Any]]:
+    """What the step kept of every trial."""
+    kept = Derived.of(store, "sync", "tiny")
+    return [kept.read(recording.folder.name) for recording in recordings(store)]
+
+
+def as_if_fitted_worse(recording: Recording) -> None:
+    """Commit a record whose events are off, as an older program might have."""
+    record = read_json(recording.folder / RECORD)
+    clock = record["clocks"]["events"]["map"]
+    clock["reference_ns"] = [time + SHIFT_NS for time in clock["reference_ns"]]
+    sums = read_json(recording.folder / CHECKSUMS)
+    path = recording.folder / RECORD
+    write_json(path, record)
+    sums[RECORD] = {"sha256": sha256(path), "bytes": path.stat().st_size}
+    write_json(recording.folder / CHECKSUMS, sums)
+
+
+def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
+    before = [recording.checksum for recording in recordings(store)]
+    result = sync(store, collected(store))
+    assert (result["done"], result["fresh"], result["changed"]) == (3, 0, 0)
+    assert all("clocks" not in kept and kept["refused"] == {} for kept in results(store))
+    for recording in recordings(store):
+        assert recording.clocks == recording.record["clocks"]
+        assert not recording.refitted
+    assert [recording.checksum for recording in recordings(store)] == before
+    known = result["campaigns"]["tiny"]
+    assert (known["trials"], known["refitted"], known["refused"]) == (3, 3, 0)
+    assert {name: device["grade"] for name, device in known["devices"].items()} == {
+        "events": "trigger input", "frames": "hardware trigger", "arm": "digital input"
+    }  # fmt: skip
+    json.dumps(result, allow_nan=False)
+
+
+def test_residuals_are_kept_over_the_time_of_the_trial(store: Store) -> None:
+    sync(store, collected(store))
+    for recording in recordings(store):
+        arrays = Derived.of(store, "sync", "tiny").arrays(recording.folder.name)
+        for device in ("events", "frames", "arm"):
+            time_s, residual_us = arrays[f"{device}_s"], arrays[f"{device}_us"]
+            assert len(time_s) == len(residual_us) <= 200
+            assert (np.diff(time_s) > 0).all()
+            assert 0 <= time_s[0] < 1 < time_s[-1] < recording.record["recorded_s"] + 2
+            most = recording.clocks[device]["residual_max_ns"] / 1e3
+            assert 0 < np.abs(residual_us).max() <= most + 1e-9
+
+
+def test_a_second_run_does_nothing(store: Store) -> None:
+    first = sync(store, collected(store))
+    page = Path(first["page"])
+    written = page.stat().st_mtime_ns
+    again = sync(store, collected(store))
+    assert (again["done"], again["fresh"]) == (0, 3)
+    assert page.stat().st_mtime_ns == written
+    page.unlink()
+    assert sync(store, collected(store))["done"] == 0
+    assert page.exists()
+
+
+def test_a_new_version_that_fits_alike_makes_nothing_else_stale(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync(store, collected(store))
+    label(store, collected(store))
+    with monkeypatch.context() as patched:
+        patched.setattr(synchronise, "VERSION", synchronise.VERSION + 1)
+        assert sync(store, collected(store))["done"] == 3
+        assert label(store, collected(store))["done"] == 0
+    assert sync(store, collected(store))["done"] == 3
+
+
+def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None:
+    sync(store, collected(store))
+    label(store, collected(store))
+    first = recordings(store)[0]
+    true = first.clock("events").to_reference(10**9)
+    old = first.raw_checksum
+    as_if_fitted_worse(first)
+    worse = recordings(store)[0]
+    assert worse.raw_checksum != old
+    # what was fitted of other raw data is not used
+    assert worse.clock("events").to_reference(10**9) == true + SHIFT_NS
+    label(store, collected(store))
+
+    campaigns = collected(store)
+    opened = campaigns[0].campaign.recording(first.folder.name)
+    result = sync(store, campaigns)
+    assert (result["done"], result["changed"]) == (1, 1)
+    assert opened.clock("events").to_reference(10**9) == true
+    assert opened.refitted
+    assert opened.checksum != opened.raw_checksum
+    assert opened.record["clocks"]["events"]["map"] != opened.clocks["events"]["map"]
+    sent = pickle.loads(pickle.dumps(opened))
+    assert sent.clocks == opened.clocks
+    assert label(store, campaigns)["done"] == 1
+    assert label(store, collected(store))["done"] == 0
+    text = Path(result["page"]).read_text()
+    assert "<td>1</td>" in text  # one trial with refitted clocks
+
+
+def test_a_refusal_keeps_the_record_and_is_told(
+    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sync(store, collected(store))
+    first = recordings(store)[0]
+    found = synchronise.synchronise_recording(first)
+    del found.devices["frames"]
+    found.refused["frames"] = "ambiguous: it fits twice"
+    monkeypatch.setattr(synchronise, "synchronise_recording", lambda recording: found)
+    data, arrays = fit_again(first, None)
+    assert "clocks" not in data
+    assert "frames_us" not in arrays
+    kept = Derived.of(store, "sync", "tiny")
+    before = kept.read(first.folder.name)
+    kept.write(first.folder.name, before["key"], data, arrays)
+    result = sync(store, collected(store))
+    assert (result["done"], result["campaigns"]["tiny"]["refused"]) == (0, 1)
+    said = capsys.readouterr().err
+    assert "frames cannot be fitted again (ambiguous: it fits twice)" in said
+    assert recordings(store)[0].clocks == first.record["clocks"]
+    (kept.folder / f"{first.folder.name}.json").unlink()
+    assert sync(store, collected(store))["done"] == 1
+
+
+def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
+    first = recordings(store)[0]
+    path = Derived.of(store, "sync", "tiny").folder / f"{first.folder.name}.json"
+    sync(store, collected(store))
+    kept = read_json(path)
+    clocks = json.loads(json.dumps(first.record["clocks"]))
+    clocks["events"]["uncertainty_ns"] = 77_000.0
+    write_json(path, {**kept, "clocks": clocks})
+    table = catalogue(store)
+    assert table["sync_uncertainty_us"].max() == 77.0
+    told = sync_summary(collected(store))
+    assert told["worst_against_events_us"]["events"] == 77.0
+    assert set(told) == {"grade", "grades", "worst_uncertainty_us", "worst_against_events_us"}
+    write_json(path, kept)
+
+
+def test_the_page_has_every_figure_and_stands_alone(store: Store) -> None:
+    text = Path(sync(store, collected(store))["page"]).read_text()
+    for name in (
+        "Residuals over a trial", "Drift over the campaign", "Pulses and frames",
+        "Uncertainty of events against frames and arm", "The worst trials",
+    ):  # fmt: skip
+        assert f"<h2>{name}" in text
+    assert text.count("<figure>") == text.count(">simulated</text>") == 4
+    for unit in ("residual (µs)", "drift (ppm)", "uncertainty (µs)", "missed pulses", "lost"):
+        assert unit in text
+    assert "cannot be told from that of the device" in text
+    assert "Every number and picture here is simulated" in text
+    assert "src=" not in text
+    for recording in recordings(store):
+        assert recording.folder.name in text
+
+
+def test_processors_may_differ_in_the_last_digit() -> None:
+    clock = {"grade": "a", "drift_ppm": 12.5, "map": {"device_ns": [5], "drift": [10**13]}}
+    near = {
+        "grade": "a",
+        "drift_ppm": 12.5 + 1e-13,
+        "map": {"device_ns": [5], "drift": [10**13 + 9]},
+    }
+    assert same_clocks(clock, near)
+    for change in (
+        {"grade": "b"}, {"drift_ppm": 12.50001}, {"map": {"device_ns": [6], "drift": [10**13]}},
+    ):  # fmt: skip
+        assert not same_clocks(clock, {**clock, **change})
+    assert not same_clocks(clock, {"grade": "a"})
+
+
+def test_the_command_prints_a_table_and_one_object(
+    store: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert sliplab(monkeypatch, "sync", store.folder) == 0
+    shown = capsys.readouterr().out
+    for word in ("Clocks of tiny (simulated)", "hardware", "events", "sync.html"):
+        assert word in shown
+    assert sliplab(monkeypatch, "sync", store.folder, "--campaign", "tiny", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["step"], found["simulated"], found["fresh"]) == ("sync", True, 3)
+    assert found["campaigns"]["tiny"]["devices"]["arm"]["pulses"].keys() == {
+        "missed", "late", "spurious"
+    }  # fmt: skip
+
+
+def test_a_store_without_a_campaign_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store.create(tmp_path / "store")
+    assert sliplab(monkeypatch, "sync", tmp_path / "store") == 1
+    assert "holds no campaign yet; run `sliplab collect` first" in capsys.readouterr().err
+
+
+def test_a_campaign_that_is_not_there_is_named(
+    store: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert sliplab(monkeypatch, "sync", store.folder, "--campaign", "other") == 2
+    assert "there are tiny" in capsys.readouterr().err
+
+
+def test_a_campaign_without_trials_has_a_page_that_says_so(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Collected, "trials", [])
+    result = sync(store, collected(store))
+    assert (result["done"], result["fresh"]) == (0, 0)
+    assert "hold no committed trial" in Path(result["page"]).read_text()
