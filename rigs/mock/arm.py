@@ -122,10 +122,6 @@ class MockArm:
         """Stop now."""
         self._world.halt_arm(self._world.now_ns, self._world.arm_state)
 
-    def clear_protective_stop(self) -> None:
-        """What a person does at the teach pendant; no rig may do it by itself."""
-        self._world.arm_state = ArmState.READY
-
     def close(self) -> None:
         """Give the connection back."""
         self._connected = False
