@@ -96,7 +96,8 @@ class Engine:
         """
         if not isinstance(x, SparseWindows):
             if x.shape[1:] != self.shape:
-                raise ValueError(f"samples have the shape {x.shape}; expected (n, *{self.shape})")
+                expected = ", ".join(map(str, self.shape))
+                raise ValueError(f"samples have the shape {x.shape}; expected (n, {expected})")
             x = SparseWindows.of(x)
         if x.shape != self.shape:
             raise ValueError(f"samples have the shape {x.shape}; expected {self.shape}")

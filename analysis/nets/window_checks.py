@@ -38,7 +38,8 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
     def predict(order: tuple[int, ...]) -> Counts:
         net = restore(fitted)
         values = dict(fitted.state_dict)
-        values["fc2.weight"] = values["fc2.weight"][list(order)]
+        for name in ("fc2.weight", "fc2.bias"):
+            values[name] = values[name][list(order)]
         set_weights(net, values)
         return Engine(net, fitted.windows.cells).counts(x)
 

@@ -405,7 +405,8 @@ def test_the_model_goes_out_as_what_it_is(
     speck = json.loads((tmp_path / "out" / "seed0.speck.json").read_text())
     with np.load(tmp_path / "out" / "seed0.speck.npz") as arrays:
         assert {name: arrays[name].dtype for name in arrays} == dict.fromkeys(
-            ("conv1", "conv2", "fc1", "fc2"), np.int8
+            ("conv1.weight", "conv2.weight", "fc1.weight", "fc1.bias", "fc2.weight", "fc2.bias"),
+            np.int8,
         )
     assert speck["quantisation"]["change"]["windows"] == card["figures"]["test"]["samples"]
     for name in (".card.md", ".speck.md"):
