@@ -92,7 +92,7 @@ def kill_study(folder: Path, kills: int, seed: int, arguments: list[str]) -> dic
     whole_s = time.monotonic() - began
     at, done = [], 0
     while done < kills:
-        after = rng.uniform(0.02, 0.6) * whole_s
+        after = rng.uniform(0.02, 0.3) * whole_s
         code = live(stopped, arguments, log, after)
         if code >= 0:
             break  # it was complete before its time

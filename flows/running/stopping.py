@@ -8,10 +8,13 @@ every step.
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from types import FrameType
 
 _requested = threading.Event()
@@ -23,8 +26,20 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 def leave_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; only the parent answers it."""
+    """Ctrl-C reaches every process of a terminal; only the parent answers it.
+
+    A parent that is killed answers nothing: its children end with it. By themselves they would
+    stay, each waiting at a pipe whose other end the next one holds open.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()  # bounded by the parent's life
+    os._exit(1)
 
 
 def requested() -> bool:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -51,3 +56,46 @@ def forget() -> Iterator[None]:
     yield
     with stopping.signals():
         pass
+
+
+ORPHANS = """
+import os
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+from flows.running import stopping
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(
+        2, mp_context=get_context("spawn"), initializer=stopping.leave_to_parent
+    ) as pool:
+        for each in [pool.submit(os.getpid) for _ in range(64)]:
+            each.result()
+        print(*(worker.pid for worker in pool._processes.values()), flush=True)
+        input()
+"""
+
+
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    """Each of them waits at a pipe whose other end its neighbour holds: no end of file comes."""
+    script = tmp_path / "pool.py"
+    script.write_text(ORPHANS)
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert parent.stdin is not None
+    assert parent.stdout is not None
+    with parent.stdin, parent.stdout:
+        workers = [os.pidfd_open(int(pid)) for pid in parent.stdout.readline().split()]
+        try:
+            assert len(workers) == 2
+            assert select.select(workers, [], [], 0)[0] == []
+            parent.kill()
+            parent.wait(30)
+            for worker in workers:
+                assert select.select([worker], [], [], 30)[0] == [worker]
+        finally:
+            for worker in workers:
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(worker, signal.SIGKILL)
+                os.close(worker)
