@@ -25,12 +25,13 @@ def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> S
     if found is None:
         return Section(
             title,
-            ["Not measured in this store. It takes hours:"],
+            ["Not measured in this store. It takes a quarter of an hour; all levels take hours:"],
             commands=[(command(store, "generalisation"), "makes it.")],
         )
     groups: dict[str, list[Share]] = {}
     rows = []
-    for name, row in _checked(found, "generalisation", "results").items():
+    results = _checked(found, "generalisation", "results")
+    for name, row in sorted(results.items(), key=lambda each: each[0].startswith("skin ")):
         if "left out" in row:
             rows.append([name, row["left out"], "", "", "", ""])
             continue
