@@ -19,7 +19,7 @@ import torch
 
 from analysis.nets import model_file
 from analysis.nets.dataset import SampleSet
-from analysis.nets.network import exact, spike_counts
+from analysis.nets.network import exact, matrices, spike_counts
 from analysis.nets.training import engine, restore
 
 PART = 2048
@@ -27,9 +27,8 @@ PART = 2048
 
 def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int | bool]:
     """How many of the first `most` windows differ."""
-    torch.set_num_threads(
-        1
-    )  # waiting for each other, Sinabs' threads take longer beside other work
+    # waiting for each other, Sinabs' threads take longer beside other work
+    torch.set_num_threads(1)
     fitted = model_file.load(model)
     net, fast = restore(fitted), engine(fitted)
     compared = differ = with_spikes = 0
@@ -44,12 +43,11 @@ def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int |
             print(f"{compared} windows, {differ} differ", file=sys.stderr)
             if compared >= most:
                 break
-    weights = [value.numpy() for value in fitted.state_dict.values()]
     return {
         "windows": compared,
         "with_spikes": with_spikes,
         "differ": differ,
-        "exact_by_arithmetic": exact(weights),
+        "exact_by_arithmetic": exact(matrices(net)),
     }
 
 
