@@ -60,7 +60,12 @@ def collected(campaigns: list[Collected], summary: Json, simulated: bool) -> Sec
         [
             f"{quality['committed']} of {quality['planned']} planned trials are committed; "
             f"{quality['retaken']} attempts failed a quality gate and were taken again or set "
-            f"aside, {quality['quarantined']} attempts stand in quarantine.",
+            f"aside, {quality['quarantined']} attempts stand in quarantine"
+            + (
+                f", {quality['interrupted']} more were broken off by a stop."
+                if quality["interrupted"]
+                else "."
+            ),
             f"Kept of the outside camera: {results.source_text(summary)}.",
         ],
         pictures,

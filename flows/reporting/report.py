@@ -32,7 +32,7 @@ from storage.files import make_folder, read_json, write_json, write_text
 from storage.store import Store, StoreError, safe_name
 
 STEP = "report"
-VERSION = 5
+VERSION = 6
 
 
 def report_folder(store: Store) -> Path:

@@ -150,11 +150,13 @@ def _sync(campaigns: list[Collected]) -> dict[str, Any]:
 
 def _quality(campaigns: list[Collected]) -> dict[str, Any]:
     aside = [known for item in campaigns for known in item.campaign.quarantined()]
+    broken_off = sum(known["cause"] == "interrupted" for known in aside)
     return {
         "planned": sum(len(item.plan) for item in campaigns),
         "committed": sum(len(item.trials) for item in campaigns),
         "retaken": sum(str(known["cause"]).startswith("gate") for known in aside),
-        "quarantined": len(aside),
+        "quarantined": len(aside) - broken_off,
+        "interrupted": broken_off,
     }
 
 

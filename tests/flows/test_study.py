@@ -96,7 +96,7 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Out
     assert summary["labels"]["source"] == {"video": 0, "tracks": 8}
     assert summary["sync"]["grade"] == "hardware trigger"
     assert summary["quality"] == {
-        "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0
+        "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0, "interrupted": 0
     }  # fmt: skip
     assert {"collect tiny", "label", "train", "evaluate", "report"} <= set(summary["timing_s"])
     assert set(summary["protocols"]) == {"tiny", "tiny_gravity"}
