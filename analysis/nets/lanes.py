@@ -54,41 +54,40 @@ def _all(builder: Any, value: Any, lanes: int) -> Any:
     return builder.shuffle_vector(first, nothing, zeros)
 
 
+def _add(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    """The code of `add` and `add_times`."""
+    kinds, (a, at, b, of, *factor) = signature.args, given
+    to = _place(context, builder, kinds[0], a, at, LANES)
+    by = _load(builder, _place(context, builder, kinds[2], b, of, LANES), LANES)
+    for each in factor:
+        by = builder.fmul(by, _all(builder, each, LANES))
+    _store(builder, builder.fadd(_load(builder, to, LANES), by), to)
+    return context.get_dummy_value()
+
+
 @intrinsic
 def add(typing: Any, a: Any, at: Any, b: Any, of: Any) -> Any:
     """``a[at:at + LANES] += b[of:of + LANES]``, float32."""
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = signature.args
-        to = _place(context, builder, kinds[0], given[0], given[1], LANES)
-        by = _place(context, builder, kinds[2], given[2], given[3], LANES)
-        _store(builder, builder.fadd(_load(builder, to, LANES), _load(builder, by, LANES)), to)
-        return context.get_dummy_value()
-
-    return types.void(a, at, b, of), code
+    return types.void(a, at, b, of), _add
 
 
 @intrinsic
 def add_times(typing: Any, a: Any, at: Any, b: Any, of: Any, factor: Any) -> Any:
     """``a[at:at + LANES] += b[of:of + LANES] * factor``, float32, rounded twice."""
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = signature.args
-        to = _place(context, builder, kinds[0], given[0], given[1], LANES)
-        by = _place(context, builder, kinds[2], given[2], given[3], LANES)
-        product = builder.fmul(_load(builder, by, LANES), _all(builder, given[4], LANES))
-        _store(builder, builder.fadd(_load(builder, to, LANES), product), to)
-        return context.get_dummy_value()
-
-    return types.void(a, at, b, of, factor), code
+    return types.void(a, at, b, of, factor), _add
 
 
-def _step(builder: Any, current: Any, v: Any, threshold: Any, kept: Any) -> Any:
-    """A step of `BLOCK` neurons whose numbers lie at these pointers; who fires, as bits."""
+def _fires(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    """The code of `fires` and `fires_kept`."""
+    *arrays, at, threshold = given
+    current, v, *kept = (
+        _place(context, builder, kind, array, at, BLOCK)
+        for kind, array in zip(signature.args, arrays, strict=False)
+    )
     zero = ir.Constant(_vector(BLOCK), [0.0] * BLOCK)
     u = builder.fadd(_load(builder, v, BLOCK), _load(builder, current, BLOCK))
-    if kept is not None:
-        _store(builder, u, kept)
+    for place in kept:
+        _store(builder, u, place)
     over = builder.fsub(u, _all(builder, threshold, BLOCK))
     fired = builder.fcmp_ordered(">=", over, zero)
     _store(builder, builder.select(fired, zero, u), v)
@@ -103,28 +102,13 @@ def fires(typing: Any, current: Any, v: Any, at: Any, threshold: Any) -> Any:
     u = v + current; it fires where u - threshold >= 0; then v = 0, else u; current = 0. All are
     float32, and the bits a uint64.
     """
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = signature.args
-        i = _place(context, builder, kinds[0], given[0], given[2], BLOCK)
-        potential = _place(context, builder, kinds[1], given[1], given[2], BLOCK)
-        return _step(builder, i, potential, given[3], None)
-
-    return types.uint64(current, v, at, threshold), code
+    return types.uint64(current, v, at, threshold), _fires
 
 
 @intrinsic
 def fires_kept(typing: Any, current: Any, v: Any, u: Any, at: Any, threshold: Any) -> Any:
     """As `fires`, and ``u[at:at + BLOCK]`` is filled with the potentials before the reset."""
-
-    def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = signature.args
-        i = _place(context, builder, kinds[0], given[0], given[3], BLOCK)
-        potential = _place(context, builder, kinds[1], given[1], given[3], BLOCK)
-        kept = _place(context, builder, kinds[2], given[2], given[3], BLOCK)
-        return _step(builder, i, potential, given[4], kept)
-
-    return types.uint64(current, v, u, at, threshold), code
+    return types.uint64(current, v, u, at, threshold), _fires
 
 
 @intrinsic

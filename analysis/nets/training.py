@@ -26,6 +26,7 @@ from scipy.special import log_softmax
 from torch import nn
 
 from analysis.nets import metrics
+from analysis.nets.learning_rate import learning_rate
 from analysis.nets.network import (
     SPIKING,
     build,
@@ -338,22 +339,6 @@ class _Run:
             raise ValueError(f"not a state of this training: {error}") from error
         self.to_grid()
         self.settle()
-
-
-def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
-    """Of a step in the epoch after `done` epochs.
-
-    Constant, or falling from the full rate to nothing along half a cosine over all epochs
-    (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a line.
-
-    Args:
-        step, steps: done in this epoch, and all of an epoch.
-    """
-    rising = training.warm_up * training.epochs * steps
-    rate = training.learning_rate * min(1.0, (done * steps + step + 1) / max(rising, 1.0))
-    if training.schedule == "constant":
-        return rate
-    return rate * 0.5 * (1.0 + math.cos(math.pi * done / training.epochs))
 
 
 def _record(

@@ -15,7 +15,6 @@ from analysis.nets.training import (
     EpochRecord,
     Fitted,
     fit,
-    learning_rate,
     predict_counts,
     restore,
 )
@@ -185,25 +184,6 @@ def test_a_damaged_state_is_refused(spoilt: bytes | None) -> None:
         spoilt = states[0]
     with pytest.raises(ValueError, match=r"state of this training|expected"):
         fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, state=spoilt)
-
-
-def test_the_rate_falls_along_half_a_cosine() -> None:
-    falling = Training(epochs=10, learning_rate=1e-2, schedule="cosine")
-    rates = [learning_rate(falling, done) for done in range(10)]
-    assert rates[0] == 1e-2
-    assert rates[5] == pytest.approx(5e-3)
-    assert 0 < rates[-1] < 3e-4
-    assert rates == sorted(rates, reverse=True)
-    assert {learning_rate(TRAINING, done) for done in range(5)} == {TRAINING.learning_rate}
-
-
-def test_the_rate_rises_in_a_line_first() -> None:
-    rising = Training(epochs=10, learning_rate=1e-2, schedule="constant", warm_up=0.15)
-    rates = [learning_rate(rising, k // 100, k % 100, 100) for k in range(1000)]
-    np.testing.assert_allclose(rates[:150], 1e-2 * np.arange(1, 151) / 150, rtol=1e-12)
-    assert set(rates[150:]) == {1e-2}
-    flat = rising.model_copy(update={"warm_up": 0.0})
-    assert learning_rate(flat, 0, 0, 100) == 1e-2
 
 
 def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) -> None:

@@ -31,7 +31,6 @@ from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detecting.detecting import (
     RIG,
     keeping,
-    model_in,
     ordered,
     short_slide,
     slip_when_busy,
@@ -39,16 +38,6 @@ from tests.flows.detecting.detecting import (
     untrained,
 )
 from tests.flows.live import order_in, take_all
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return model_in(tmp_path_factory.mktemp("model"))
-
-
-@pytest.fixture(scope="module")
-def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("protocol") / "p.yaml", short_slide())
 
 
 @pytest.fixture(scope="module")

@@ -24,23 +24,10 @@ from tests.flows.conftest import write
 from tests.flows.detecting.detecting import (
     RIG,
     keeping,
-    model_in,
     ordered,
-    short_slide,
     slip_when_busy,
     stands_clear,
 )
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return model_in(tmp_path_factory.mktemp("model"))
-
-
-@pytest.fixture(scope="module")
-def protocol(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("protocol") / "p.yaml", short_slide())
-
 
 # -- how it ends -----------------------------------------------------------------------------
 
