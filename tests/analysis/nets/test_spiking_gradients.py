@@ -12,7 +12,7 @@ from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Job, Trainer, WindowLoss
 from analysis.nets.spiking_gradients import _through
 from protocols.settings import Network, Windows
-from tests.analysis.nets.test_spiking import FULL, SMALL, TINY, gridded, put, sparse
+from tests.analysis.nets.test_spiking import FULL, SMALL, TINY, gridded, on_own_grid, put, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -96,15 +96,17 @@ def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
     ("windows", "share"), [(TINY, 0.1), (TINY, 0.3), (FULL, 0.01), (FULL, 0.03)]
 )
 def test_gradients_are_sinabs_own(windows: Windows, share: float) -> None:
+    network = Network() if windows is FULL else SMALL
     for seed in range(2):
-        net = gridded(Network() if windows is FULL else SMALL, windows, seed)
         x = sparse(6, windows, seed, share)
         y = torch.tensor([0, 1, 2, 0, 1, 2])
+        net = on_own_grid(build(network, windows, seed))
+        _, fast = by_events(net, x, y, windows.cells)
+        assert max(off(fast, by_sinabs(net, x, y))) <= 1e-6
+        assert max(off(fast, in_double(net, x, y))) <= 1e-6
+        net = gridded(network, windows, seed)  # other biases
         _, fast = by_events(net, x, y, windows.cells)
         assert max(off(fast, in_double(net, x, y))) <= 1e-6
-        # Sinabs' own are rounded too: 0.9e-6 off in windows of three times the usual events
-        allowed = 2e-6 if windows is FULL and share > 0.01 else 1e-6
-        assert max(off(fast, by_sinabs(net, x, y))) <= allowed
 
 
 def test_where_sums_cancel_the_error_is_that_of_float32() -> None:
