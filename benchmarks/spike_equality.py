@@ -10,6 +10,7 @@ extremes.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -53,9 +54,13 @@ def compare(samples: list[SampleSet], model: Path, most: int) -> dict[str, int |
 
 def main() -> int:
     """The command line."""
-    store, model, most = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-    paths = sorted((store / "derived" / "samples").glob("*.arrays"))
-    found = compare([SampleSet.load(path) for path in paths], model, most)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.spike_equality")
+    parser.add_argument("store", type=Path)
+    parser.add_argument("model", type=Path, help="such as STORE/models/seed0.pt")
+    parser.add_argument("most", type=int, help="windows")
+    asked = parser.parse_args()
+    paths = sorted((asked.store / "derived" / "samples").glob("*.arrays"))
+    found = compare([SampleSet.load(path) for path in paths], asked.model, asked.most)
     print(json.dumps(found))
     return int(found["differ"] > 0)
 

@@ -1,11 +1,13 @@
 """The whole chain: collect every protocol, synchronise, label, check the labels, train, evaluate,
-report. Run again it goes on where it was, and a step with nothing to do says so.
+search if that is asked for, report. Run again it goes on where it was, and a step with nothing to
+do says so.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from flows.collecting.collect import collect
@@ -19,6 +21,7 @@ from flows.planning.orders import Order
 from flows.reporting.report import report
 from flows.running.campaigns import collected
 from flows.study_ledger import Ledger, Row
+from flows.study_searches import Search, training_windows
 from flows.syncing.sync import sync
 from storage.store import Store
 
@@ -40,15 +43,16 @@ class Outcome:
     rows: list[Row] = field(default_factory=list)
 
 
-def study(orders: list[Order], check: int = 0) -> Outcome:
+def study(orders: list[Order], check: int = 0, more: Sequence[Search] = ()) -> Outcome:
     """Run what is missing or stale, step by step; a step with nothing to do says so.
 
     Args:
         check: trials whose labels are checked with video, where the rig draws none.
+        more: what is searched before the report.
     """
     Store.create(orders[0].store)
     check = check if label_check.wanted(orders[0]) else 0
-    ledger = Ledger(orders[0].store, expected(orders, check))
+    ledger = Ledger(orders[0].store, expected(orders, check, more))
     done = []
     for order in orders:
         with ledger.step(f"collect {order.campaign}") as tell:
@@ -71,11 +75,13 @@ def study(orders: list[Order], check: int = 0) -> Outcome:
         run(CHECK, lambda: check_labels(orders[0], check), "trials")
     run("train", lambda: train(store, campaigns), "networks")
     run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
+    for search in more:
+        run(search.name, partial(search.work, store, campaigns), search.of)
     run("report", lambda: report(store, campaigns), "pages")
     return Outcome(done, steps, ledger.rows())
 
 
-def expected(orders: list[Order], check: int) -> dict[str, float]:
+def expected(orders: list[Order], check: int, more: Sequence[Search] = ()) -> dict[str, float]:
     """Seconds that each step is expected to take from nothing."""
     seconds: dict[str, float] = {}
     labelled, trials = 0.0, 0
@@ -91,21 +97,16 @@ def expected(orders: list[Order], check: int) -> dict[str, float]:
     if check:
         seconds[CHECK] = (COLLECT_S["video"] + LABEL_S["video"]) * check
     seconds["train"] = _training_s(orders)
-    return {**seconds, "evaluate": EVALUATE_S, "report": REPORT_S}
+    seconds["evaluate"] = EVALUATE_S
+    return {**seconds, **{search.name: search.seconds for search in more}, "report": REPORT_S}
 
 
 def _training_s(orders: list[Order]) -> float:
     found = [order for order in orders if order.plan.protocol.collection.experiment == "kinematic"]
-    windows = sum(
-        3 * order.plan.protocol.analysis.samples.per_class
-        for order in found
-        for trial in order.plan
-        if trial.split == "train"
-    )
     if not found:
         return 0.0
     training = found[0].plan.protocol.analysis.training
-    return windows * training.epochs * len(training.seeds) / SAMPLES_PER_S
+    return training_windows(found) * training.epochs * len(training.seeds) / SAMPLES_PER_S
 
 
 def _tell(tell: Callable[[str, bool], None], done: int, of: str) -> None:

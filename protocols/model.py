@@ -129,11 +129,19 @@ class Collection(StrictModel):
             fail("cannot hold before the approach")
         if ("plate" in names) != (self.plate is not None):
             fail("phases 'plate' and the section 'plate' belong together")
-        used = {str(ref) for ref in _references_in(self.motion)}
-        used |= {str(ref) for ref in _references_in(self.plate)}
+        references = [*_references_in(self.motion), *_references_in(self.plate)]
+        used = {str(ref) for ref in references}
         for ref in sorted(used):
             if ref[1:] not in self.factors:
                 fail(f"names a factor that is not there; there are {', '.join(self.factors)}", ref)
+        for each in references:
+            unit = self.factors[each.factor].unit
+            if unit is not None and unit != each.unit:
+                raise KeyedError(
+                    f"collection.factors.{each.factor}.unit",
+                    unit,
+                    f"must be {each.unit or 'left out, with words as levels'} where {each} stands",
+                )
         for name in self.factors:
             if f"${name}" not in used:
                 raise KeyedError(

@@ -95,9 +95,14 @@ def parse(raw: object, unit: str) -> Decimal:
 
 @dataclass(frozen=True)
 class FactorRef:
-    """``$depth`` in a motion phase: the level of that factor in the trial at hand."""
+    """``$depth`` in a motion phase: the level of that factor in the trial at hand.
+
+    Attributes:
+        unit: what its levels must be in, canonical; None for words.
+    """
 
     factor: str
+    unit: str | None = None
 
     def __str__(self) -> str:
         return f"${self.factor}"
@@ -110,7 +115,7 @@ def parse_or_ref(raw: object, unit: str) -> Decimal | FactorRef:
     if isinstance(raw, str) and raw.startswith("$"):
         if not re.fullmatch(r"\$[a-z][a-z0-9_]*", raw):
             raise ValueError("must be a factor's name after '$', such as '$depth'")
-        return FactorRef(raw[1:])
+        return FactorRef(raw[1:], unit)
     return parse(raw, unit)
 
 
@@ -186,8 +191,6 @@ PositiveMillimetres: Any = _quantity("mm", "0", True, ref=False)
 PositiveSpeed: Any = _quantity("mm/s", "0", True, ref=False)
 Seconds: Any = _quantity("s", "0", False, ref=False)
 PositiveSeconds: Any = _quantity("s", "0", True, ref=False)
-PositiveKilograms: Any = _quantity("kg", "0", True, ref=False)
-PositivePixels: Any = _quantity("px", "0", True, ref=False)
 PositivePercent: Any = _quantity("percent", "0", True, ref=False)
 # The same, or a factor's name after a dollar sign.
 MillimetresOrRef: Any = _quantity("mm", "0", True, ref=True)
@@ -195,3 +198,11 @@ SpeedOrRef: Any = _quantity("mm/s", "0", True, ref=True)
 DegreesOrRef: Any = _quantity("deg", None, False, ref=True)
 KilogramsOrRef: Any = _quantity("kg", "0", True, ref=True)
 PercentOrRef: Any = _quantity("percent", "0", False, ref=True)
+
+
+def level_order(text: str) -> tuple[float, str]:
+    """Key that sorts levels in words (``2.4 mm``) by their number, and those without one last."""
+    try:
+        return float(text.split()[0]), ""
+    except (ValueError, IndexError):
+        return float("inf"), text

@@ -19,15 +19,12 @@ Code = Literal["lfsr", "irregular", "regular"]
 """What the box sends: 16-bit LFSR, irregular intervals, or a regular train with a start marker."""
 FrameGrade = Literal["hardware trigger", "exposure line", "device time stamps", "host arrival"]
 ArmGrade = Literal["digital input", "host time"]
-EventGrade = Literal["trigger input"]
-Grade = FrameGrade | ArmGrade | EventGrade
 WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")
 """Grades by which a device's time is known from a wire; the others go through the host."""
 
 MARKER_TICKS = 16
 """A regular train begins with a pulse and this many ticks without one; then every second tick."""
 CRYSTAL_PPM = 200.0
-CERAMIC_PPM = 5000.0
 
 
 class DeviceClock(StrictModel):

@@ -179,7 +179,3 @@ def write(
         path = _path(store)
         make_folder(path.parent)
         write_bytes(path, hashlib.sha256(data).digest() + data)
-
-
-def _same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
-    return bool(one.equals(other)) and list(one.dtypes) == list(other.dtypes)

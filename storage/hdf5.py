@@ -1,8 +1,9 @@
 """One HDF5 file a trial for everything but frames, in the event layout of the DSEC data set.
 
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
-other streams stand beside them. Columns are chunked and compressed with bitshuffle and zstd.
-Attributes give every column its unit. Files carry no time stamps: the same data are the same bytes.
+other streams stand beside them. Columns are chunked and compressed with bitshuffle, events in
+LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
+same data are the same bytes.
 """
 
 from __future__ import annotations

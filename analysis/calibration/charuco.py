@@ -68,12 +68,6 @@ class Board:
         size = (self.columns, self.rows)
         return cv2.aruco.CharucoBoard(size, self.square_mm, self.marker_mm, dictionary)
 
-    def picture(self, px_per_mm: int) -> Picture:
-        """The squares without a margin, 0 black and 255 white, (h, w)."""
-        width, height = (round(side * px_per_mm) for side in self.size_mm)
-        result: Picture = self.opencv().generateImage((width, height), marginSize=0)
-        return result
-
 
 @dataclass(frozen=True)
 class Corners:

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NONE = -1
 BEFORE, AFTER = 12, 8
 """Frames before and after the slip that are used."""
 DEPARTED_PX = 0.06

@@ -25,7 +25,6 @@ DEFAULT_MARGIN = 2.0
 Counts = npt.NDArray[Any]
 Labels = npt.NDArray[np.integer[Any]]
 IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from analysis.nets.training import EpochRecord, Fitted, restore
+from analysis.nets.epoch_record import EpochRecord
+from analysis.nets.training import Fitted, restore
 from protocols.settings import Network, Training, Windows
 from storage.files import write_bytes
 

@@ -28,9 +28,13 @@ WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 BIASED = ("fc1", "fc2")
 """Those of them with a bias as well: a current that their neurons get in every step."""
 
-FIRST_BIAS = {"fc1": (-0.5, 0.5), "fc2": (0.3, 0.3)}
-"""Between which values biases begin, in thresholds a step. Half of the hidden neurons fire by
-themselves, so that events can also silence; all outputs do, so that none is out of reach."""
+FIRST_BIAS = (-0.5, 0.5)
+"""Between which values the hidden neurons' biases begin, in thresholds a step: half of them fire by
+themselves, so that events can also silence."""
+
+FIRST_DRIVE = 0.3
+"""What every output gets in a step of a window without events, before training, in thresholds. One
+that began far below its threshold would never be reached (docs/decisions/0056)."""
 
 SPIKING = ("iaf1", "iaf2", "iaf3", "iaf4")
 """Names of the spiking layers, one after each layer of `WEIGHTED`."""
@@ -44,8 +48,9 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
 
     Time is folded into the batch: the modules take (n * steps, channels, cells, cells) float32
     and give (n * steps, 3) spikes. Weights are torch's default draw times
-    ``settings.weight_scale``; biases begin at `FIRST_BIAS`, and the convolutions have none
-    (docs/decisions/0054). torch's global random state is left as it was.
+    ``settings.weight_scale``; hidden neurons' biases are drawn from `FIRST_BIAS`, outputs begin at
+    `FIRST_DRIVE`, and convolutions have no biases (docs/decisions/0054, 0056). torch's global
+    random state is left as it was.
 
     Args:
         settings: channels, kernels, hidden neurons, weight scale.
@@ -69,12 +74,12 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
         )
         fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden)
         fc2 = nn.Linear(settings.hidden, len(CLASSES))
-        for name, layer in (("fc1", fc1), ("fc2", fc2)):
-            nn.init.uniform_(layer.bias, *FIRST_BIAS[name])
+        nn.init.uniform_(fc1.bias, *FIRST_BIAS)
     layers: tuple[Any, ...] = (conv1, conv2, fc1, fc2)
     with torch.no_grad():
         for layer, scale in zip(layers, settings.weight_scale, strict=True):
             layer.weight.mul_(scale)
+        fc2.bias.copy_(FIRST_DRIVE - fc2.weight @ rates_alone(fc1.bias, windows.steps))
     return nn.Sequential(
         OrderedDict(
             conv1=conv1,
@@ -88,6 +93,16 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             iaf4=_iaf(windows.steps),
         )
     )
+
+
+def rates_alone(bias: torch.Tensor, steps: int) -> torch.Tensor:
+    """Spikes a step of neurons that get nothing but their bias, by the paper's neuron (n,).
+
+    A bias b > 0 takes ceil(1 / b) steps from reset to the threshold 1; one that takes more than
+    `steps` does not fire within a window.
+    """
+    wait = torch.ceil(1.0 / bias.clamp(min=0.5 / steps))
+    return torch.where((bias > 0) & (wait <= steps), 1.0 / wait, torch.zeros_like(bias))
 
 
 def _iaf(steps: int) -> IAFSqueeze:

@@ -19,7 +19,6 @@ from analysis.nets.windows import bin_events
 from protocols.settings import Windows
 from storage.streams import EventChunk
 
-F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 Onsets = tuple[int | None, int | None]
 """First of all papillae, and the centre's; ns after the start of the motion, None: never."""

@@ -19,7 +19,6 @@ from analysis.timeline.pulse_kernels import fullest, pair, partners, quantile
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MIN_PULSES = 24
 """Fewer than this may fit a 16-bit code in more than one place once some are lost."""

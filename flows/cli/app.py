@@ -21,6 +21,7 @@ from flows.cli.common import (
 from flows.cli.control import register as register_control
 from flows.cli.detect import register as register_detect
 from flows.cli.exchange import register as register_exchange
+from flows.cli.generalise import register as register_generalise
 from flows.cli.guesses import register as register_guesses
 from flows.cli.models import register as register_models
 from flows.cli.remote import register as register_remote
@@ -153,6 +154,7 @@ def collect(
 
 register_steps(app)
 register_tradeoff(app)
+register_generalise(app)
 register_guesses(app)
 register_chain(app)
 register_store(app)

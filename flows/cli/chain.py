@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -13,12 +14,26 @@ from flows.running import console
 FULL = ("kinematic", "gravity", "disturbance")
 PILOT = ("pilot", "pilot_gravity")
 EXTRA = ("disturbance=125",)
+LABELS_CHECKED = 60
+"""Trials whose labels of tracks a study checks with video, unless another number is asked for."""
 
 
 def package_file(package: str, name: str) -> Path:
     """A file that ships with a package."""
     module = __import__(package)
     return Path(module.__path__[0]) / name
+
+
+def shipped(pilot: bool, extra: bool) -> dict[Path, tuple[str, ...]]:
+    """A study's protocols, and the optional levels that are switched on in each.
+
+    Args:
+        pilot: the small ones, which have none.
+        extra: with the disturbance of 125 % that the paper left out.
+    """
+    on = {"disturbance": EXTRA} if extra else {}
+    names = PILOT if pilot else FULL
+    return {package_file("protocols", f"{name}.yaml"): on.get(name, ()) for name in names}
 
 
 def study(
@@ -35,7 +50,14 @@ def study(
     check_labels: Annotated[
         int,
         typer.Option(min=0, help="Trials to take again with video, to check labels of tracks by."),
-    ] = 60,
+    ] = LABELS_CHECKED,
+    searches: Annotated[
+        bool,
+        typer.Option(
+            "--searches",
+            help="Also other methods, the scene's guesses, speed against error; takes hours.",
+        ),
+    ] = False,
     status: Annotated[
         bool, typer.Option("--status", help="Only say how far it is, from any terminal.")
     ] = False,
@@ -45,11 +67,8 @@ def study(
     if status:
         _status(folder, as_json)
         return
-    names = PILOT if pilot else FULL
-    files = protocol or [package_file("protocols", f"{name}.yaml") for name in names]
-    whole = not (pilot or protocol)
-    enable: dict[Path, tuple[str, ...]] = {files[-1]: EXTRA} if whole and extra else {}
-    _chain(folder, files, rig, as_json, enable, check_labels)
+    files = dict.fromkeys(protocol, ()) if protocol else shipped(pilot, extra)
+    _chain(folder, files, rig, as_json, check_labels, searches)
 
 
 def _status(folder: Path, as_json: bool) -> None:
@@ -72,35 +91,34 @@ def demo(
     as_json: JsonOption = False,
 ) -> None:
     """Run the pilot study on the simulated rig and say where the report is."""
-    protocols = [package_file("protocols", f"{name}.yaml") for name in PILOT]
     if rig == Path("rehearsal"):
         console.say(
             "The demo's outside camera hands over simulated tracks of the markers, no video; "
             "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
         )
-    _chain(folder, protocols, rig, as_json)
+    _chain(folder, shipped(pilot=True, extra=False), rig, as_json)
 
 
 def _chain(
     folder: Path,
-    protocols: list[Path],
+    protocols: Mapping[Path, tuple[str, ...]],
     rig: Path,
     as_json: bool,
-    enable: dict[Path, tuple[str, ...]] | None = None,
     check: int = 0,
+    more: bool = False,
 ) -> None:
     """Run the whole chain and print what came out."""
     from flows.planning.orders import check_disk, make_order
 
-    enabled = enable or {}
-    orders = [make_order(file, rig, folder, enable=enabled.get(file, ())) for file in protocols]
+    orders = [make_order(file, rig, folder, enable=on) for file, on in protocols.items()]
     check_disk(orders)
     prepare_store(folder)
     from flows.reporting.report import read_summary
     from flows.study import study as run
+    from flows.study_searches import searches
     from storage.store import Store
 
-    outcome = run(orders, check)
+    outcome = run(orders, check, searches(orders) if more else ())
     summary = read_summary(Store.open(folder))
     page = folder / "report" / "index.html"
     if as_json:

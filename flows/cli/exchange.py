@@ -11,8 +11,6 @@ from flows.cli.common import JsonOption, StoreArgument, StoreOption, finish
 from flows.running import console
 from protocols.errors import InputError
 
-TABLES = {".csv", ".parquet", ".json"}
-
 
 def import_(
     kind_or_path: Annotated[

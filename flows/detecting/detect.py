@@ -44,7 +44,7 @@ def detect(
 
     Args:
         out: a file of JSON lines, one a decision, that is written while it runs.
-        counting: the network, instead of the model's by the fused kernels in one thread.
+        counting: the network, instead of the model's by the event-driven kernels in one thread.
         build: makes the rig.
 
     Raises:

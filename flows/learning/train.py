@@ -27,8 +27,6 @@ from storage.store import Store, StoreError
 if TYPE_CHECKING:
     from flows.running.cluster import Cluster
 
-VERSION = 5
-
 
 @dataclass(frozen=True)
 class Model:
@@ -95,7 +93,10 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     models = []
     for seed in settings.training.seeds:
         key = make_key(
-            "train", VERSION, inputs, {**parameters, "seed": seed, "dataset": dataset.VERSION}
+            "train",
+            training.VERSION,
+            inputs,
+            {**parameters, "seed": seed, "dataset": dataset.VERSION},
         )
         models.append(Model(seed, store.folder / "models" / f"seed{seed}.pt", key))
     return models

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from analysis.nets.training import EpochRecord
+from analysis.nets.epoch_record import EpochRecord
 from analysis.pictures.figures import training_curves
 from flows.running import console, orchestration
 from storage.files import write_text

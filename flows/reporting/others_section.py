@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,9 +9,11 @@ from typing import Any
 
 from analysis.pictures.figures_conditions import Share, shares
 from analysis.pictures.report import Figure, Link, Section, Table, percent
+from flows.reporting import label_tables
 from flows.reporting.report_extras import FILES, command
 from flows.reporting.search_section import search
 from flows.searching import tradeoff_page
+from protocols.quantity import level_order
 from storage.errors import StoreError
 from storage.store import Store
 
@@ -25,7 +26,7 @@ def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> S
     if found is None:
         return Section(
             title,
-            ["Not measured in this store. It takes a quarter of an hour; all levels take hours:"],
+            ["Not measured in this store. It takes half an hour or more; all levels take hours:"],
             commands=[(command(store, "generalisation"), "makes it.")],
         )
     groups: dict[str, list[Share]] = {}
@@ -60,7 +61,7 @@ def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> S
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     return Section(
         title,
-        ["Made by `python -m benchmarks.generalisation`; the report does not check its age."],
+        ["Made by `sliplab generalise`; the report does not check its age."],
         pictures,
         [Table(columns, rows, "Strict accuracy on windows.")],
     )
@@ -68,14 +69,7 @@ def skins(store: Store, found: Json | None, summary: Json, simulated: bool) -> S
 
 def in_order(rows: Mapping[str, Json]) -> list[tuple[str, Json]]:
     """A factor's levels by their number, words after numbers."""
-
-    def place(item: tuple[str, Json]) -> tuple[float, str]:
-        try:
-            return float(item[0].split()[0]), ""
-        except ValueError:
-            return math.inf, item[0]
-
-    return sorted(rows.items(), key=place)
+    return sorted(rows.items(), key=lambda item: level_order(item[0]))
 
 
 def factors(by_factor: Mapping[str, Mapping[str, Json]], strict: float | None,
@@ -125,7 +119,11 @@ def tradeoff(store: Store, found: Mapping[str, Json]) -> Section:
         pictures.append(_scene(found["scene"], said, tables))
     for name in ("labels", "labels_truth"):
         if name in found:
-            tables.append(_figures(name, found[name]))
+            try:
+                made = label_tables.speed if name == "labels" else label_tables.truth
+                tables.append(made(_checked(found[name], name, "figures")))
+            except (KeyError, TypeError, ValueError) as error:
+                raise _odd(name, error) from None
     if "detector" in found:
         try:
             picture, table = search(found["detector"], bool(found["detector"]["simulated"]))
@@ -168,20 +166,6 @@ def _unit(key: str) -> str:
         if key.endswith(ending):
             return f"{key.removesuffix(ending).replace('_', ' ')} ({unit})"
     return f"{key.replace('_', ' ')} (share)"
-
-
-def _figures(name: str, line: Json) -> Table:
-    """A benchmark's figures; their units are in their names."""
-    rows = [
-        [key, f"{value:.4g}"]
-        for key, value in _checked(line, name, "figures").items()
-        if isinstance(value, int | float) and math.isfinite(value)
-    ]
-    words = {
-        "labels": "Following the markers: how much faster than OpenCV, and how far off (pixels)",
-        "labels_truth": "Labels against the simulation's truth (simulated)",
-    }
-    return Table(("figure, its unit in its name", "value"), rows, f"{words[name]}.")
 
 
 def _checked(found: Json, name: str, key: str) -> Json:

@@ -1,6 +1,6 @@
 """Results of other programs that the report takes up where they stand in the store.
 
-    STORE/derived/generalisation/results.json   python -m benchmarks.generalisation
+    STORE/derived/generalisation/results.json   sliplab generalise
     STORE/derived/guesses/results.json          sliplab guesses
     STORE/derived/tradeoff/tradeoff.json        sliplab tradeoff --scene
     STORE/derived/tradeoff/labels.json          python -m benchmarks labels --json
@@ -32,7 +32,7 @@ FILES = {
 """By name, where each stands in the store."""
 
 COMMANDS = {
-    "generalisation": "python -m benchmarks.generalisation {store} --out {folder}",
+    "generalisation": "sliplab generalise {store}",
     "guesses": "sliplab guesses {store}",
     "scene": "sliplab tradeoff --scene PROTOCOL --out {folder}",
     "labels": "python -m benchmarks labels --json > {file}",

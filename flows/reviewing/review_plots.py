@@ -17,7 +17,6 @@ Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, Kind] = ("incipient", "gross")
 COLOUR = {"incipient": ORANGE, "gross": RED}
 _FAINT = "#b8bec4"
-_HOLD = "#00000008"
 _CLOSE_S = 0.3
 """Half of what is seen close by."""
 _DRAG = """

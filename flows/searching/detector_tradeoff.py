@@ -179,7 +179,8 @@ def detector_tradeoff(
         dry_run: only say what there is to do, and how long it would take.
 
     Returns:
-        the numbers, or what there is to do and `estimated_s`.
+        the numbers and how many runs were ``made`` for them, or what there is to do and
+        `estimated_s`.
 
     Raises:
         InputError: a value that no network can have, or a `folder` that is no folder.
@@ -195,6 +196,7 @@ def detector_tradeoff(
         f"{plan['runs']} trainings ({len(search.grid.settings)} settings, {ask.seeds} seeds), "
         f"{plan['kept']} of them kept"
     )
+    made = 0
     if minutes == 0 and not dry_run:
         console.say(told)
     else:
@@ -203,13 +205,13 @@ def detector_tradeoff(
         if dry_run:
             return {**plan, "estimated_s": round(seconds, 1)}
         began = time.monotonic()
-        search.make(lambda: minutes is not None and time.monotonic() - began >= 60 * minutes)
+        made = search.make(lambda: minutes is not None and time.monotonic() - began >= 60 * minutes)
     result = search.result()
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / NUMBERS, result)
     write_text(folder / TABLE, as_csv(result))
     write_text(folder / PAGE, render(result))
-    return result
+    return {**result, "made": made}
 
 
 def as_csv(result: dict[str, Any]) -> str:

@@ -20,13 +20,14 @@ from torch import nn
 
 from analysis.nets import dataset, metrics, model_file, training
 from analysis.nets.dataset import SampleSet
+from analysis.nets.epoch_record import EpochRecord
 from analysis.nets.quantised import quantise
 from analysis.nets.quantised_engine import common_net
 from analysis.nets.samples import strided_windows
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Engine
 from analysis.nets.synaptic import count_net_work
-from analysis.nets.training import EpochRecord, Fitted, restore
+from analysis.nets.training import Fitted, restore
 from flows.searching.detector_tradeoff_data import Ask, Data, Used
 from flows.searching.detector_tradeoff_grid import Setting, counted_stride
 from protocols.settings import Network, Training, Windows
@@ -79,7 +80,10 @@ def make_run(data: Data, setting: Setting, seed: int) -> Run:
         [base.windows.length_ms, base.samples.per_class, ask.samples],
     ]
     model_key = make_key(
-        "tradeoff model", VERSION, data.inputs(data.train, data.validation), learned
+        "tradeoff model",
+        training.VERSION,
+        data.inputs(data.train, data.validation),
+        learned,
     )
     judged = data.inputs(data.validation, data.test, data.falling)
     key = make_key(STEP, VERSION, [model_key, judged], ask.stride_ms)

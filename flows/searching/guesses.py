@@ -30,20 +30,19 @@ from flows.learning.samples import load_samples
 from flows.learning.train import training_settings, wanted_models
 from flows.learning.trial_scores import score_row, summaries
 from flows.learning.window_scores import owners, whose
-from flows.planning.orders import Order, make_order
+from flows.planning.orders import Order
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
 from flows.searching.guess_changes import AS_IT_IS, NAMES, figures
+from flows.searching.other_rig import other_order
 from flows.searching.scene_runs import sample_trials
 from flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
 from flows.syncing.sync import sync
 from protocols.errors import InputError
 from protocols.settings import Detection
-from protocols.yaml_file import parse_yaml, read_text
 from rigs.rig_file import load_rig_file
-from rigs.rig_inheritance import rig_yaml
 from storage.derived import Derived, make_key
-from storage.files import read_json, write_json, write_text
+from storage.files import read_json, write_json
 from storage.recording import Recording
 from storage.store import Store, StoreError
 
@@ -182,20 +181,13 @@ class Guesses:
 
     def _order(self, item: Collected, setting: Setting, folder: Path) -> Order:
         """The chosen trials of a campaign on the changed rig."""
-        source = item.campaign.folder / "rig.yaml"
-        data = parse_yaml(read_text(source, "rig file"), source)
+        change: Json = {}
         if setting.parameter is not None:
             new = self._value(item, setting.parameter) * setting.factor
             if setting.parameter.endswith("poisson_ratio"):
                 new = min(new, LARGEST_POISSON)
-            _merge(data, {"mock": nested(setting.parameter, new)})
-        rig = folder / f"{item.name}.yaml"
-        write_text(rig, rig_yaml(data))
-        enabled: Any = item.info.get("enabled", ())
-        order = make_order(
-            item.campaign.protocol_file, rig, folder / "store",
-            enable=tuple(enabled), campaign=item.name,
-        )  # fmt: skip
+            change = {"mock": nested(setting.parameter, new)}
+        order = other_order(item, change, folder)
         return replace(order, only=frozenset(self.trials[item.name]))
 
     def _judge(self, store: Store, campaigns: list[Collected]) -> Json:
@@ -229,14 +221,6 @@ class Guesses:
             starts = strided_windows(*span, length_ns, stride_ns)
             x, end_ns = dataset.cut_windows(recording, starts, windows), starts + length_ns
         return training.predict_counts(self.fitted, x), end_ns
-
-
-def _merge(data: Json, other: Json) -> None:
-    for name, value in other.items():
-        if isinstance(value, dict) and isinstance(data.setdefault(name, {}), dict):
-            _merge(data[name], value)
-        else:
-            data[name] = value
 
 
 def _by_trial(

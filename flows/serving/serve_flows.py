@@ -11,7 +11,7 @@ from typing import Any
 
 from prefect import flow
 
-from flows.cli.chain import FULL, PILOT, package_file
+from flows.cli.chain import LABELS_CHECKED, shipped
 from flows.cli.common import STEPS
 from flows.collecting import controlling
 from flows.planning.orders import Bench, Order, check_disk, make_order
@@ -134,14 +134,13 @@ def _chain(wanted: Chain, here: Service, run: Any) -> str:
 def _study(wanted: Study, here: Service, run: Any) -> str:
     from flows.study import study as whole
 
-    names = PILOT if wanted.pilot else FULL
-    files = [package_file("protocols", f"{name}.yaml") for name in names]
-    orders = [_order(here, wanted, file, run) for file in files]
+    files = shipped(wanted.pilot, wanted.extra)
+    orders = [_order(here, wanted, file, run, enable=on) for file, on in files.items()]
     check_disk(orders)
     done: dict[str, Any] = {}
 
     def work() -> dict[str, Any]:
-        outcome = whole(orders)
+        outcome = whole(orders, LABELS_CHECKED)
         done.update({step["step"]: step["done"] for step in outcome.steps})
         return {"taken": sum(item["taken"] for item in outcome.collected)}
 

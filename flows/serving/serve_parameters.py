@@ -68,6 +68,9 @@ class Study(OnRig):
     """The whole chain over the shipped protocols, to the report."""
 
     pilot: bool = Field(default=False, description="The small protocols.")
+    extra: bool = Field(
+        default=True, description="Also the disturbance of 125 % that the paper left out."
+    )
 
 
 class Step(Parameters):

@@ -13,7 +13,6 @@ from storage.streams import EventChunk, FrameChunk
 
 SIMULATED = "simulated"
 """Stands in the source's name of a file that was written from simulated data."""
-_TAKEN = {EVENTS, FRAMES, TRIGGERS}
 
 
 def read_aedat4(path: Path, name: str) -> ForeignTrial:

@@ -54,6 +54,11 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "collection.motion[1].speed",
         "mm/s",
     ),
+    "factor in another unit than its place": (
+        _set(COLLECTION, "factors", "depth", "unit", to="mm/s"),
+        "collection.factors.depth.unit",
+        "must be mm where $depth stands",
+    ),
     "no unit": (
         _set(COLLECTION, "motion", 3, "distance", to=12),
         "collection.motion[3].distance",

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.quantity import UNITS, canonical, parse, parse_or_ref, to_decimal
+from protocols.quantity import UNITS, canonical, level_order, parse, parse_or_ref, to_decimal
 
 decimals = st.decimals(
     min_value=-1000, max_value=1000, places=4, allow_nan=False, allow_infinity=False
@@ -88,3 +88,8 @@ def test_a_reference_is_a_factors_name() -> None:
     assert str(parse_or_ref("$depth", "mm")) == "$depth"
     with pytest.raises(ValueError, match="factor's name"):
         parse_or_ref("$Depth!", "mm")
+
+
+def test_levels_sort_by_their_number_and_words_last() -> None:
+    levels = ["10 mm", "left", "2.4 mm", "", "-1 mm", "above"]
+    assert sorted(levels, key=level_order) == ["-1 mm", "2.4 mm", "10 mm", "", "above", "left"]

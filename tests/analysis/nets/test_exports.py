@@ -15,6 +15,7 @@ from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
 from analysis.nets.activity import activity
+from analysis.nets.epoch_record import EpochRecord
 from analysis.nets.model_card import SplitResult, card_markdown, model_card
 from analysis.nets.network import (
     BIASED,
@@ -29,7 +30,7 @@ from analysis.nets.network import (
 from analysis.nets.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from analysis.nets.quantised import LOWEST, chip_run, compare, quantise, quantised_net
 from analysis.nets.speck import CORES, KI, speck_fit
-from analysis.nets.training import EpochRecord, Fitted, restore
+from analysis.nets.training import Fitted, restore
 from protocols.settings import Network, Training, Windows
 from tests.analysis.nets.test_spiking import FULL, SMALL, TINY, biased, sparse
 

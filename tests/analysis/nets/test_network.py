@@ -11,9 +11,11 @@ from sinabs.utils import validate_memory_mapping_speck
 from analysis.nets.network import (
     BIASED,
     FIRST_BIAS,
+    FIRST_DRIVE,
     SPIKING,
     WEIGHTED,
     build,
+    rates_alone,
     reset_states,
     set_weights,
     spike_counts,
@@ -105,9 +107,27 @@ def test_a_seed_decides_the_weights_and_nothing_else_random() -> None:
     assert torch.equal(torch.rand(1), expected)
     second, other = weights(build(SMALL, WINDOWS, 3)), weights(build(SMALL, WINDOWS, 4))
     assert all(torch.equal(first[n], second[n]) for n in first)
-    assert [n for n in first if torch.equal(first[n], other[n])] == ["fc2.bias"]
-    for name, (low, high) in FIRST_BIAS.items():
-        assert ((first[f"{name}.bias"] >= low) & (first[f"{name}.bias"] <= high)).all()
+    assert not any(torch.equal(first[n], other[n]) for n in first)
+    low, high = FIRST_BIAS
+    assert ((first["fc1.bias"] >= low) & (first["fc1.bias"] <= high)).all()
+
+
+@pytest.mark.parametrize("hidden", [4, 16, 64])
+def test_outputs_begin_alike_in_a_window_without_events(hidden: int) -> None:
+    net = build(SMALL.model_copy(update={"hidden": hidden}), WINDOWS, 5)
+    names = dict(net.named_children())
+    steps = 840  # every rate of a neuron that fires within a window is a whole part of it
+    rates = rates_alone(names["fc1"].bias, WINDOWS.steps)
+    neurons = names["iaf3"]
+    current = names["fc1"].bias.detach().expand(steps, -1)
+    neurons.num_timesteps = steps
+    fired = neurons(current).sum(dim=0)
+    neurons.reset_states()
+    inside = 1 / rates <= WINDOWS.steps
+    assert 0 < int(inside.sum()) < hidden
+    torch.testing.assert_close(fired[inside], torch.floor(steps * rates[inside] + 1e-3))
+    drive = names["fc2"].weight @ rates + names["fc2"].bias
+    torch.testing.assert_close(drive, torch.full((3,), FIRST_DRIVE))
 
 
 def test_weight_scale_belongs_to_its_layer() -> None:

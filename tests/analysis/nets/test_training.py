@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.nets import metrics, training
+from analysis.nets import metrics
 from analysis.nets.model_file import FORMAT, load, save
 from analysis.nets.network import GRID, build, exact, matrices, spike_counts, weights
 from analysis.nets.training import (
@@ -145,7 +145,7 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
     """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
     one_step = {"epochs": 1, "batch": 150}
     parts = run(**one_step)
-    monkeypatch.setattr(training, "MICRO_BATCH", 150)
+    monkeypatch.setattr("analysis.nets.training_run.MICRO_BATCH", 150)
     whole = run(**one_step)
     assert parts.history[0].loss == pytest.approx(whole.history[0].loss, rel=1e-6)
     start = weights(build(NETWORK, WINDOWS, 0))
@@ -211,19 +211,14 @@ def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
 def test_silent_layers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     network = NETWORK.model_copy(update={"weight_scale": (1e-3, 1.0, 1.0, 1.0)})
     settings = Training(epochs=1, batch=64, learning_rate=1e-9)
-    monkeypatch.setattr("analysis.nets.network.FIRST_BIAS", {"fc1": (0.0, 0.0), "fc2": (0.0, 0.0)})
+    monkeypatch.setattr("analysis.nets.network.FIRST_BIAS", (0.0, 0.0))
+    monkeypatch.setattr("analysis.nets.network.FIRST_DRIVE", 0.0)
     found = fit(*TRAIN, *VAL, network, WINDOWS, settings, 0)
     assert [w.split()[1] for w in found.warnings] == ["iaf1", "iaf2", "iaf3", "iaf4"]
     assert "silent" in found.warnings[0]
     assert found.chosen.val_strict == 0.0
     assert found.chosen.val_argmax == pytest.approx(1 / 3)
     assert found.chosen.val_loss == pytest.approx(np.log(3))
-
-
-def test_saturated_layers_are_named() -> None:
-    record = EpochRecord(1, 0, 0, 0, 0, 0, 0, {"iaf1": 0.1, "iaf2": 0.95, "iaf3": 0.1, "iaf4": 0.1})
-    (warning,) = training._warnings(record)
-    assert "iaf2 is saturated" in warning
 
 
 def test_a_saved_model_is_the_same_model(fitted: Fitted, tmp_path: Path) -> None:

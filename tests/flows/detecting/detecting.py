@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from analysis.detect.live import Counting
 from analysis.nets import model_file
+from analysis.nets.epoch_record import EpochRecord
 from analysis.nets.network import SPIKING, build, weights
-from analysis.nets.training import EpochRecord, Fitted
+from analysis.nets.training import Fitted
 from flows.detecting.detect_order import DetectOrder, make_detect_order
 from protocols.settings import Network, Training, Windows
 from rigs.build import build_rig

@@ -172,7 +172,7 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
     assert "here (simulated)" in text
     assert f"sliplab review {store.folder.resolve()}" in text
     assert "no campaign takes reference trials" in text
-    assert f"benchmarks.generalisation {store.folder.resolve()}" in text
+    assert f"sliplab generalise {store.folder.resolve()}" in text
 
 
 def test_failures_have_a_command_that_shows_them(store: Store) -> None:
@@ -239,8 +239,11 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     found = {
         "generalisation": {"simulated": True, "results": results},
         "scene": scene(),
-        "labels": {"name": "labels", "figures": {"x_blob_detector": 41.25}},
-        "labels_truth": {"name": "labels_truth", "figures": {"paper_incipient_ms": 4.5}},
+        "labels": {"name": "labels", "figures": {"frame_ms": 0.0254, "error_px": 0.005}},
+        "labels_truth": {
+            "name": "labels_truth",
+            "figures": {"trials": 60.0, "slip_median_ms": 4.5},
+        },
         "detector": detector(),
     }
     for name, data in found.items():
@@ -253,8 +256,8 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     for word in (
         "skin 101",
         "no train trials",
-        "x_blob_detector",
-        "41.25",
+        "SlipLab&#39;s tracker",
+        "0.0254",
         "4.5",
         "without a depth",
     ):

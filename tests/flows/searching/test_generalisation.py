@@ -1,0 +1,111 @@
+"""Other skins and levels left out: each measured once, kept, and told in a table."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flows.planning.orders import Order
+from flows.reporting.report_extras import extras
+from flows.running.campaigns import collected
+from flows.searching import generalisation
+from flows.searching.generalisation import Generalisation, Result, measure_generalisation, table
+from flows.study import Outcome
+from protocols.errors import InputError
+from storage.store import Store, StoreError
+from tests.command_line import here
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study, tried without one direction and on one other skin."""
+    folder = tmp_path_factory.mktemp("generalisation") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    found = Store.open(folder)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(generalisation, "VALIDATION", 0.4)  # of six trials
+        measure_generalisation(found, collected(found), ("direction",), skins=1, trials=4, epochs=1)
+    return found
+
+
+def test_a_level_is_tested_on_and_not_trained_on(store: Store) -> None:
+    work = Generalisation(store, collected(store), 1)
+    levels = work.levels("direction")
+    assert levels == sorted(levels, key=lambda text: float(text.split()[0]))
+    row = work.results()[f"direction {levels[0]}"]
+    where = [item.plan.describe(trial).get("direction") for item, trial, _ in work.known]
+    assert row["trials"] == where.count(levels[0])
+    assert row["n"] == np.isin(work.place, np.flatnonzero(np.array(where) == levels[0])).sum()
+    assert 0 < row["trained_on"] < len(where) - row["trials"]
+    assert 0 <= row["share"] <= 1
+    assert not list(work.folder.glob("*.state"))
+
+
+def test_another_skin_is_another_skin_and_leaves_no_store(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = store.folder / "derived" / "generalisation"
+    row = extras(store)["generalisation"]["results"]["skin 101"]
+    assert row["trials"] == 4
+    assert not (folder / "skin101").exists()
+    seen: list[str] = []
+    monkeypatch.setattr(
+        generalisation, "collect", lambda order: seen.append(order.rig.scene.scene.skin.seed)
+    )
+    with pytest.raises(StoreError, match="holds no campaign yet"):
+        Generalisation(store, collected(store), 1).skin(102, 4)
+    shutil.rmtree(folder / "skin102")
+    assert seen == [102]
+
+
+def test_what_is_kept_is_not_measured_again(store: Store) -> None:
+    asked = (store, collected(store), ("direction",))
+    assert measure_generalisation(*asked, skins=1, trials=4, epochs=1)["made"] == 0
+    other = Generalisation(store, collected(store), 2)
+    made: list[str] = []
+
+    def work(key: str) -> Result:
+        made.append(key)
+        return {"left out": "not tried"}
+
+    before = store.folder / "derived" / "generalisation" / "results.json"
+    text = before.read_text()
+    name = next(iter(other.results()))
+    for _ in range(2):
+        other.once(name, None, work)
+    assert len(made) == 1
+    before.write_text(text)
+
+
+def test_what_is_not_there_is_refused(store: Store) -> None:
+    campaigns = collected(store)
+    with pytest.raises(InputError, match=r"--factor.*must be a factor of the slides: "):
+        measure_generalisation(store, campaigns, ("mass",))
+    with pytest.raises(InputError, match=r"--level.*must be one of 0 deg"):
+        measure_generalisation(store, campaigns, ("direction",), ("1 deg",))
+
+
+def test_the_table_has_a_row_for_each_result() -> None:
+    counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
+    row = generalisation.scored(counts, np.array([0, 1, 1, 2]), np.array([0, 0, 1, 1]))
+    assert (row["share"], row["trials"], row["n"]) == (0.75, 2, 4)
+    text = table({"depth 2 mm": {**row, "seen": 0.9}, "speed 1": {"left out": "no trials"}}, True)
+    assert "(simulated)" in text
+    assert "| depth 2 mm | 2 | 4 | 75.0 | 50.0 to 100.0 | 83.3 | 90.0 |" in text
+    assert "| speed 1 | no trials |" in text
+
+
+def test_the_command_line(store: Store, tmp_path: Path) -> None:
+    asked = ("--factor", "direction", "--skins", "1", "--trials", "4", "--epochs", "1")
+    done = here("generalise", str(store.folder), *asked, "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert (said["simulated"], said["made"]) == (True, 0)
+    assert "skin 101" in said["results"]
+    shown = here("generalise", str(store.folder), *asked)
+    assert "generalise, simulated" in shown.stdout
+    assert "skin 101" in shown.stdout

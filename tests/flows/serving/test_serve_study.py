@@ -1,0 +1,48 @@
+"""A study from Prefect's page is the study of the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from flows.cli.chain import LABELS_CHECKED, shipped
+from flows.planning.orders import make_order
+from flows.serving import serve_flows
+from flows.serving.serve_parameters import Study
+from flows.study import Outcome
+from tests.conftest import ROOT
+
+
+def test_only_the_whole_study_has_the_extra_disturbance() -> None:
+    assert [file.stem for file in shipped(False, True)] == ["kinematic", "gravity", "disturbance"]
+    assert list(shipped(False, True).values()) == [(), (), ("disturbance=125",)]
+    assert list(shipped(False, False).values()) == [(), (), ()]
+    assert {file.stem: on for file, on in shipped(True, True).items()} == {
+        "pilot": (), "pilot_gravity": ()
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("extra", "trials"), [(True, 100), (False, 80)])
+def test_a_served_study_asks_for_the_same_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extra: bool, trials: int
+) -> None:
+    asked: list[Any] = []
+
+    def study(orders: list[Any], check: int) -> Outcome:
+        asked.extend([orders, check])
+        return Outcome([{"taken": 3}], [{"step": "report", "done": 1}])
+
+    monkeypatch.setattr("flows.study.study", study)
+    monkeypatch.setattr(serve_flows, "when_free", lambda _order, _patience, work, _run: work())
+    here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
+    said = serve_flows._study(Study(extra=extra), here, None)
+    assert said == "3 trials taken; report: 1 done"
+    orders, check = asked
+    assert check == LABELS_CHECKED
+    assert [len(order.plan.trials) for order in orders] == [864, 180, trials]
+    for order, (file, on) in zip(orders, shipped(False, extra).items(), strict=True):
+        rig = ROOT / "rigs" / "rehearsal.yaml"
+        assert order.plan == make_order(file, rig, tmp_path / "other", enable=on).plan

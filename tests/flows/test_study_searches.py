@@ -1,0 +1,86 @@
+"""Searches on top of a study: each done once, gone on with, and shown in the report."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from flows import study_searches
+from flows.learning import window_baselines
+from flows.planning.orders import Order
+from flows.reporting.report_extras import extras
+from flows.searching.detector_tradeoff_data import Ask
+from flows.searching.detector_tradeoff_grid import Axes
+from flows.searching.generalisation import measure_generalisation
+from flows.study import Outcome, expected, study
+from flows.study_searches import searches
+from protocols.errors import InputError
+from storage.store import Store
+
+NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
+
+
+def test_what_a_study_can_have(ran: tuple[list[Order], Outcome]) -> None:
+    slides, falls = ran[0]
+    assert [each.name for each in searches([slides, falls])] == NAMES
+    assert [each.name for each in searches([falls])] == ["guesses"]
+    real = slides.rig.model_copy(update={"driver": "devices"})
+    assert not real.simulated
+    slides, falls = (replace(order, rig=real) for order in (slides, falls))
+    assert [each.name for each in searches([slides, falls])] == [
+        "baselines", "generalisation", "detector search",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match=r"--searches.*needs a kinematic protocol"):
+        searches([falls])
+
+
+def test_they_stand_before_the_report_with_their_own_time(
+    ran: tuple[list[Order], Outcome],
+) -> None:
+    orders, _ = ran
+    plain, more = expected(orders, 0), expected(orders, 0, searches(orders))
+    assert list(more)[-7:] == ["evaluate", *NAMES, "report"]
+    assert sum(more.values()) - sum(plain.values()) > 3600
+
+
+def test_each_is_done_once_and_reported(
+    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ran[0][0].store, tmp_path / "store")
+    orders = [replace(order, store=tmp_path / "store") for order in ran[0]]
+    monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1})
+    few = partial(measure_generalisation, factors=("direction",), skins=1, trials=3, epochs=1)
+    monkeypatch.setattr(study_searches, "measure_generalisation", few)
+    monkeypatch.setattr(study_searches, "GUESSES", ("event_camera.contrast",))
+    monkeypatch.setattr(study_searches, "SCENE_TRIALS", 1)
+    ask = Ask(samples=40, epochs=1, trials=2, seeds=1, stride_ms=15)
+    monkeypatch.setattr(study_searches, "ASK", ask)
+    axes = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(1.0,))
+    monkeypatch.setattr(study_searches, "AXES", axes)
+
+    outcome = study(orders, more=searches(orders))
+    done = {step["step"]: step["done"] for step in outcome.steps}
+    assert done == {
+        "sync": 0, "label": 0, "train": 0, "evaluate": 0, "baselines": 1,
+        "generalisation": 2, "guesses": 3, "scene search": 1, "detector search": 2,
+        "report": 1,
+    }  # fmt: skip
+    assert {"generalisation", "guesses", "scene", "detector"} <= set(
+        extras(Store.open(orders[0].store))
+    )
+    page = (orders[0].store / "report" / "index.html").read_text()
+    for whose in ("scene", "detector"):
+        assert f"The whole of the {whose}&#39;s search" in page
+
+    again = study(orders, more=searches(orders))
+    assert not any(step["done"] for step in again.steps)
+    notes = {row.name: (row.state, row.note) for row in again.rows}
+    assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
+
+    monkeypatch.setattr(study_searches, "SCENE_TRIALS", 2)
+    third = {step["step"]: step["done"] for step in study(orders, more=searches(orders)).steps}
+    assert third["scene search"] == 1
