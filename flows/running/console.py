@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -28,6 +29,9 @@ from flows.running import stopping
 from storage.secrets import masked
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+LINE_EVERY_S = 60.0
+"""How often a bar says how far it is where there is no terminal: in the log of a night's run."""
 
 messages = Console(stderr=True, highlight=False, soft_wrap=True)
 results = Console(highlight=False)
@@ -79,10 +83,11 @@ def _cell(value: object) -> str:
 
 
 class Bar:
-    """A progress bar's handle."""
+    """A progress bar's handle; where there is no terminal, a line now and then."""
 
     def __init__(self, progress: Progress, task: Any) -> None:
         self._progress, self._task = progress, task
+        self._said_s = time.monotonic()
 
     def advance(self, count: float = 1, note: str = "", left: str = "") -> None:
         """`count` more are done; a stop request is answered here.
@@ -95,6 +100,17 @@ class Bar:
         """
         stopping.check()
         self._progress.update(self._task, advance=count, note=note, left=left)
+        now_s = time.monotonic()
+        if not messages.is_terminal and now_s - self._said_s >= LINE_EVERY_S:
+            self._said_s = now_s
+            self._say(note, left)
+
+    def _say(self, note: str, left: str) -> None:
+        (task,) = (task for task in self._progress.tasks if task.id == self._task)
+        if not left and task.time_remaining is not None:
+            left = f"{duration(task.time_remaining)} left"
+        far = f"{task.completed:.0f} of {task.total or 0:.0f}"
+        say(", ".join(part for part in (f"{task.description}: {far}", left, note) if part))
 
     def extend(self, count: float) -> None:
         """`count` more are to be done than it was thought."""
