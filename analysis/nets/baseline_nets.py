@@ -2,9 +2,9 @@
 
 Three of them, each with a few ten thousand weights like the spiking network: convolutions on the
 summed frame (where), convolutions on the volume of steps (where and when), and a gated recurrent
-unit over the steps (when). They see log(1 + counts). Each is trained for a bounded number of
-epochs, the best by validation accuracy is kept; everything random comes from one seed, so that it
-repeats on the same number of threads.
+unit over the steps (when). They see log(1 + counts). Their learning rate falls as the spiking
+network's does, and the best epoch by validation accuracy is kept; everything random comes from one
+seed, so that it repeats on the same number of threads.
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ from analysis.nets.metrics import CLASSES
 from analysis.nets.sparse import SparseWindows
 
 EPOCHS = 10
-PATIENCE = 3
 BATCH = 128
 LEARNING_RATE = 2e-3
 
-_SEED = 0
 _CHUNK = 512
 """Samples that are made dense at a time."""
 
@@ -118,13 +116,15 @@ def trained_net(
     validation: SampleSet,
     test: SparseWindows,
     epochs: int = EPOCHS,
+    seed: int = 0,
     on_epoch: Callable[[int, float], None] | None = None,
     mirror: bool = True,
 ) -> tuple[Votes, dict[str, Any]]:
     """Train one of `KINDS`, keep its best epoch by validation accuracy, vote on test samples.
 
     Args:
-        epochs: at most; it ends `PATIENCE` epochs after the best.
+        epochs: over which the rate falls to nothing along half a cosine.
+        seed: of the first weights, the order and the mirrors.
         on_epoch: called with each epoch and its validation accuracy.
         mirror: windows are mirrored at random, as the spiking network's are.
 
@@ -133,19 +133,21 @@ def trained_net(
 
     Raises:
         KeyError: no such kind.
-        ValueError: no training or no validation samples.
+        ValueError: no training or no validation samples, no epoch.
     """
+    if epochs < 1:
+        raise ValueError(f"{kind}: {epochs} epochs; must be at least one")
     if not len(train) or not len(validation):
         raise ValueError(f"{kind}: {len(train)} training and {len(validation)} validation samples")
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(_SEED)
+        torch.manual_seed(seed)
         net = KINDS[kind](train.windows.shape)
     optimizer = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
     best: _Best | None = None
-    done = 0
-    while done < epochs and (best is None or done - best.epoch < PATIENCE):
-        done += 1
-        _one_epoch(net, optimizer, train, np.random.default_rng([_SEED, done]), mirror)
+    steps = epochs * math.ceil(len(train) / BATCH)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for done in range(1, epochs + 1):
+        _one_epoch(net, optimizer, falling, train, np.random.default_rng([seed, done]), mirror)
         votes = _votes(net, validation.windows)
         strict = metrics.accuracy(votes, validation.y).strict or 0.0
         loss = float(
@@ -159,8 +161,7 @@ def trained_net(
     assert best is not None
     net.load_state_dict(best.state)
     said = {
-        "epochs": done,
-        "most_epochs": epochs,
+        "epochs": epochs,
         "chosen_epoch": best.epoch,
         "validation_strict": best.strict,
         "weights": sum(p.numel() for p in net.parameters()),
@@ -172,6 +173,7 @@ def trained_net(
 def _one_epoch(
     net: nn.Module,
     optimizer: torch.optim.Optimizer,
+    falling: torch.optim.lr_scheduler.LRScheduler,
     train: SampleSet,
     rng: np.random.Generator,
     mirror: bool,
@@ -189,6 +191,7 @@ def _one_epoch(
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]  # torch leaves it untyped
         optimizer.step()
+        falling.step()
 
 
 def _votes(net: nn.Module, x: SparseWindows) -> Votes:

@@ -16,6 +16,9 @@ def test_the_rate_falls_along_half_a_cosine() -> None:
     assert rates[5] == pytest.approx(5e-3)
     assert 0 < rates[-1] < 3e-4
     assert rates == sorted(rates, reverse=True)
+    at = np.array([learning_rate(falling, k // 7, k % 7, 7) for k in range(70)])
+    ramp = np.minimum(1.0, np.arange(1, 71) / (falling.warm_up * 70))
+    np.testing.assert_allclose(at, 1e-2 * ramp * np.cos(np.pi * np.arange(70) / 140) ** 2)
     flat = Training(epochs=6, learning_rate=1e-2, schedule="constant")
     assert {learning_rate(flat, done) for done in range(5)} == {flat.learning_rate}
 
