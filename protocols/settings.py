@@ -125,6 +125,9 @@ class Training(StrictModel):
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[int, ...] = (0,)
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?)$")
+    """What computes it: the processor by the event-driven kernels, or a GPU (``cuda``, ``cuda:1``)
+    by Sinabs' own layers. Last bits differ between devices."""
 
     @field_validator("seeds")
     @classmethod

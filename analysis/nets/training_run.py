@@ -6,7 +6,7 @@ import io
 import math
 import pickle
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -25,22 +25,8 @@ from analysis.nets.network import (
     weights,
 )
 from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Job, Trainer, WindowLoss
+from analysis.nets.training_work import work_on
 from protocols.settings import Network, Training, Windows
-
-MICRO_BATCH = 4
-"""Samples whose gradients are computed at once; they are summed up to ``training.batch``. Small
-enough for the processor's cache, and to give every thread something to do."""
-
-
-@dataclass(frozen=True)
-class _Part:
-    """What a few samples contribute to a step."""
-
-    loss: float
-    counts: metrics.IntArray
-    rates: dict[str, float]
-    gradients: tuple[torch.Tensor, ...]
 
 
 class Run:
@@ -55,7 +41,7 @@ class Run:
         self.optimizer = torch.optim.Adam(
             self.parameters.values(), training.learning_rate, fused=True
         )
-        self.trainer = Trainer(self.trained, windows.cells)
+        self.work = work_on(training.device, self.trained, windows.cells, training.gain)
         self.history: list[EpochRecord] = []
         self.seconds: list[float] = []
         self.best = 0
@@ -65,7 +51,7 @@ class Run:
 
     def to_grid(self) -> None:
         """Let the spikes be those of the fine weights as they are now."""
-        self.trainer.take(on_grid(matrices(self.fine)))
+        self.work.take(on_grid(matrices(self.fine)))
 
     def settle(self) -> None:
         """Let `trained` have the weights that the spikes are of."""
@@ -82,38 +68,20 @@ class Run:
     def one_epoch(
         self, x: SparseWindows, y: metrics.IntArray, order: metrics.IntArray, pool: Executor
     ) -> tuple[float, metrics.IntArray, dict[str, float]]:
-        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates.
-
-        Parts of a batch are computed in any order and added up in theirs: the sum has the same
-        bits on any number of threads.
-        """
+        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates."""
         batch = self.training.batch
         steps = math.ceil(len(x) / batch)
-
-        def compute(rows: metrics.IntArray) -> _Part:
-            job = Job(self.trainer, x, rows, y[rows], self.training.gain)
-            loss = WindowLoss.apply(job, *self.trainer.leaves)  # type: ignore[no-untyped-call]
-            grads = torch.autograd.grad(loss, self.trainer.leaves)
-            return _Part(loss.item(), job.counts, job.rates(), grads)
-
         loss = 0.0
         counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
         fired = dict.fromkeys(SPIKING, 0.0)
         for start in range(0, len(x), batch):
             chosen = order[start : start + batch]
-            rows = [chosen[k : k + MICRO_BATCH] for k in range(0, len(chosen), MICRO_BATCH)]
-            parts = list(pool.map(compute, rows))
-            for row, part in zip(rows, parts, strict=True):
-                loss += part.loss
-                counts[row] = part.counts
-                for name, rate in part.rates.items():
-                    fired[name] += rate * len(row)
-            sums = [
-                torch.stack(each).sum(dim=0).numpy()
-                for each in zip(*(part.gradients for part in parts), strict=True)
-            ]
-            total = self.trainer.layout.unpack(sums)
-            for name, gradient in by_parameter(total).items():
+            found = self.work.batch(x, y, chosen, pool)
+            loss += found.loss
+            counts[chosen] = found.counts
+            for name, rate in found.fired.items():
+                fired[name] += rate
+            for name, gradient in found.gradients.items():
                 self.parameters[name].grad = gradient / len(chosen)
             for group in self.optimizer.param_groups:
                 group["lr"] = learning_rate(self.training, len(self.history), start // batch, steps)

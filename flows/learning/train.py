@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis.nets import dataset, model_file, training
+from analysis.nets import dataset, model_file, training, training_work
 from analysis.nets.dataset import SampleSet
 from flows.labelling.reviewed import Labels
 from flows.learning.samples import load_samples
@@ -19,6 +19,7 @@ from flows.running import console
 from flows.running.campaigns import Collected, training_campaigns
 from flows.running.orchestration import Parcel, run
 from flows.running.timing import timed
+from protocols.errors import InputError
 from protocols.settings import AnalysisSettings
 from storage.derived import make_key
 from storage.files import read_json, write_bytes, write_json
@@ -180,11 +181,16 @@ def train(
     Args:
         cluster: what makes the samples; this machine trains.
         reviewed: people's decisions are applied to the labels.
+
+    Raises:
+        StoreError: labels or samples are missing.
+        InputError: there is no such device to train on.
     """
     labels = Labels(store, reviewed)
     models = wanted_models(store, campaigns, reviewed)
     stale = [model for model in models if not model.fresh]
     if stale:
+        _check_device(training_campaigns(campaigns)[0])
         run(train_flow, Parcel((labels, campaigns, stale, cluster)), cluster)
     return {
         "step": "train",
@@ -192,3 +198,14 @@ def train(
         "fresh": len(models) - len(stale),
         **labels.told(campaigns),
     }
+
+
+def _check_device(item: Collected) -> None:
+    device, there = item.settings.training.device, training_work.devices()
+    if device not in there:
+        raise InputError(
+            item.campaign.protocol_file,
+            "analysis.training.device",
+            device,
+            f"there is none here; must be one of {', '.join(there)}",
+        )

@@ -30,6 +30,7 @@ from flows.reporting.report import read_summary, report
 from flows.running import trial_work
 from flows.running.campaigns import collected, training_campaigns
 from flows.study import Outcome, study
+from protocols.errors import InputError
 from storage.derived import Derived
 from storage.files import write_bytes
 from storage.store import Store, StoreError
@@ -226,6 +227,19 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
     for path in (store.folder / "derived" / "baselines").iterdir():
         path.unlink()
     assert report(store, campaigns)["done"] == 1
+
+
+def test_a_device_that_is_not_there_is_a_wrong_input(
+    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = store_of(ran)
+    monkeypatch.setattr("flows.learning.train.Model.fresh", False)
+    monkeypatch.setattr("analysis.nets.training_work.devices", lambda: ["cuda", "cuda:0"])
+    with pytest.raises(
+        InputError,
+        match=r"analysis\.training\.device = cpu: there is none here; must be one of cuda, cuda:0",
+    ):
+        train(store, collected(store))
 
 
 def test_a_check_that_fails_ends_the_command(

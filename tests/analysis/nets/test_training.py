@@ -145,7 +145,7 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
     """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
     one_step = {"epochs": 1, "batch": 150}
     parts = run(**one_step)
-    monkeypatch.setattr("analysis.nets.training_run.MICRO_BATCH", 150)
+    monkeypatch.setattr("analysis.nets.training_work.MICRO_BATCH", 150)
     whole = run(**one_step)
     assert parts.history[0].loss == pytest.approx(whole.history[0].loss, rel=1e-6)
     start = weights(build(NETWORK, WINDOWS, 0))
