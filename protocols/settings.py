@@ -6,6 +6,7 @@ model is handed whole to the step that uses it, and that step is stale when its 
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -106,6 +107,10 @@ class Network(StrictModel):
     """Factors on the default initial weights; without them the deep layers stay silent."""
 
 
+_DEVICE = r"^(cpu|cuda(:\d+)?)$"
+_DEVICES = "cpu, or a GPU as cuda or cuda:1"
+
+
 class Training(StrictModel):
     """How the network is fitted."""
 
@@ -125,9 +130,19 @@ class Training(StrictModel):
     patience: int = Field(default=5, ge=1)
     """Epochs without a better validation accuracy before it stops."""
     seeds: tuple[int, ...] = (0,)
-    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?)$")
+    device: str = Field(
+        default="cpu",
+        json_schema_extra={"pattern": _DEVICE, "patternErrorMessage": f"must be {_DEVICES}"},
+    )
     """What computes it: the processor by the event-driven kernels, or a GPU (``cuda``, ``cuda:1``)
     by Sinabs' own layers. Last bits differ between devices."""
+
+    @field_validator("device")
+    @classmethod
+    def _known(cls, device: str) -> str:
+        if not re.fullmatch(_DEVICE, device):
+            raise ValueError(f"must be {_DEVICES}")
+        return device
 
     @field_validator("seeds")
     @classmethod

@@ -54,6 +54,11 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "collection.motion[1].speed",
         "mm/s",
     ),
+    "unknown device": (
+        _set("analysis", "training", "device", to="gpu"),
+        "analysis.training.device",
+        "must be cpu, or a GPU as cuda",
+    ),
     "factor in another unit than its place": (
         _set(COLLECTION, "factors", "depth", "unit", to="mm/s"),
         "collection.factors.depth.unit",
