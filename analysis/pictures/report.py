@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
@@ -44,6 +45,8 @@ class Table:
     rows: Sequence[Sequence[str]]
     caption: str = ""
     commands: Sequence[int] = ()
+    long: ClassVar[int] = 40
+    """A cell of more characters is broken into lines."""
 
     @property
     def texts(self) -> set[int]:
@@ -53,7 +56,9 @@ class Table:
             for k in range(len(self.columns))
         )
         return {
-            k for k, cells in enumerate(columns) if cells and all(c[0].isalpha() for c in cells)
+            k
+            for k, cells in enumerate(columns)
+            if any(len(c) > self.long for c in cells) or (cells and all(c[0].isalpha() for c in cells))
         }
 
 

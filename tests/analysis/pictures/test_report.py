@@ -129,3 +129,12 @@ def test_words_read_from_the_left_and_commands_as_code() -> None:
     assert '<th class="text">cause</th><th>lead (ms)</th>' in page
     assert '<td class="text">late</td><td>12</td>' in page
     assert page.startswith("<!doctype html>")
+
+
+def test_a_column_with_a_sentence_has_its_heading_on_the_left() -> None:
+    sentence = "30 ms windows every 10 ms, one class of two spikes ahead"
+    table = Table(("", "detector", "ms"), [["a", sentence, "12"], ["b", "5 ms", "30"]])
+    assert table.texts == {0, 1}
+    page = render([], [], [Section("a", (), tables=[table])], simulated=False)
+    assert '<th class="text">detector</th><th>ms</th>' in page
+    assert f'<td class="words">{sentence}</td><td>12</td>' in page
