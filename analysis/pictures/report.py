@@ -58,7 +58,8 @@ class Table:
         return {
             k
             for k, cells in enumerate(columns)
-            if any(len(c) > self.long for c in cells) or (cells and all(c[0].isalpha() for c in cells))
+            if any(len(c) > self.long for c in cells)
+            or (cells and all(c[0].isalpha() for c in cells))
         }
 
 
