@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets.metrics import CLASSES, IntArray
+from analysis.nets.metrics import IntArray
 from analysis.nets.network import SPIKING, by_parameter, parameters, reset_states, set_weights
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Job, Trainer, WindowLoss
@@ -153,7 +153,6 @@ class BySinabs:
             wanted = parameters(self._net)
             grads = torch.autograd.grad(loss, list(wanted.values()))
         reset_states(self._net)
-        assert counts.shape == (len(rows), len(CLASSES))
         return Batch(
             loss.item(),
             counts.detach().cpu().numpy().astype(np.int64),

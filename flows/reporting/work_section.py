@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import fmean
 from typing import Any
 
 from analysis.pictures.report import Section, Table, number, percent
@@ -87,14 +88,15 @@ def _lost(windows: Json, beside: Json) -> list[str]:
 def _means(ours: Json, theirs: Json, best: str) -> list[str]:
     """Mean against mean, where both were trained with several seeds."""
     strict = ours["spread"]["strict"]["mean"]
-    shares = [row["argmax"] for row in theirs.get("seeds", ()) if row["argmax"] is not None]
+    shares = _shares(theirs)
     if len(ours["each"]) < 2 or len(shares) < 2 or strict is None:
         return []
-    points = 100 * (strict - _mean(shares))
+    mean = fmean(shares)
+    points = 100 * (strict - mean)
     return [
         f"Over {len(ours['each'])} seeds the spiking network's strict accuracy is "
         f"{percent(strict)} in the mean; over {len(shares)} seeds {METHODS[best]} have "
-        f"{percent(_mean(shares))}: {number(abs(points), 2)} points "
+        f"{percent(mean)}: {number(abs(points), 2)} points "
         f"{'ahead' if points > 0 else 'behind'}, ties counted as wrong."
     ]
 
@@ -122,14 +124,15 @@ def _others(beside: Json) -> list[Table]:
 
 def _over_seeds(made: Json) -> str:
     """Mean, lowest and highest argmax accuracy of a method that was trained with several seeds."""
-    shares = [row["argmax"] for row in made.get("seeds", ()) if row["argmax"] is not None]
+    shares = _shares(made)
     if not shares:
         return "–"
-    return f"{percent(_mean(shares))} ({percent(min(shares))} to {percent(max(shares))})"
+    return f"{percent(fmean(shares))} ({percent(min(shares))} to {percent(max(shares))})"
 
 
-def _mean(shares: list[float]) -> float:
-    return sum(shares) / len(shares)
+def _shares(made: Json) -> list[float]:
+    """Argmax accuracy with each seed; none for what has nothing random."""
+    return [row["argmax"] for row in made.get("seeds", ()) if row["argmax"] is not None]
 
 
 def _span(row: Json) -> str:
