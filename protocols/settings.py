@@ -7,7 +7,7 @@ model is handed whole to the step that uses it, and that step is stale when its 
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -100,6 +100,9 @@ class Network(StrictModel):
     conv1_channels: int = Field(default=8, ge=1, le=256)
     conv2_channels: int = Field(default=16, ge=1, le=256)
     hidden: int = Field(default=32, ge=1, le=1024)
+    outputs_per_class: int = Field(default=4, ge=1, le=64)
+    """Output neurons of each class, whose spikes are counted together: with one, as in the paper,
+    a window of 30 steps has 31 counts to tell classes apart by, and more ties."""
     conv1_kernel: Literal[1, 3, 5, 7] = 5
     conv2_kernel: Literal[1, 3, 5, 7] = 3
     """Side of the square kernels, cells."""
@@ -122,8 +125,9 @@ class Training(StrictModel):
     warm_up: float = Field(default=0.02, ge=0, le=1)
     """Share of all steps over which the learning rate rises from nothing: a neuron that a first
     large step puts far below its threshold never learns again."""
-    gain: float = Field(default=0.25, gt=0, le=10)
-    """What a spike counts in the cross-entropy. Less of it asks for counts further apart."""
+    gain: float = Field(default=0.0625, gt=0, le=10)
+    """What a spike counts in the cross-entropy. Less of it asks for counts further apart. By
+    default a quarter over ``network.outputs_per_class``."""
     mirror: bool = True
     """Each epoch shows each training window as it is, or mirrored along one side or both, drawn
     anew: a slide to the left is as good as one to the right."""
@@ -178,8 +182,9 @@ class Detection(StrictModel):
 
     smoothing: int = Field(default=4, ge=1, le=1000)
     """Windows over which spike counts are averaged."""
-    margin: float = Field(default=2.0, ge=0)
-    """The winner must exceed every other class by at least this many mean spikes."""
+    margin: float = Field(default=8.0, ge=0)
+    """The winner must exceed every other class by at least this many mean spikes. By default two,
+    as in the paper, for each of a class's ``network.outputs_per_class`` neurons."""
     false_early_ms: float = Field(default=30.0, ge=0)
     """A detection earlier than the true onset by more than this is false."""
     stride_ms: int | None = Field(default=None, ge=1, le=1000)
@@ -189,8 +194,9 @@ class Detection(StrictModel):
     """Where smoothing and margin come from: this file; the grid below, by validation trials; or
     by the test trials themselves, as in the paper, which flatters the result."""
     smoothing_grid: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
-    margin_grid: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-    """What `choose` tries: every smoothing with every margin."""
+    margin_grid: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+    """What `choose` tries: every smoothing with every margin. By default from a half to eight
+    for each of a class's output neurons."""
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)
     """Share of trials that a choice may leave false early."""
     compare: Comparison | None = Comparison()
@@ -223,6 +229,27 @@ class AnalysisSettings(StrictModel):
     detection: Detection = Detection()
 
     @model_validator(mode="after")
+    def _spikes(self) -> AnalysisSettings:
+        """What is counted in spikes goes with how many neurons give them."""
+        factor = self.network.outputs_per_class / Network().outputs_per_class
+        usual, rule = Training(), Detection()
+        changes: tuple[tuple[str, StrictModel, dict[str, Any]], ...] = (
+            ("training", self.training, {"gain": usual.gain / factor}),
+            (
+                "detection",
+                self.detection,
+                {
+                    "margin": rule.margin * factor,
+                    "margin_grid": tuple(each * factor for each in rule.margin_grid),
+                },
+            ),
+        )
+        for name, part, wanted in changes:
+            left = {key: wanted[key] for key in wanted.keys() - part.model_fields_set}
+            object.__setattr__(self, name, part.model_copy(update=left))  # frozen for all others
+        return self
+
+    @model_validator(mode="after")
     def _strides(self) -> AnalysisSettings:
         length = self.windows.length_ms
         stride = self.detection.stride_ms
@@ -244,6 +271,11 @@ class AnalysisSettings(StrictModel):
     def stride_ms(self) -> int:
         """From one window's begin to the next one's in detection."""
         return self.detection.stride_ms or self.windows.length_ms
+
+    @property
+    def most_spikes(self) -> int:
+        """That a class can give in a window: a neuron fires once a step at most."""
+        return self.windows.steps * self.network.outputs_per_class
 
     @property
     def fine_stride_ms(self) -> int | None:

@@ -27,7 +27,7 @@ def carried_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
         x: n windows that follow each other.
 
     Returns:
-        uint8 (n * steps, 3), 0 or 1.
+        uint8 (n * steps, 3), by class.
 
     Raises:
         ValueError: samples of another shape.

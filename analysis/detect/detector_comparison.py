@@ -49,15 +49,16 @@ class Parts:
 
 
 def compare(
-    parts: Parts, windows: Windows, settings: Detection, fine_ms: int
+    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
 ) -> dict[str, Any] | None:
     """Every detector at every stride and rate, as plain data for JSON.
 
     Args:
-        windows: their length and steps.
+        windows: their length.
         settings: smoothing of the paper's rule, the grid of smoothings, what is false early, and
             the rates that are compared.
         fine_ms: the finer stride; divides the window's length.
+        most: spikes that a class can give in a window.
 
     Returns:
         None where nothing is to be compared, or training, validation or test trials are missing.
@@ -69,7 +70,7 @@ def compare(
     asked = settings.compare
     if asked is None or not (parts.train and parts.validation and parts.test):
         return None
-    learned = learn(parts.train, windows.length_ms * 1_000_000, windows.steps)
+    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
     found = []
     for stride in sorted({windows.length_ms, fine_ms}, reverse=True):
         every = stride // fine_ms

@@ -224,12 +224,12 @@ class Learned:
         }
 
 
-def learn(trials: Sequence[Labelled], length_ns: int, steps: int) -> Learned:
+def learn(trials: Sequence[Labelled], length_ns: int, most: int) -> Learned:
     """Learn from labelled training trials in consecutive windows.
 
     Args:
         length_ns: a window's length.
-        steps: the most spikes that an output can give in a window.
+        most: spikes that a class can give in a window.
     """
     labels = [trial.states(length_ns) for trial in trials]
     flat = np.concatenate([np.empty(0, np.int64), *labels])
@@ -239,7 +239,7 @@ def learn(trials: Sequence[Labelled], length_ns: int, steps: int) -> Learned:
     return Learned(
         fit_chain(labels, classes),
         {
-            "histograms": Reading(fit_histograms(counts, flat, classes, steps + 1), False, 1.0),
+            "histograms": Reading(fit_histograms(counts, flat, classes, most + 1), False, 1.0),
             "counts": Reading(fit_logistic(counts, flat, classes), False, 1.0),
             "counts and events": Reading(fit_logistic(both, flat, classes), True, 1.0),
         },

@@ -1,6 +1,6 @@
 """What a set of spike counts is worth, in numbers that a silent network cannot flatter.
 
-The class of a sample is the output neuron with most spikes. A network that never fires gives
+The class of a sample is the one whose output neurons spike most. A network that never fires gives
 (0, 0, 0) everywhere; an ordinary argmax calls that class 0 and looks good on a quiet recording.
 So a tie is shared here, accuracies with a unique winner and with a margin stand beside it, and
 nothing depends on the order of the classes.
@@ -15,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 CLASSES = ("no_slip", "incipient", "gross")
-"""Class names; their positions are the labels 0, 1, 2 and the output neurons."""
+"""Class names; their positions are the labels 0, 1, 2 and the columns of spike counts."""
 
 NO_SLIP, INCIPIENT, GROSS = range(3)
 
-DEFAULT_MARGIN = 2.0
-"""Spikes by which a winner must lead to count as decided (the paper's rule for a detection)."""
+DEFAULT_MARGIN = 8.0
+"""Spikes by which a winner must lead to count as decided: two for each of a class's four output
+neurons (the paper's rule for a detection)."""
 
 Counts = npt.NDArray[Any]
 Labels = npt.NDArray[np.integer[Any]]

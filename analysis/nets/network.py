@@ -47,13 +47,13 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
     """A network with fresh weights: conv, conv of stride 2, two fully connected, IAF after each.
 
     Time is folded into the batch: the modules take (n * steps, channels, cells, cells) float32
-    and give (n * steps, 3) spikes. Weights are torch's default draw times
-    ``settings.weight_scale``; hidden neurons' biases are drawn from `FIRST_BIAS`, outputs begin at
-    `FIRST_DRIVE`, and convolutions have no biases (docs/decisions/0054, 0056). torch's global
-    random state is left as it was.
+    and give (n * steps, outputs) spikes; output j is of class j % 3 (`by_class`). Weights are
+    torch's default draw times ``settings.weight_scale``; hidden neurons' biases are drawn from
+    `FIRST_BIAS`, outputs begin at `FIRST_DRIVE`, and convolutions have no biases
+    (docs/decisions/0054, 0056, 0059). torch's global random state is left as it was.
 
     Args:
-        settings: channels, kernels, hidden neurons, weight scale.
+        settings: channels, kernels, hidden neurons, outputs, weight scale.
         windows: shape of a sample.
         seed: the same seed gives the same weights to the bit.
     """
@@ -73,7 +73,7 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             bias=False,
         )
         fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden)
-        fc2 = nn.Linear(settings.hidden, len(CLASSES))
+        fc2 = nn.Linear(settings.hidden, len(CLASSES) * settings.outputs_per_class)
         nn.init.uniform_(fc1.bias, *FIRST_BIAS)
     layers: tuple[Any, ...] = (conv1, conv2, fc1, fc2)
     with torch.no_grad():
@@ -150,6 +150,11 @@ def set_weights(net: nn.Sequential, values: dict[str, torch.Tensor]) -> None:
             parameter.copy_(values[name])
 
 
+def by_class(spikes: torch.Tensor) -> torch.Tensor:
+    """Output spikes (..., outputs) added up by class (..., 3): output j is of class j % 3."""
+    return spikes.reshape(*spikes.shape[:-1], -1, len(CLASSES)).sum(dim=-2)
+
+
 def reset_states(net: nn.Sequential) -> None:
     """Put every neuron to potential zero, as before an independent sample."""
     for name in SPIKING:
@@ -188,7 +193,7 @@ def spike_counts(net: nn.Sequential, x: Array, batch: int = 64) -> Counts:
             part = torch.from_numpy(x[start : start + batch].astype(np.float32))
             reset_states(net)
             spikes = net(part.flatten(0, 1))
-            counts = spikes.unflatten(0, (len(part), -1)).sum(dim=1)
+            counts = by_class(spikes.unflatten(0, (len(part), -1)).sum(dim=1))
             out[start : start + batch] = counts.numpy().astype(np.int64)
     reset_states(net)
     return out

@@ -59,6 +59,10 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
         numpy_helper.from_array(value.detach().numpy(), name)
         for name, value in parameters(net).items()
     ]
+    constants += [
+        numpy_helper.from_array(np.array([0, -1, len(CLASSES)], np.int64), "by_class"),
+        numpy_helper.from_array(np.array([1], np.int64), "neurons"),
+    ]
     states = [*SPIKING, "sum"]
     for name in states:
         rest = np.array(shapes[name], np.int64)
@@ -89,7 +93,10 @@ def to_onnx(net: nn.Sequential, windows: Windows, about: dict[str, str]) -> byte
             body=body,
             num_scan_inputs=1,
         ),
-        helper.make_node("Cast", ["sum.end"], [OUTPUT], to=TensorProto.INT64),
+        # neuron j is of class j % 3, and a class's spikes are added up
+        helper.make_node("Reshape", ["sum.end", "by_class"], ["sums"]),
+        helper.make_node("ReduceSum", ["sums", "neurons"], ["counted"], keepdims=0),
+        helper.make_node("Cast", ["counted"], [OUTPUT], to=TensorProto.INT64),
     ]
     sample = [windows.steps, windows.channels, windows.cells, windows.cells]
     graph = helper.make_graph(

@@ -19,7 +19,7 @@ from numba import njit
 from torch import nn
 
 from analysis.nets.metrics import winners
-from analysis.nets.network import SPIKING, WEIGHTED, build, parameters, set_weights
+from analysis.nets.network import SPIKING, WEIGHTED, build, by_class, parameters, set_weights
 from analysis.nets.speck import STATE_BITS, WEIGHT_BITS
 from analysis.nets.training import Fitted
 
@@ -145,7 +145,7 @@ def chip_run(net: nn.Sequential, x: npt.NDArray[np.uint8], batch: int = 16) -> C
                 cut[name] += _fire(spikes.numpy(), threshold, LOWEST, HIGHEST, ends[name])
                 whole[name] += spikes.numel()
                 at = spikes.view(at.shape)
-            counts.append(at.view(n, steps, -1).sum(dim=1).numpy().astype(np.int64))
+            counts.append(by_class(at.view(n, steps, -1).sum(dim=1)).numpy().astype(np.int64))
     return ChipRun(
         np.concatenate(counts),
         {name: (float(low), float(high)) for name, (low, high) in ends.items()},

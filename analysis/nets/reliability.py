@@ -1,6 +1,6 @@
 """Whether a lead of so many spikes means what it says: shares right, and a probability from them.
 
-A detection trusts a class that leads by two spikes. How often is that right, and by how many
+A detection trusts a class that leads by eight spikes. How often is that right, and by how many
 spikes does the network have to lead to be right in 99 of 100 windows? Spike counts are no
 probabilities. One number, the temperature (Guo et al., 2017), makes them some; it is fitted on
 validation windows only, and what it is worth is measured on test windows.
@@ -23,7 +23,7 @@ FloatArray = npt.NDArray[np.float64]
 BINS = 15
 """Of equal width, for the expected calibration error, as Guo et al. take them."""
 
-MOST = 10
+MOST = 40
 """Leads of so many spikes and more share a row."""
 
 _TEMPERATURES = (1e-2, 1e3)

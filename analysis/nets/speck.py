@@ -172,7 +172,7 @@ def speck_fit(network: Network, windows: Windows) -> SpeckFit:
             network.conv2_kernel, 2, network.conv2_kernel // 2,
         ),
         _layer("fc1", network.conv2_channels, side, network.hidden, side, 1, 0),
-        _layer("fc2", network.hidden, 1, len(CLASSES), 1, 1, 0),
+        _layer("fc2", network.hidden, 1, len(CLASSES) * network.outputs_per_class, 1, 1, 0),
     )  # fmt: skip
     problems = [problem for layer in layers for problem in layer.problems]
     cores = _assign(layers)

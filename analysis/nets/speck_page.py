@@ -13,6 +13,7 @@ NOT_SHOWN = (
     "looks once a millisecond.",
     "The chip adds biases (fc1, fc2) by its leak clock: it must tick once a step.",
     "The chip does not reset its neurons between windows; the program that reads it has to.",
+    "Spikes of a class's output neurons are added up by the program that reads the chip.",
     "Routing, delays and lost spikes of the chip are not in here, and no chip has seen this file.",
 )
 

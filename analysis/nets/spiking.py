@@ -120,8 +120,8 @@ class Stream:
         self._scratch = engine._layout.scratch()
         self._fired = np.zeros(len(SPIKING), np.int64)
 
-    def push(self, plane: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-        """The next step's counts (channels, cells, cells): which output neurons fire, (3,).
+    def push(self, plane: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The next step's counts (channels, cells, cells): output spikes by class, uint8 (3,).
 
         Raises:
             ValueError: another shape, or not uint8.
@@ -134,9 +134,8 @@ class Stream:
             cell, plane.ravel()[cell], 0, len(cell), engine._layers, engine.threshold,
             self._state, self._scratch, self._fired,
         )  # fmt: skip
-        fires = np.zeros(len(CLASSES), np.bool_)
-        fires[self._scratch[1][-1][:n]] = True
-        return fires
+        classes = self._scratch[1][-1][:n] % np.uint64(len(CLASSES))
+        return np.bincount(classes.astype(np.int64), minlength=len(CLASSES)).astype(np.uint8)
 
     def reset(self) -> None:
         """Back to rest."""
@@ -201,7 +200,8 @@ class Job:
         loss = spiking_gradients.windows_loss(
             x.cell, x.count, x.offsets, self._rows, self._labels, self._gain, trainer.steps,
             trainer.layers, trainer.layout.spans, trainer.back, trainer.constants,
-            trainer.layout.rest, memory[:4], memory[4], self.counts, self._fired, self.grads,
+            trainer.layout.rest, memory[:4], trainer.layout.neurons[-1], memory[4], self.counts,
+            self._fired, self.grads,
         )  # fmt: skip
         trainer.give_back(memory)
         return float(loss)

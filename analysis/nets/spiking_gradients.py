@@ -46,12 +46,12 @@ def forward_kept(
         potentials: of each layer float32 (steps, neurons), filled with u inside the spans.
         lists: of each layer, filled with its spikes, one step after the other.
         ends: of each layer uint64 (steps + 1,), filled with where a step's spikes end.
-        out: int64 (3,), grows by the output spikes.
+        out: int64 (3,), grows by the output spikes; those of neuron j belong to class j % 3.
         the rest: see `analysis.nets.spiking_kernels`.
     """
     reach, weights, shape, bias = layers
     currents = scratch[0]
-    last = len(state) - 1
+    last, classes = len(state) - 1, np.uint64(out.size)
     for k in range(len(state)):
         state[k][:] = rest[k]
         ends[k][0] = _U0
@@ -75,8 +75,7 @@ def forward_kept(
                 )  # fmt: skip
             ends[k][t + 1] = n
     for e in range(ends[last][steps]):
-        if lists[last][e] < out.size:
-            out[lists[last][e]] += 1
+        out[lists[last][e] % classes] += 1
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -188,7 +187,7 @@ def backward(
             filled up with zeros).
         constants: threshold, width and scale of the surrogate.
         potentials, lists, ends: from `forward_kept`.
-        by_count: float32, gradient by the window's output counts, zero beyond the three.
+        by_count: float32, gradient by the window's spikes of each output, zero beyond the outputs.
         planes: scratch, (dL/du of layers 2 to 4 (steps, neurons), dL/du of the largest layer,
             gradient by the spikes of layer 1, taps of a step).
         grads: of each layer, in the packed order.
@@ -234,8 +233,8 @@ def backward(
 @njit(cache=True, nogil=True)
 def windows_loss(
     cell: Any, count: Any, offsets: Any, rows: Any, labels: Any, gain: float, steps: int,
-    layers: Any, spans: Any, back: Any, constants: Any, rest: Any, memory: Any, by_count: Any,
-    out: Any, fired: Any, grads: Any,
+    layers: Any, spans: Any, back: Any, constants: Any, rest: Any, memory: Any, outputs: int,
+    by_count: Any, out: Any, fired: Any, grads: Any,
 ) -> float:  # fmt: skip
     """Windows forward and back, one after the other: what a window leaves stays in the cache.
 
@@ -243,7 +242,8 @@ def windows_loss(
         rows, labels: int64 (n,), which windows, and their classes.
         gain: what a spike counts in the cross-entropy.
         memory: (state, scratch, kept (potentials, lists, ends), planes) of one thread.
-        by_count: scratch float32, zero beyond the classes.
+        outputs: output neurons; neuron j is of class ``j % classes``.
+        by_count: scratch float32, zero beyond the outputs.
         out: int64 (n, classes), grows by the output spikes.
         fired: int64 (layers,), grows by every layer's spikes.
         grads: of each layer, in the packed order; grow by the gradient of what is returned.
@@ -268,6 +268,8 @@ def windows_loss(
         for k in range(classes):
             by_count[k] = np.float32(gain * math.exp(gain * (out[i, k] - most)) / total)
         by_count[labels[i]] -= np.float32(gain)
+        for k in range(classes, outputs):
+            by_count[k] = by_count[k - classes]
         backward(
             cell, count, offsets, rows[i], steps, layers, back, constants, potentials,
             lists, ends, by_count, planes, grads,

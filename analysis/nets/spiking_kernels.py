@@ -172,10 +172,11 @@ def windows(
     Args:
         cell, count, offsets: see `analysis.nets.sparse.SparseWindows`.
         rest: potentials of each layer at rest.
-        out: int64 (n, 3), filled in its rows [begin, end).
+        out: int64 (n, 3), filled in its rows [begin, end): spikes of the outputs by class; output
+            neuron j is of class j % 3.
         fired_by: int64 (n, layers), likewise, spikes of each layer.
     """
-    outputs = out.shape[1]
+    classes = np.uint64(out.shape[1])
     for i in range(begin, end):
         for k in range(len(state)):
             state[k][:] = rest[k]
@@ -186,5 +187,4 @@ def windows(
             )  # fmt: skip
             last = scratch[1][len(state) - 1]
             for k in range(n):
-                if last[k] < outputs:
-                    out[i, last[k]] += 1
+                out[i, last[k] % classes] += 1

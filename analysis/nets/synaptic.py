@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
+from analysis.nets.metrics import CLASSES
 from analysis.nets.network import BIASED, SPIKING, WEIGHTED
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Trainer, side_by_side
@@ -80,13 +81,13 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
     For the first layer places are input cells (channel, row, column), for the others neurons of
     the layer below in its plane; zero where there is no neuron.
     """
-    (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (classes, _) = trainer.layout.shapes
+    (c1, channels, k1, _), (c2, _, k2, _), (hidden, _), (outputs, _) = trainer.layout.shapes
     near, far = reached(cells, k1, 1), reached(cells, k2, 2)
     tables = trainer.layout.tables
     result = [np.tile((np.outer(near, near) * c1).ravel(), channels)]
     strided = (np.outer(far, far) * c2)[:, :, None]
     each: I64
-    for table, each in zip(tables[:3], (strided, np.array(hidden), np.array(classes)), strict=True):
+    for table, each in zip(tables[:3], (strided, np.array(hidden), np.array(outputs)), strict=True):
         plane = np.zeros(table.target.size, np.int64)
         plane[table.target.index()] = each
         result.append(plane)
@@ -111,7 +112,7 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | N
 
     def some(begin: int) -> None:
         state, scratch, (potentials, lists, ends), *_ = memory = trainer.borrow()
-        out = np.zeros(synapses[-1].max(), np.int64)
+        out = np.zeros(len(CLASSES), np.int64)
         row = begin // CHUNK
         for i in range(begin, min(begin + CHUNK, len(x))):
             forward_kept(

@@ -29,7 +29,7 @@ from analysis.nets.spiking import Engine, Samples
 from analysis.nets.training_run import Run
 from protocols.settings import Network, Training, Windows
 
-VERSION = 7
+VERSION = 8
 """Raised when the same samples, settings and seed give other weights."""
 
 

@@ -21,7 +21,14 @@ import torch
 from torch import nn
 
 from analysis.nets.metrics import IntArray
-from analysis.nets.network import SPIKING, by_parameter, parameters, reset_states, set_weights
+from analysis.nets.network import (
+    SPIKING,
+    by_class,
+    by_parameter,
+    parameters,
+    reset_states,
+    set_weights,
+)
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Job, Trainer, WindowLoss
 
@@ -145,7 +152,7 @@ class BySinabs:
         reset_states(self._net)
         with _exact_sums():
             spikes = self._net(dense.flatten(0, 1)).unflatten(0, (len(rows), -1))
-            counts = spikes.sum(dim=1)
+            counts = by_class(spikes.sum(dim=1))
             target = torch.from_numpy(y[rows]).to(self._device)
             loss = nn.functional.cross_entropy(
                 self._gain * counts.double(), target, reduction="sum"

@@ -29,7 +29,7 @@ class CheckFailed(Exception):
 
 
 Predict = Callable[[tuple[int, ...]], Counts]
-"""Spike counts (n, 3) of a network whose output k is the old output ``order[k]``."""
+"""Spike counts (n, 3) of a network whose outputs of class k are the old ones of ``order[k]``."""
 
 
 def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
@@ -39,7 +39,9 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
         net = restore(fitted)
         values = dict(fitted.state_dict)
         for name in ("fc2.weight", "fc2.bias"):
-            values[name] = values[name][list(order)]
+            old = values[name]
+            grouped = old.reshape(-1, len(CLASSES), *old.shape[1:])  # output j is of class j % 3
+            values[name] = grouped[:, list(order)].reshape(old.shape)
         set_weights(net, values)
         return Engine(net, fitted.windows.cells).counts(x)
 

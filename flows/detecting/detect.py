@@ -63,7 +63,9 @@ def detect(
         rig.should_stop = stopping.requested
         rig.poll_s = min(rig.poll_s, order.poll_s)
         detector = _detector(order, rig, counting)
-        view = done.enter_context(DetectView(_title(order), order.fitted.windows.steps))
+        fitted = order.fitted
+        most = fitted.windows.steps * fitted.network.outputs_per_class
+        view = done.enter_context(DetectView(_title(order), most))
 
         def told(timed: Timed) -> None:
             write(timed)

@@ -27,10 +27,11 @@ class DetectView:
 
     Args:
         title: says "simulated" where that is so.
+        most: spikes that a class can give in a window.
     """
 
-    def __init__(self, title: str, steps: int) -> None:
-        self._title, self._steps = title, steps
+    def __init__(self, title: str, most: int) -> None:
+        self._title, self._most = title, most
         self._rate: deque[tuple[float, int]] = deque(maxlen=34)
         self._last: deque[str] = deque(maxlen=LAST)
         self._state = ""
@@ -85,7 +86,7 @@ class DetectView:
         timed = self._now
         for number, name in enumerate(CLASSES):
             mean = 0.0 if timed is None else timed.decision.smoothed[number]
-            filled = min(WIDTH, round(WIDTH * mean / self._steps))
+            filled = min(WIDTH, round(WIDTH * mean / self._most))
             bar = Text("█" * filled + "·" * (WIDTH - filled), style=_STYLES[number])
             table.add_row(name.replace("_", " "), bar, f"{mean:5.2f}")
         if timed is None:

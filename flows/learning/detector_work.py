@@ -95,11 +95,12 @@ class DetectorWork:
         parts = _parts(store, self.compared)
         if parts is None or fine is None:
             return None
-        found = compare(parts, settings.windows, detection, fine)
+        found = compare(parts, settings.windows, detection, fine, settings.most_spikes)
         carried = _parts(store, self.carried)
         if found is None or carried is None:
             return found
-        beside = compare(carried, settings.windows, detection, fine) or {"detectors": []}
+        beside = compare(carried, settings.windows, detection, fine, settings.most_spikes)
+        beside = beside or {"detectors": []}
         return {**found, "carried": beside["detectors"]}
 
 

@@ -176,7 +176,8 @@ def _lead(windows: Json, simulated: bool) -> Section:
                 window_figures.reliability(windows["reliability"], simulated=simulated),
                 "Share of windows called rightly, by how far the winner leads; below, how many "
                 "windows there are. Bars are Wilson's 95 % intervals, which take windows for "
-                "independent. The paper's detection asks for a lead of 2.",
+                "independent. The paper's detection asks for a lead of 2 with one output neuron a "
+                "class.",
                 "lead-reliability",
                 _leads(windows["reliability"]),
             )

@@ -21,10 +21,11 @@ from analysis.statistics.pareto import front
 from flows.searching.detector_tradeoff_data import Data, true_onsets
 from flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_stride, strides
 from flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts
+from protocols.settings import Detection
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(2.0))
+MARGINS = Detection().margin_grid
+PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(Detection().margin))
 LOOSE = 0.1
 """Share of validation trials that the looser choice may leave false early, for either onset."""
 RULES = ("paper's", "chosen", f"chosen, {100 * LOOSE:g} %")

@@ -217,16 +217,15 @@ def trial_counts(
 
 def _count(
     used: Used, engine: Engine, windows: Windows, ask: Ask
-) -> tuple[npt.NDArray[np.uint8 | np.uint16], int]:
+) -> tuple[npt.NDArray[np.uint16], int]:
     """Spike counts of a trial's windows at the finest stride, and the first one's end."""
     length_ns = windows.length_ms * 1_000_000
     stride_ns = counted_stride(windows.length_ms, ask.stride_ms) * 1_000_000
     span = dataset.recorded_span(used.recording)
     starts = strided_windows(*span, length_ns, stride_ns)
     counts = engine.counts(dataset.cut_windows(used.recording, starts, windows))
-    # a neuron fires once a step at most
-    small = np.uint8 if windows.steps <= 255 else np.uint16
-    return counts.astype(small), span[0] + length_ns
+    # at most 1000 steps of 64 neurons
+    return counts.astype(np.uint16), span[0] + length_ns
 
 
 def _window_figures(

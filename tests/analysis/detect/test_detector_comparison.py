@@ -44,7 +44,7 @@ def parts(validation: int = 10, test: int = 10) -> Parts:
 
 @pytest.fixture(scope="module")
 def compared() -> dict[str, object]:
-    found = compare(parts(), WINDOWS, SETTINGS, 10)
+    found = compare(parts(), WINDOWS, SETTINGS, 10, WINDOWS.steps)
     assert found is not None
     return found
 
@@ -82,7 +82,11 @@ def test_what_adds_up_evidence_beats_the_average_here(compared: dict) -> None:
 
 def test_no_level_and_no_choice_knows_the_test_trials(compared: dict) -> None:
     other = compare(
-        Parts(parts().train, parts().validation, [trial(900, 10)]), WINDOWS, SETTINGS, 10
+        Parts(parts().train, parts().validation, [trial(900, 10)]),
+        WINDOWS,
+        SETTINGS,
+        10,
+        WINDOWS.steps,
     )
     assert other is not None
     for mine, theirs in zip(compared["detectors"], other["detectors"], strict=True):
@@ -97,7 +101,7 @@ def test_one_stride_is_compared_once() -> None:
         parts().train,
         *([thinned(t, 3) for t in p] for p in (parts(3, 3).validation, parts(3, 3).test)),
     )
-    found = compare(few, WINDOWS, SETTINGS, 30)
+    found = compare(few, WINDOWS, SETTINGS, 30, WINDOWS.steps)
     assert found is not None
     assert found["strides_ms"] == [30]
     assert len(found["detectors"]) == 8
@@ -114,7 +118,7 @@ def test_thinned_windows_are_the_consecutive_ones() -> None:
 def test_nothing_to_compare(missing: str) -> None:
     there = copy.copy(vars(parts(2, 2)))
     if missing == "compare":
-        assert compare(Parts(**there), WINDOWS, Detection(compare=None), 10) is None
+        assert compare(Parts(**there), WINDOWS, Detection(compare=None), 10, WINDOWS.steps) is None
         return
     there[missing] = []
-    assert compare(Parts(**there), WINDOWS, SETTINGS, 10) is None
+    assert compare(Parts(**there), WINDOWS, SETTINGS, 10, WINDOWS.steps) is None

@@ -67,8 +67,8 @@ def test_default_sizes_fit_the_chip() -> None:
         "conv2.weight": (16, 8, 3, 3),
         "fc1.weight": (32, 1600),
         "fc1.bias": (32,),
-        "fc2.weight": (3, 32),
-        "fc2.bias": (3,),
+        "fc2.weight": (12, 32),
+        "fc2.bias": (12,),
     }
     assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(BIASED)
     # on the chip a fully connected layer is a convolution over all of its input
@@ -127,7 +127,7 @@ def test_outputs_begin_alike_in_a_window_without_events(hidden: int) -> None:
     assert 0 < int(inside.sum()) < hidden
     torch.testing.assert_close(fired[inside], torch.floor(steps * rates[inside] + 1e-3))
     drive = names["fc2"].weight @ rates + names["fc2"].bias
-    torch.testing.assert_close(drive, torch.full((3,), FIRST_DRIVE))
+    torch.testing.assert_close(drive, torch.full((12,), FIRST_DRIVE))
 
 
 def test_weight_scale_belongs_to_its_layer() -> None:
@@ -180,7 +180,7 @@ def test_weights_that_do_not_fit_are_named() -> None:
     good = weights(net)
     with pytest.raises(ValueError, match=r"fc2\.weight"):
         set_weights(net, {k: v for k, v in good.items() if k != "fc2.weight"})
-    with pytest.raises(ValueError, match=r"fc2.weight has the shape \(8, 3\)"):
+    with pytest.raises(ValueError, match=r"fc2.weight has the shape \(8, 12\)"):
         set_weights(net, good | {"fc2.weight": good["fc2.weight"].T})
 
 

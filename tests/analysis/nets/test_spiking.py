@@ -15,6 +15,7 @@ from analysis.nets.network import (
     GRID,
     SPIKING,
     build,
+    by_class,
     by_parameter,
     exact,
     matrices,
@@ -77,13 +78,21 @@ def test_spike_counts_are_sinabs_own(share: float) -> None:
 
 
 @pytest.mark.parametrize("polarity", ["positive", "both"])
-@pytest.mark.parametrize(("k1", "k2"), [(1, 1), (3, 5), (5, 3), (7, 7), (1, 7), (7, 1)])
+@pytest.mark.parametrize(
+    ("k1", "k2", "outputs"),
+    [(1, 1, 1), (3, 5, 2), (5, 3, 4), (7, 7, 11), (1, 7, 3), (7, 1, 64)],
+)
 @pytest.mark.parametrize("crop", [20, 100, 120])
-def test_every_shape_of_network(polarity: str, k1: int, k2: int, crop: int) -> None:
+def test_every_shape_of_network(polarity: str, k1: int, k2: int, outputs: int, crop: int) -> None:
     """One cell a side, an odd number, an even number; channels that fill no vector."""
     windows = Windows(length_ms=8, crop_px=crop, polarity=polarity)
     network = Network(
-        conv1_channels=3, conv2_channels=5, hidden=9, conv1_kernel=k1, conv2_kernel=k2
+        conv1_channels=3,
+        conv2_channels=5,
+        hidden=9,
+        outputs_per_class=outputs,
+        conv1_kernel=k1,
+        conv2_kernel=k2,
     )
     net = gridded(network, windows, 1)
     x = sparse(6, windows, 2, 0.5)
@@ -119,7 +128,13 @@ def test_extremes(data: st.DataObject) -> None:
     windows = Windows(
         length_ms=5, crop_px=60, polarity=data.draw(st.sampled_from(["positive", "both"]))
     )
-    network = Network(conv1_channels=2, conv2_channels=2, hidden=3, conv1_kernel=3)
+    network = Network(
+        conv1_channels=2,
+        conv2_channels=2,
+        hidden=3,
+        outputs_per_class=data.draw(st.integers(1, 4)),
+        conv1_kernel=3,
+    )
     net = build(network, windows, 0)
     values = [
         data.draw(hnp.arrays(np.int8, w.shape, elements=st.integers(-4, 4))).astype(np.float32) / 4
@@ -151,8 +166,9 @@ def test_a_threshold_that_is_reached_exactly_fires() -> None:
     x = np.array([1, 1, 0, 3], np.uint8).reshape(1, 4, 1, 1, 1)
     for weight, spikes in ((0.5, 2), (0.5 - GRID[0], 1), (0.2, 1), (0.25, 1), (-1.0, 0)):
         put(net, [np.full_like(first, weight), *rest])
-        assert Engine(net, 1).counts(x).tolist() == [[spikes] * 3]
-        np.testing.assert_array_equal(spike_counts(net, x), [[spikes] * 3])
+        expected = [[spikes * network.outputs_per_class] * 3]
+        assert Engine(net, 1).counts(x).tolist() == expected
+        np.testing.assert_array_equal(spike_counts(net, x), expected)
 
 
 @pytest.mark.parametrize("fill", [0, 1, 255])
@@ -176,7 +192,7 @@ def test_whole_and_step_by_step_for_long() -> None:
     x = sparse(1, windows, 6, 0.2)
     reset_states(net)
     with torch.no_grad():
-        expected = net(torch.from_numpy(x[0].astype(np.float32))).numpy() > 0
+        expected = by_class(net(torch.from_numpy(x[0].astype(np.float32)))).numpy()
     stream = Engine(net, windows.cells).stream()
     np.testing.assert_array_equal([stream.push(plane) for plane in x[0]], expected)
     assert expected.any()

@@ -13,6 +13,7 @@ from analysis.nets.network import (
     SPIKING,
     WEIGHTED,
     build,
+    by_class,
     matrices,
     parameters,
     reset_states,
@@ -43,7 +44,7 @@ def by_sinabs(
             getattr(net, name).register_forward_hook(lambda _m, _i, out: out.double())
     reset_states(net)
     out = net(torch.from_numpy(x.astype(kind)).flatten(0, 1)).unflatten(0, (len(x), -1))
-    loss = nn.functional.cross_entropy(gain * out.sum(dim=1), y)
+    loss = nn.functional.cross_entropy(gain * by_class(out.sum(dim=1)), y)
     wanted = parameters(net)
     grads = dict(zip(wanted, torch.autograd.grad(loss, list(wanted.values())), strict=True))
     return [
@@ -89,7 +90,7 @@ def in_double(net: nn.Sequential, x: np.ndarray, y: torch.Tensor) -> list[torch.
         lambda v: v @ w4[:, :-1].T + w4[:, -1],
     ]
     states: list[torch.Tensor | float] = [0.0] * 4
-    out = torch.zeros(len(x), 3, dtype=torch.float64)
+    out = torch.zeros(len(x), len(w4), dtype=torch.float64)
     for t in range(x.shape[1]):
         value = torch.from_numpy(x[:, t].astype(np.float64))
         for k, layer in enumerate(layers):
@@ -97,7 +98,7 @@ def in_double(net: nn.Sequential, x: np.ndarray, y: torch.Tensor) -> list[torch.
             value = _Spike.apply(u)
             states[k] = u * (1 - value.detach())
         out = out + value
-    return list(torch.autograd.grad(nn.functional.cross_entropy(out, y), weights))
+    return list(torch.autograd.grad(nn.functional.cross_entropy(by_class(out), y), weights))
 
 
 def off(found: list[Any], expected: list[torch.Tensor]) -> list[float]:
@@ -135,11 +136,16 @@ def test_where_sums_cancel_the_error_is_that_of_float32() -> None:
     assert max(fast) <= max(slow)
 
 
-@pytest.mark.parametrize(("k1", "k2"), [(1, 1), (3, 5), (7, 3), (1, 7)])
-def test_every_shape_of_network(k1: int, k2: int) -> None:
+@pytest.mark.parametrize(("k1", "k2", "outputs"), [(1, 1, 1), (3, 5, 2), (7, 3, 4), (1, 7, 11)])
+def test_every_shape_of_network(k1: int, k2: int, outputs: int) -> None:
     windows = Windows(length_ms=8, crop_px=100, polarity="both")
     network = Network(
-        conv1_channels=3, conv2_channels=5, hidden=9, conv1_kernel=k1, conv2_kernel=k2
+        conv1_channels=3,
+        conv2_channels=5,
+        hidden=9,
+        outputs_per_class=outputs,
+        conv1_kernel=k1,
+        conv2_kernel=k2,
     )
     net = gridded(network, windows, 1)
     x = sparse(4, windows, 2, 0.5)

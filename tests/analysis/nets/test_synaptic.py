@@ -79,7 +79,7 @@ def test_operations_are_those_of_sinabs_spikes_followed_one_by_one() -> None:
     assert found.events == pytest.approx(x.sum() / len(x))
     said = found.as_dict()
     assert said["share"] == pytest.approx(sum(synapses.values()) / sum(dense.values()))
-    assert found.rates["iaf4"] == pytest.approx(spikes["iaf4"] / (8 * 3))
+    assert found.rates["iaf4"] == pytest.approx(spikes["iaf4"] / (8 * 12))
 
 
 def _shape_of(layer: nn.Module) -> dict[str, object]:

@@ -128,7 +128,7 @@ def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> Non
     assert [row["seeds"] for row in found["rows"]] == [[0, 1]] * len(rows)
     (paper,) = [row for row in found["rows"] if row["paper"]]
     assert [paper[key] for key in keys] == [30, 1, 20, 1.0, "trained", 30, "paper's"]
-    assert (paper["smoothing"], paper["margin"]) == (4, 2.0)
+    assert (paper["smoothing"], paper["margin"]) == (4, 8.0)
     assert found["trials"]["falling"] == 1
     # true gross onset of the plate is 0.5 s; the first window of it ends at 35 ms
     leads = [v for row in found["rows"] for v in row["falling"]["lead_min_ms"] if v is not None]
