@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from analysis.nets.network import WEIGHTED, build
+from analysis.nets.network import WEIGHTED, build, by_class
 from protocols.settings import Network, Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]
@@ -50,7 +50,7 @@ class Rival(nn.Module):
                 y = y.flatten(1)
             y = layer(y)
             y = fire(y.unflatten(0, (n, steps))).flatten(0, 1)
-        return y.unflatten(0, (n, steps)).sum(dim=1)
+        return by_class(y.unflatten(0, (n, steps)).sum(dim=1))
 
 
 def _stepwise(step: Callable[[torch.Tensor, Any], tuple[torch.Tensor, Any]], start: Any) -> Neuron:

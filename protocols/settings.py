@@ -139,7 +139,7 @@ class Training(StrictModel):
         json_schema_extra={"pattern": _DEVICE, "patternErrorMessage": f"must be {_DEVICES}"},
     )
     """What computes it: the processor by the event-driven kernels, or a GPU (``cuda``, ``cuda:1``)
-    by Sinabs' own layers. Last bits differ between devices."""
+    by compiled layers. Last bits differ between devices."""
 
     @field_validator("device")
     @classmethod

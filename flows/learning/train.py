@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis.nets import dataset, model_file, training, training_work
+from analysis.nets import dataset, model_file, training, training_device
 from analysis.nets.dataset import SampleSet
 from flows.labelling.reviewed import Labels
 from flows.learning.samples import load_samples
@@ -201,7 +201,7 @@ def train(
 
 
 def _check_device(item: Collected) -> None:
-    device, there = item.settings.training.device, training_work.devices()
+    device, there = item.settings.training.device, training_device.devices()
     if device not in there:
         raise InputError(
             item.campaign.protocol_file,
