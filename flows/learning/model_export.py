@@ -97,7 +97,8 @@ def export_model(
         raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
     source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
     files: dict[str, bytes | str] = {}
-    with console.bar("export", 5) as bar:
+    trials = sum(1 for item in campaigns for _ in item.of_split("test"))
+    with console.bar("export", 4 + trials) as bar:
         made_from_these = _made_from_these(source)
         samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}
         seen = _look_at(samples)
@@ -107,8 +108,9 @@ def export_model(
             files[".onnx"], checks = _onnx(source, seen.x, checked)
         bar.advance(1, "onnx")
         whole = quantise(training.restore(fitted))
-        real, chip = latencies(campaigns, source.labels, fitted, whole)
-        bar.advance(1, "test trials")
+        real, chip = latencies(
+            campaigns, source.labels, fitted, whole, lambda: bar.advance(1, "test trials")
+        )
         speck = _speck(source, whole, seen, real, chip)
         files |= {
             ".speck.json": json_text(speck),

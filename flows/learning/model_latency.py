@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from analysis.detect.detection import detect
@@ -17,14 +18,23 @@ Latency = dict[str, Any]
 
 
 def latencies(
-    campaigns: list[Collected], labels: Labels, fitted: Fitted, whole: Quantised
+    campaigns: list[Collected],
+    labels: Labels,
+    fitted: Fitted,
+    whole: Quantised,
+    on_trial: Callable[[], None] = lambda: None,
 ) -> tuple[Latency, Latency]:
-    """Latency over the test trials of `campaigns`, as trained and with the whole numbers."""
+    """Latency over the test trials of `campaigns`, as trained and with the whole numbers.
+
+    Args:
+        on_trial: called before each of them; some thousand windows take a second.
+    """
     fast, chip = training.engine(fitted), quantised_net(fitted, whole)
     found: tuple[dict[str, list[Any]], ...] = ({}, {})
     for item in campaigns:
         rule = item.settings.detection
         for _, recording in item.of_split("test"):
+            on_trial()
             label = labels.read(item, recording)
             onsets = (label["incipient_ns"], label["gross_ns"])
             if None in onsets:

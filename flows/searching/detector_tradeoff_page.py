@@ -94,7 +94,8 @@ def _tried(result: Mapping[str, Any]) -> Section:
         f"trials in at most {ask['epochs']} epochs, less than the store's own network: figures "
         "say how settings differ, not how good each could become.",
         "Stride, precision, smoothing and margin were read off the same networks. The paper's "
-        "pair is 4 windows and 2 spikes; chosen pairs are those with the lowest median latency on "
+        "pair is 4 windows and 2 spikes for each of a class's output neurons; chosen pairs are "
+        "those with the lowest median latency on "
         f"{trials['validation']} validation trials of which at most "
         f"{percent(result['false_early_rate'], 0)} are false early, for either onset; or at most "
         f"{percent(LOOSE, 0)}. Figures are "

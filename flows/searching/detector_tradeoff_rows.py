@@ -21,11 +21,11 @@ from analysis.statistics.pareto import front
 from flows.searching.detector_tradeoff_data import Data, true_onsets
 from flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_stride, strides
 from flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts
-from protocols.settings import Detection
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-MARGINS = Detection().margin_grid
-PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(Detection().margin))
+MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+"""In spikes for each of a class's output neurons."""
+PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(2.0))
 LOOSE = 0.1
 """Share of validation trials that the looser choice may leave false early, for either onset."""
 RULES = ("paper's", "chosen", f"chosen, {100 * LOOSE:g} %")
@@ -89,7 +89,7 @@ def make_rows(
 
 
 class Truth:
-    """True onsets of each part, and how many trials each has."""
+    """True onsets of each part, how many trials each has, and margins in spikes of a class."""
 
     def __init__(self, data: Data) -> None:
         self.validation, self.test = true_onsets(data.validation), true_onsets(data.test)
@@ -97,14 +97,15 @@ class Truth:
         edges = np.cumsum([0, len(data.validation), len(data.test), len(data.falling)])
         self.parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
         self.rate = data.settings.detection.false_early_rate
+        self.margins = [each * data.settings.network.outputs_per_class for each in MARGINS]
 
     def judged(
         self, arrays: dict[str, npt.NDArray[Any]], precision: str, counted_ms: int, every: int
     ) -> Judged:
         """Detections at a stride of `every` counted windows."""
-        none = np.full((len(SMOOTHINGS), len(MARGINS), 2), NEVER, np.int64)
+        none = np.full((len(SMOOTHINGS), len(self.margins), 2), NEVER, np.int64)
         found = [
-            sweep(counts[::every], ends[::every], SMOOTHINGS, MARGINS) if len(ends) else none
+            sweep(counts[::every], ends[::every], SMOOTHINGS, self.margins) if len(ends) else none
             for counts, ends in trial_counts(arrays, precision, counted_ms)
         ]
         stacked = np.stack(found)
@@ -120,7 +121,9 @@ def _rows(
         each = [truth.judged(arrays, precision, counted, stride // counted) for _, arrays in there]
         pooled = np.concatenate([one.validation for one in each])
         known = _repeated(truth.validation, len(each))
-        chosen = [choose_pair(pooled, known, SMOOTHINGS, MARGINS, r) for r in (truth.rate, LOOSE)]
+        chosen = [
+            choose_pair(pooled, known, SMOOTHINGS, truth.margins, r) for r in (truth.rate, LOOSE)
+        ]
         for rule, pair in zip(RULES, (PAPER_PAIR, *chosen), strict=True):
             figures = [one[0] for one in there]
             rows.append(
@@ -130,7 +133,7 @@ def _rows(
                     "stride_ms": stride,
                     "rule": rule,
                     "smoothing": SMOOTHINGS[pair[0]],
-                    "margin": MARGINS[pair[1]],
+                    "margin": truth.margins[pair[1]],
                     "paper": _is_paper(setting, precision, stride, rule),
                     "seeds": [one["seed"] for one in figures],
                     **_figures(truth, precision, stride, pair, figures, each),
@@ -240,7 +243,7 @@ def pair_table(data: Data, kept: Kept, runs: Sequence[Run]) -> list[dict[str, An
     each = [truth.judged(arrays, PRECISIONS[0], counted, every).test for arrays in ours]
     rows = []
     for s, smoothing in enumerate(SMOOTHINGS if each else ()):
-        for m, margin in enumerate(MARGINS):
+        for m, margin in enumerate(truth.margins):
             found: list[Figures] = [worth(one[:, s, m], truth.test) for one in each]
             names = ("mean_ms", "p95_ms", "missed_either", "false_early_either")
             means = {name: mean([getattr(row, name) for row in found]) for name in names}
