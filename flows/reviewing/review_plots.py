@@ -68,12 +68,18 @@ class TimePlots:
             "active_scroll": "xwheel_zoom",
             "min_border_left": 62,
         }  # fmt: skip
+        # the program sets all ranges: a page that had to find them in data not yet there complains
         self.moved = figure(
-            height=330, y_axis_label="displacement (px)", toolbar_location="above", **common
+            height=330,
+            y_axis_label="displacement (px)",
+            y_range=Range1d(0, 1),
+            toolbar_location="above",
+            **common,
         )
         self.rate = figure(
             height=170,
             y_axis_label="events (1/s)",
+            y_range=Range1d(0, 1),
             toolbar_location=None,
             x_axis_label="time in the trial (s)",
             **common,
@@ -171,9 +177,12 @@ class TimePlots:
         self._threshold.location = shown.threshold_px
         start, end = shown.span_s
         self.moved.x_range.update(reset_start=start, reset_end=end, bounds=(start, end))
-        self._whole = (start, end, float(np.nanmax(moved, initial=2 * shown.threshold_px)))
+        top = float(np.nanmax(moved, initial=2 * shown.threshold_px))
+        self._whole = (start, end, top)
+        self.moved.y_range.update(reset_start=-0.02 * top, reset_end=1.05 * top)
         self.zoom(None, shown.threshold_px)
-        self.rate.y_range.update(start=0, end=1.1 * float(np.max(shown.rate, initial=1.0)))
+        most = 1.1 * float(np.max(shown.rate, initial=1.0))
+        self.rate.y_range.update(start=0, end=most, reset_start=0, reset_end=most)
         for line in self._motion:
             line.update(location=shown.motion_s[0], visible=True)
         for kind in KINDS:

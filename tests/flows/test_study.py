@@ -322,7 +322,7 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> Non
     assert report(store, campaigns)["done"] == 1
     assert evaluate(store, campaigns)["done"] == 1
     assert report(store, campaigns)["done"] == 1
-    assert read_summary(store)["detection"]["tiny"]["margin"] == 2.0
+    assert read_summary(store)["detection"]["tiny"]["margin"] == 8.0
 
 
 def test_the_same_seed_gives_the_same_summary(
