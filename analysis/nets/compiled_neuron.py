@@ -1,10 +1,11 @@
 """The network with its neurons' time loop fused by torch's compiler, for a GPU.
 
 Sinabs runs a layer step by step, some ten small kernels each: a GPU then waits for launches. Here a
-layer's loop over time, forward and back, is one function each that `torch.compile` turns into one
-kernel (Triton's on a GPU): a neuron's potential stays in a register. Convolutions are products of
-matrices, because the libraries' fast ways to convolve (Winograd's, Fourier's) pass through numbers
-that are not on the weights' grid, and then spikes would no longer be the same to the last one.
+layer's loop over time, forward and back, is one function each that `torch.compile` fuses into a
+kernel or three (Triton's on a GPU), with a neuron's potential in a register. Convolutions are
+products of matrices, because the libraries' fast ways to convolve (Winograd's, Fourier's) pass
+through numbers that are not on the weights' grid, and then spikes would no longer be the same to
+the last one.
 
 The layers keep the names and weights of `analysis.nets.network.build`: what works with the one
 works with the other.
@@ -27,14 +28,13 @@ from analysis.nets.spiking import neuron
 def _forward(current: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Spikes and potentials before the reset, both (n, steps, m), of currents (n, steps, m)."""
     v = torch.zeros_like(current[:, 0])
-    spikes, potentials = [], []
+    found = []
     for t in range(current.shape[1]):
         u = v + current[:, t]
-        fires = u - threshold >= 0
-        v = torch.where(fires, 0.0, u)
-        spikes.append(fires.to(u.dtype))
-        potentials.append(u)
-    return torch.stack(spikes, dim=1), torch.stack(potentials, dim=1)
+        v = torch.where(u - threshold >= 0, 0.0, u)
+        found.append(u)
+    potentials = torch.stack(found, dim=1)
+    return (potentials - threshold >= 0).to(potentials.dtype), potentials
 
 
 def _backward(
