@@ -6,6 +6,7 @@ between two trials; what was made until then is kept, and the next run makes the
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -25,8 +26,9 @@ from storage.streams import Json
 if TYPE_CHECKING:
     from flows.running.cluster import Cluster
 
-FEW = 3
-"""Trials for which starting processes (about two seconds each) gains nothing."""
+START_S = 3.0
+"""Work goes on in this process for so long before others are started, which takes as long: what is
+short is done by then, and what is long takes two starts at the most."""
 Make = Callable[[Recording, Any], Any]
 """Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
 module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
@@ -146,23 +148,25 @@ def each_trial(
     Args:
         done: called with the number of an item of `work` and what came of it.
         processes: without a cluster, use all cores; False where `make` does that by itself, or
-            takes less time than starting processes, which is never done for a `FEW`.
+            takes little time. Either way the first ones are made here, for `START_S`.
     """
-    if cluster is None and (not processes or len(work) <= FEW):
-        for number, item in enumerate(work):
-            done(number, make(item.recording, item.settings))
-        return
+    here = 0
+    if cluster is None:
+        began = time.monotonic()
+        while here < len(work) and not (processes and time.monotonic() - began >= START_S):
+            done(here, make(work[here].recording, work[here].settings))
+            here += 1
     place = place_of(store)
     jobs = [
         _Job(
             place, item.campaign, item.recording.folder.name, item.recording.checksum,
             item.recording.clocks_elsewhere, make, item.settings,
         )
-        for item in work
+        for item in work[here:]
     ]  # fmt: skip
     if cluster is not None and jobs:
         cluster.check_store(_find, jobs[0])
-    spread(title, _make, jobs, done, cluster)
+    spread(title, _make, jobs, lambda number, made: done(here + number, made), cluster)
 
 
 def _find(job: _Job) -> None:

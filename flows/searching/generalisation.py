@@ -30,7 +30,6 @@ from flows.learning.window_scores import owners, whose
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
 from flows.searching.other_rig import other_order
-from flows.syncing.sync import sync
 from protocols.errors import InputError
 from protocols.hashing import hash_integer
 from protocols.quantity import level_order
@@ -188,7 +187,6 @@ class Generalisation:
             change = {"mock": {"scene": {"skin": {"seed": seed}}}}
             collect(other_order(item, change, folder, most=missing))
         campaigns = collected(store)
-        sync(store, campaigns)
         label(store, campaigns)
         samples, place, _ = all_samples(store, campaigns)
         return samples, place

@@ -37,7 +37,6 @@ from flows.searching.guess_changes import AS_IT_IS, NAMES, figures
 from flows.searching.other_rig import other_order
 from flows.searching.scene_runs import sample_trials
 from flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
-from flows.syncing.sync import sync
 from protocols.errors import InputError
 from protocols.settings import Detection
 from rigs.rig_file import load_rig_file
@@ -150,7 +149,6 @@ class Guesses:
         for order in orders:
             collect(order)
         campaigns = collected(store, [order.campaign for order in orders])
-        sync(store, campaigns)
         label(store, campaigns)
         found = self._judge(store, campaigns)
         value = None

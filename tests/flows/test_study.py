@@ -329,7 +329,7 @@ def test_the_same_seed_gives_the_same_summary(
     ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(trial_work, "FEW", 8)  # here without processes, and still the same
+    monkeypatch.setattr(trial_work, "START_S", 0.0)  # all in processes, and still the same
     orders = [make_order(Path(order.plan.file), rig_path, tmp_path / "store") for order in ran[0]]
     study(orders)
     first, second = (read_summary(Store.open(folder)) for folder in (

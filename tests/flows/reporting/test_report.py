@@ -23,7 +23,6 @@ from flows.reporting.report import read_summary, report, write_figures
 from flows.reporting.report_against import compare
 from flows.reporting.report_extras import FILES
 from flows.reporting.report_trials import OUTCOMES, Conditions, accounted, intervals, told
-from flows.running import trial_work
 from flows.running.campaigns import collected
 from flows.searching.tradeoff_page import ERRORS
 from flows.study import Outcome
@@ -286,10 +285,7 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     assert list(data.iterdir()) == []  # an older report's figures go
 
 
-def test_wear_is_the_slope_of_reference_trials(
-    tmp_path: Path, rig_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(trial_work, "FEW", 8)  # here, without processes
+def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
     rows = [
         {"trial": str(k), "place": 1 + 10 * k, "hold_events_per_s": 1000.0 + 2 * k,
          "first_slip_ms": None if k else 900.0}

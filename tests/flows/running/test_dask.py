@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import signal
@@ -50,7 +51,7 @@ def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
     folder = tmp_path_factory.mktemp("here") / "store"
     shutil.copytree(taken, folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trial_work, "FEW", 6)
+        patch.setattr(trial_work, "START_S", math.inf)
         return run_steps(folder, None)
 
 

@@ -18,7 +18,7 @@ from flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
 from flows.searching.guesses import Guesses, Setting, measure_guesses
 from flows.study import Outcome
 from storage.derived import Derived
-from storage.files import read_json
+from storage.files import read_json, write_json
 from storage.store import Store, StoreError
 from tests.command_line import here
 
@@ -82,7 +82,8 @@ def test_stopped_between_two_settings_it_goes_on(
 ) -> None:
     shutil.copytree(store.folder, tmp_path / "store")
     other = Store.open(tmp_path / "store")
-    (other.folder / "derived/guesses/results.json").unlink()
+    file = other.folder / "derived/guesses/results.json"
+    write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
     first = Guesses.measure
 
     def stopped(self: Guesses, setting: Setting) -> None:
