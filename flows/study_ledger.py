@@ -22,6 +22,9 @@ FILE = "study.json"
 TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"
 LEAST, MOST = 0.2, 5.0
 """Limits of how much longer or shorter than expected the rest may take by what is over."""
+BELIEF_S = 60.0
+"""So much work as expected is taken for seen already: the first step also compiles the kernels,
+once in an installation, and says little about the others if it is short."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,7 @@ class Ledger:
         """Seconds that the steps to do and to go on with will take, by all that is known."""
         over = [r for r in self._rows.values() if r.state == DONE and r.seconds > 0]
         expected = sum(row.expected_s for row in over)
-        pace = sum(row.seconds for row in over) / expected if expected else 1.0
+        pace = (sum(row.seconds for row in over) + BELIEF_S) / (expected + BELIEF_S)
         pace = min(max(pace, LEAST), MOST)
         return sum(
             max(row.expected_s * pace - row.seconds, 0.0)

@@ -39,7 +39,7 @@ def test_a_study_from_its_beginning_to_its_end(tmp_path: Path) -> None:
         assert [row.state for row in read(tmp_path)] == [RUNNING, TO_DO, TO_DO]
         clock.now += 50.0  # twice as fast as expected
         tell("10 trials taken", True)
-    assert ledger.left_s() == pytest.approx(125.0)
+    assert ledger.left_s() == pytest.approx(250.0 * (50 + 60) / (100 + 60))
     with ledger.step("label") as tell:
         clock.now += 25.0
         tell("10 trials", True)
@@ -70,7 +70,7 @@ def test_a_step_that_was_stopped_adds_up(tmp_path: Path) -> None:
         clock.now += 90.0
         tell("6 trials taken", True)
     assert read(tmp_path)[0].seconds == 120.0
-    assert again.left_s() == pytest.approx(250.0 * 1.2)
+    assert again.left_s() == pytest.approx(250.0 * (120 + 60) / (100 + 60))
 
 
 def test_a_step_with_nothing_to_do_costs_nothing_and_keeps_what_it_cost(tmp_path: Path) -> None:
@@ -78,12 +78,27 @@ def test_a_step_with_nothing_to_do_costs_nothing_and_keeps_what_it_cost(tmp_path
     for worked in (True, False):
         ledger = spend(tmp_path, clock, 40.0, worked)
         assert read(tmp_path)[0].seconds == 40.0
-    assert ledger.left_s() == pytest.approx(250.0 * 0.4)
+    assert ledger.left_s() == pytest.approx(250.0 * (40 + 60) / (100 + 60))
 
 
 def test_what_is_left_is_never_beyond_reason(tmp_path: Path) -> None:
     ledger = spend(tmp_path, Clock(), 1e6)
     assert ledger.left_s() == 5 * 250.0
+
+
+def test_a_short_first_step_says_little_about_the_rest(tmp_path: Path) -> None:
+    clock = Clock()
+    ledger = Ledger(tmp_path, {"collect": 15.0, "train": 60.0}, clock)
+    with ledger.step("collect") as tell:
+        clock.now += 75.0  # a minute of it compiled what is compiled once
+        tell("36 trials taken", True)
+    assert ledger.left_s() == pytest.approx(60.0 * (75 + 60) / (15 + 60))
+    long = Ledger(tmp_path / "long", {"collect": 15000.0, "train": 60.0}, clock)
+    (tmp_path / "long").mkdir()
+    with long.step("collect") as tell:
+        clock.now += 30000.0
+        tell("864 trials taken", True)
+    assert long.left_s() == pytest.approx(120.0, rel=0.01)
 
 
 def test_no_study_no_rows(tmp_path: Path) -> None:
