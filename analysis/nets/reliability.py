@@ -23,8 +23,9 @@ FloatArray = npt.NDArray[np.float64]
 BINS = 15
 """Of equal width, for the expected calibration error, as Guo et al. take them."""
 
-MOST = 40
-"""Leads of so many spikes and more share a row."""
+EDGES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Leads of a row, from each of these to the next: half octaves, so that rows have windows enough,
+and the usual margins (2 with one output neuron a class, 8 with four) begin one."""
 
 _TEMPERATURES = (1e-2, 1e3)
 
@@ -53,26 +54,28 @@ def wilson(right: int, n: int, level: float = 0.95) -> tuple[float, float]:
     return (0.0 if not right else low), (1.0 if right == n else high)
 
 
-def by_lead(counts: Counts, labels: Labels, most: int = MOST) -> list[dict[str, Any]]:
-    """Share right for each lead in whole spikes, from 0 (a tie, no winner, never right) up.
+def by_lead(counts: Counts, labels: Labels) -> list[dict[str, Any]]:
+    """Share right by lead in whole spikes, from 0 (a tie, no winner, never right) up.
 
     Returns:
-        a row for each lead that occurs: ``lead``, ``or_more`` (the last row may gather), ``n``,
-        ``right``, ``share``, and Wilson's 95 % interval ``low`` and ``high``, which takes windows
-        for independent of each other.
+        a row for each of `EDGES` with windows: ``lead`` and ``to``, the least and the most of it
+        (None: and more), ``n``, ``right``, ``share``, and Wilson's 95 % interval ``low`` and
+        ``high``, which takes windows for independent of each other.
     """
     counts, labels = check(counts, labels)
-    by = np.minimum(lead(counts), most)
+    by = lead(counts)
+    place = np.searchsorted(EDGES, by, side="right") - 1
     right = (by > 0) & (counts.argmax(axis=1) == labels)
     rows = []
-    for value in np.unique(by).tolist():
-        there = by == value
+    for group in np.unique(place).tolist():
+        there = place == group
         n, hits = int(there.sum()), int(right[there].sum())
         low, high = wilson(hits, n)
         rows.append(
             {
-                "lead": int(value), "or_more": value == most, "n": n, "right": hits,
-                "share": hits / n, "low": low, "high": high,
+                "lead": EDGES[group],
+                "to": EDGES[group + 1] - 1 if group + 1 < len(EDGES) else None,
+                "n": n, "right": hits, "share": hits / n, "low": low, "high": high,
             }
         )  # fmt: skip
     return rows

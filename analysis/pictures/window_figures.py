@@ -23,11 +23,11 @@ def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
         figure, (top, low) = plt.subplots(
             2, 1, figsize=(6.2, 3.8), sharex=True, height_ratios=(2.2, 1)
         )
-        leads = [row["lead"] for row in rows]
+        places = range(len(rows))
         shares = np.array([row["share"] for row in rows])
         off = np.array([[row["share"] - row["low"], row["high"] - row["share"]] for row in rows])
         top.errorbar(
-            leads,
+            places,
             100 * shares,
             yerr=100 * off.T.clip(0),
             fmt="o",
@@ -38,13 +38,19 @@ def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
         )
         top.set_ylabel("windows called\nrightly (%)")
         top.set_ylim(-3, 103)
-        low.bar(leads, [row["n"] for row in rows], color=GREY, width=0.7)
+        low.bar(places, [row["n"] for row in rows], color=GREY, width=0.7)
         low.set_ylabel("windows")
         low.set_xlabel("lead of the winner over the next class (spikes)")
         low.set_xticks(
-            leads, [f"≥ {row['lead']}" if row["or_more"] else row["lead"] for row in rows]
+            places, [_from_to(row["lead"], row["to"]) for row in rows], fontsize="x-small"
         )
         return svg_text(figure, simulated)
+
+
+def _from_to(least: int, most: int | None) -> str:
+    if most is None:
+        return f"≥ {least}"
+    return str(least) if most == least else f"{least}–{most}"
 
 
 def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simulated: bool) -> str:

@@ -13,7 +13,7 @@ from analysis.detect.smoothing_choice import settled
 from analysis.nets.dataset import SampleSet
 from flows.labelling.label_errors import label_errors, rules_compared
 from flows.labelling.reviewed import Labels
-from flows.learning import counting
+from flows.learning import counting, window_scores
 from flows.learning.counting import COUNTS, count_spikes
 from flows.learning.detector_trials import hear_trials, heard_step
 from flows.learning.detector_work import DetectorWork, detector_work
@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from flows.running.cluster import Cluster
 
 STEP = "evaluation"
-VERSION = 2
+VERSION = 3
 NAME = "evaluation"
+FORMAT = [VERSION, window_scores.VERSION]
+"""Stands in an evaluation, so that who reads it knows that its keys are those of today."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,24 @@ def make_job(
     return Job(store, campaigns, labels, model, models, detection, trials, detectors, key, cluster)
 
 
+def evaluation_of(store: Store) -> tuple[str, dict[str, Any]]:
+    """The store's evaluation with its key.
+
+    Raises:
+        StoreError: there is none, or another version of the program made it.
+    """
+    kept = Derived.of(store, STEP)
+    key = kept.key(NAME)
+    if key is None:
+        raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+    found = kept.read(NAME)
+    if found.get("format") != FORMAT:
+        raise StoreError(
+            f"{store.folder}: evaluated by another version of this program; run `sliplab evaluate`"
+        )
+    return key, found
+
+
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
 def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
@@ -128,6 +148,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     ours = job.detection[training_campaigns(job.campaigns)[0].name]
     rows = _score_trials(job, detection)
     result = {
+        "format": FORMAT,
         "seed": job.model.seed,
         "windows": score_windows(job, train, test),
         "trials": rows,

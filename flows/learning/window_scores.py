@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from flows.labelling.reviewed import Labels
     from flows.learning.evaluate import Job
 
-VERSION = 1
+VERSION = 2
 STEP = "windows"
 """The network's counts of the test windows are kept under it, for what is compared later."""
 NAME = "test"

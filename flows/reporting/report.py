@@ -29,7 +29,7 @@ from flows.running.orchestration import Parcel, run
 from flows.syncing.sync_page import PAGE as CLOCKS
 from storage.derived import Derived, make_key
 from storage.files import make_folder, read_json, write_json, write_text
-from storage.store import Store, StoreError, safe_name
+from storage.store import Store, safe_name
 
 STEP = "report"
 VERSION = 6
@@ -44,11 +44,9 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
     """What the report is made of: the evaluation, all that was collected, a page to link to.
 
     Raises:
-        StoreError: there is no evaluation yet.
+        StoreError: there is no evaluation of this version yet.
     """
-    evaluated = Derived.of(store, evaluate.STEP).key(evaluate.NAME)
-    if evaluated is None:
-        raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+    evaluated, _ = evaluate.evaluation_of(store)
     collected = [
         [
             item.name,
@@ -73,7 +71,7 @@ def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
     with timing.timed(store, "report"):
-        evaluation = Derived.of(store, evaluate.STEP).read(evaluate.NAME)
+        _, evaluation = evaluate.evaluation_of(store)
         model = evaluate.choose_model(
             wanted_models(store, campaigns, evaluation.get("reviewed") is not None)
         )

@@ -212,7 +212,8 @@ def _tenths(tenths: Json) -> dict[str, list[object]]:
 
 def _leads(rows: list[Json]) -> dict[str, list[object]]:
     headings = {
-        "lead": "lead (spikes)",
+        "lead": "lead, from (spikes)",
+        "to": "lead, to (spikes)",
         "n": "windows",
         "share": "right (share)",
         "low": "95 % interval, low (share)",

@@ -40,7 +40,7 @@ from flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_o
 from protocols.errors import InputError
 from protocols.settings import Detection
 from rigs.rig_file import load_rig_file
-from storage.derived import Derived, make_key
+from storage.derived import make_key
 from storage.files import read_json, write_json
 from storage.recording import Recording
 from storage.store import Store, StoreError
@@ -81,12 +81,9 @@ class Guesses:
         self.folder = store.folder / "derived" / STEP
         if not all(item.info.get("simulated") for item in campaigns):
             raise StoreError(f"{store.folder}: holds real trials; only simulated ones have guesses")
-        evaluated = Derived.of(store, evaluate.STEP)
-        if evaluated.key(evaluate.NAME) is None:
-            raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+        _, evaluated = evaluate.evaluation_of(store)
         self.detection = {
-            name: Detection.model_validate(value)
-            for name, value in evaluated.read(evaluate.NAME)["detection"].items()
+            name: Detection.model_validate(value) for name, value in evaluated["detection"].items()
         }
         self.model = choose_model(wanted_models(store, campaigns))
         self.trials = {item.name: self._chosen(item, trials) for item in campaigns}

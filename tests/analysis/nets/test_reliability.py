@@ -38,9 +38,18 @@ def test_leads_are_counted_by_hand() -> None:
     counts = np.array([[3, 3, 0], [0, 0, 0], [5, 4, 0], [2, 3, 0], [9, 0, 0], [0, 14, 1]])
     labels = np.array([0, 0, 0, 0, 0, 1])
     assert lead(counts).tolist() == [0, 0, 1, 1, 9, 13]
-    rows = [(r["lead"], r["n"], r["right"], r["or_more"]) for r in by_lead(counts, labels, 10)]
+    rows = [(r["lead"], r["to"], r["n"], r["right"]) for r in by_lead(counts, labels)]
     # a tie is never right, whichever class argmax would take
-    assert rows == [(0, 2, 0, False), (1, 2, 1, False), (9, 1, 1, False), (10, 1, 1, True)]
+    assert rows == [(0, 0, 2, 0), (1, 1, 2, 1), (8, 11, 1, 1), (12, 15, 1, 1)]
+
+
+def test_the_usual_margins_begin_a_row_and_the_last_is_open() -> None:
+    leads = np.array([0, 1, 2, 7, 8, 95, 96, 240])
+    counts = np.stack([leads, np.zeros(8, int), np.zeros(8, int)], axis=1)
+    rows = by_lead(counts, np.zeros(8, int))
+    assert [(r["lead"], r["to"], r["n"]) for r in rows] == [
+        (0, 0, 1), (1, 1, 1), (2, 2, 1), (6, 7, 1), (8, 11, 1), (64, 95, 1), (96, None, 2),
+    ]  # fmt: skip
 
 
 def test_temperature_has_a_closed_form_for_one_kind_of_lead() -> None:

@@ -27,7 +27,7 @@ from flows.running.campaigns import collected
 from flows.searching.tradeoff_page import ERRORS
 from flows.study import Outcome
 from storage.derived import Derived
-from storage.files import write_json
+from storage.files import read_json, write_json
 from storage.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
@@ -283,6 +283,15 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     assert absent.commands[0][0].startswith("sliplab tradeoff --scene PROTOCOL --out ")
     write_figures(other.folder / "report", [absent], simulated=True)
     assert list(data.iterdir()) == []  # an older report's figures go
+
+
+def test_an_evaluation_of_another_version_is_refused_by_name(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    path = other.folder / "derived" / "evaluation" / "evaluation.json"
+    write_json(path, {**read_json(path), "format": [1, 1]})
+    with pytest.raises(StoreError, match=r"another version.*sliplab evaluate"):
+        report(other, collected(other))
 
 
 def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
