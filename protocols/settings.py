@@ -198,7 +198,7 @@ class Detection(StrictModel):
     """What `choose` tries: every smoothing with every margin. By default from a half to eight
     for each of a class's output neurons."""
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)
-    """Share of trials that a choice may leave false early."""
+    """Share of trials that a choice may leave false early, and as many missed."""
     compare: Comparison | None = Comparison()
     """Other detectors beside this rule (docs/detection.md); null leaves them out."""
 

@@ -134,26 +134,26 @@ def choose_pair(
 
     Args:
         found: int64 (n, smoothings, margins, 2), n at least 1.
-        rate: share of the trials that may be false early, for either onset.
+        rate: share of the trials that may be false early, and missed, for either onset.
     """
     incipient, gross = found[..., 0], found[..., 1]
     true = trials.incipient_ns[:, None, None]
     tolerance = trials.tolerance_ns[:, None, None]
     early = incipient < true - tolerance
     early_gross = gross < trials.gross_ns[:, None, None] - tolerance
-    missed = incipient == NEVER
+    missed, missed_gross = incipient == NEVER, gross == NEVER
     late = np.where(missed, np.inf, (np.where(missed, true, incipient) - true) / 1e6)
     allowed = allowed_early(rate, len(found))
 
     def rank(s: int, m: int) -> tuple[float, ...]:
-        n, n_gross = int(early[:, s, m].sum()), int(early_gross[:, s, m].sum())
+        amiss = [int(e[:, s, m].sum()) for e in (early, early_gross, missed, missed_gross)]
         values = np.sort(late[:, s, m][~early[:, s, m]])
         median = float(np.median(values)) if values.size else np.inf
         high = np.inf
         if values.size:
             high = float(np.percentile(values, 95, method="inverted_cdf"))
-        excess = max(n - allowed, 0) + max(n_gross - allowed, 0)
-        return excess, median, high, n + n_gross, smoothings[s], -margins[m]
+        excess = sum(max(n - allowed, 0) for n in amiss)
+        return excess, median, high, sum(amiss[:2]), smoothings[s], -margins[m]
 
     pairs = [(s, m) for s in range(len(smoothings)) for m in range(len(margins))]
     return min(pairs, key=lambda pair: rank(*pair))

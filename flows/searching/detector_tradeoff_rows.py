@@ -23,7 +23,7 @@ from flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_strid
 from flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
-MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0, 30.0, 40.0)
 """In spikes for each of a class's output neurons."""
 PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(2.0))
 LOOSE = 0.1

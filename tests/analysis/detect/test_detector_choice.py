@@ -136,6 +136,24 @@ def test_the_bound_holds_for_gross_slip_too() -> None:
     assert (choice.smoothing, choice.false_early, choice.false_early_gross) == (4, 0, 0)
 
 
+def test_a_margin_that_some_trials_never_reach_is_not_chosen() -> None:
+    # two trials slip strongly; the third weakly, less than a stray window's lead
+    quiet, stray, gross = (9, 0, 0), (0, 4, 0), (0, 0, 9)
+
+    def trial(slip: tuple[int, int, int]) -> Counted:
+        rows = [*[quiet] * 3, stray, *[quiet] * 4, *[slip] * 8, *[gross] * 8]
+        one = counted(rows, 8)
+        return Counted(one.counts, one.end_ns, one.incipient_ns, 16 * 30 * MS)
+
+    trials = [trial((0, 9, 0)), trial((0, 9, 0)), trial((0, 3, 0))]
+    ask = Detection(smoothing_grid=(1, 4), margin_grid=(1.0, 5.0), false_early_rate=0.0)
+    choice = choose_smoothing(trials, ask, "validation")
+    assert (choice.smoothing, choice.margin) == (4, 1.0)
+    assert (choice.missed, choice.missed_gross, choice.false_early) == (0, 0, 0)
+    quick = choose_smoothing(trials[:2], ask, "validation")
+    assert (quick.smoothing, quick.margin) == (1, 5.0)
+
+
 def test_where_nothing_keeps_the_bound_the_fewest_are_taken_and_said() -> None:
     trials = [counted([(0, 9, 0)] * 20, 15)] * 3
     ask = Detection(smoothing_grid=(1, 4), margin_grid=(1.0,), false_early_rate=0.1)
