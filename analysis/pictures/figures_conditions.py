@@ -129,7 +129,10 @@ def shares(
             place += 1
         if line is not None:
             axes.axvline(100 * line[0], color=GREY, lw=0.9, ls="--", label=line[1])
-            axes.legend(loc="upper right", fontsize=7.5, bbox_to_anchor=(1, 1.0))
+            axes.legend(
+                loc="upper right", fontsize=7.5, bbox_to_anchor=(1, 1.0),
+                frameon=True, framealpha=1.0, edgecolor="none",
+            )  # fmt: skip
         axes.set_yticks(places, names, fontsize=8)
         axes.set_ylim(place - 0.3, -0.7)
         axes.set_xlabel(label)

@@ -97,8 +97,8 @@ def _tried(result: Mapping[str, Any]) -> Section:
         "pair is 4 windows and 2 spikes for each of a class's output neurons; chosen pairs are "
         "those with the lowest median latency on "
         f"{trials['validation']} validation trials of which at most "
-        f"{percent(result['false_early_rate'], 0)} are false early, for either onset; or at most "
-        f"{percent(LOOSE, 0)}. Figures are "
+        f"{percent(result['false_early_rate'], 0)} are false early and as many missed, for either "
+        f"onset; or at most {percent(LOOSE, 0)}. Figures are "
         f"of {trials['test']} test trials, means over seeds.",
         "Windows of every length lie in the same stretches of a trial. Width is a factor on the "
         "channels of both convolutions and on the hidden neurons.",
