@@ -91,7 +91,7 @@ def list_events(
     most = int((ends - np.searchsorted(times, starts)).clip(min=0).sum())
     offsets = np.zeros(starts.size * settings.steps + 1, np.int64)
     cell, count = np.empty(most, np.uint32), np.empty(most, np.uint8)
-    plane = np.zeros(settings.channels * settings.cells**2, np.uint8)
+    plane = np.zeros(settings.channels * settings.cells**2 + 1, np.uint8)
     state = _list(
         *columns, starts, settings.step_ms * 1000, settings.steps, _CODES[settings.polarity],
         of_x, of_y, settings.cells, plane, np.empty(plane.size, np.uint32), offsets, cell, count,
@@ -209,12 +209,19 @@ def _explain(state: int, columns: _Columns, width: int, height: int) -> None:
 @numba.njit(cache=True, nogil=True)
 def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
     """0, or _UNSORTED, or one plus the index of the first event outside the sensor."""
+    # whole columns without a way out of the loop: the compiler takes many events at once
+    unsorted = False
     for i in range(1, t.size):
-        if t[i] < t[i - 1]:
-            return _UNSORTED
+        unsorted |= t[i] < t[i - 1]
+    if unsorted:
+        return _UNSORTED
+    outside = False
     for i in range(x.size):
-        if x[i] >= width or y[i] >= height:
-            return i + 1
+        outside |= (x[i] >= width) | (y[i] >= height)
+    if outside:
+        for i in range(x.size):
+            if x[i] >= width or y[i] >= height:
+                return i + 1
     return 0
 
 
@@ -257,6 +264,7 @@ def _list(
     state = _fault(x, y, t, of_x.size, of_y.size)
     if state != 0:
         return state
+    both, asked, nowhere = polarity == 2, polarity == 1, plane.size - 1
     e = 0
     for n in range(starts.size):
         end = starts[n]
@@ -267,15 +275,14 @@ def _list(
             while i < t.size and t[i] < end:
                 column, row, positive = of_x[x[i]], of_y[y[i]], p[i] != 0
                 i += 1
-                if column < 0 or row < 0 or (polarity != 2 and positive != (polarity == 1)):
-                    continue
-                channel = 1 if polarity == 2 and positive else 0
-                place = (channel * cells + row) * cells + column
-                if plane[place] == 0:
-                    touched[m] = place
-                    m += 1
-                if plane[place] < 255:
-                    plane[place] += 1
+                # half of the events have the other polarity, in no order that a processor could
+                # guess: they go on a last place that nobody reads, without a branch
+                wanted = (column >= 0) & (row >= 0) & (both | (positive == asked))
+                place = ((both & positive) * cells + row) * cells + column if wanted else nowhere
+                found = plane[place]
+                touched[m] = place
+                m += (found == 0) & wanted
+                plane[place] = found + (found < 255)
             for k in range(m):
                 # few, and nearly sorted: each goes down to where it belongs
                 place = touched[k]
