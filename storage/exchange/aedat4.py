@@ -38,6 +38,8 @@ _MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
 _PACKET_EVENTS = 1 << 16
 _PIECE = 1 << 20
 _ZSTD = 3
+_START_OF_EXPOSURE, _END_OF_EXPOSURE = 3, 4
+"""Fields of a frame."""
 _COLOUR = {16: 3, 24: 4}
 """OpenCV's numbers of 8-bit pictures with three and four channels."""
 
@@ -54,10 +56,10 @@ class Stream:
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame: grey levels (height, width), middle of exposure in us."""
+    """A frame: grey levels (height, width), middle of exposure in ns."""
 
     image: U8
-    t_us: int
+    t_ns: int
 
 
 class Aedat4File:
@@ -133,16 +135,16 @@ class Aedat4File:
         last = -1
         for data in self._packets(number):
             table = Table.root(data, b"FRME")
-            t_us, form = table.number(0, "<q"), table.number(5, "<b")
+            t_ns, form = _middle_ns(table), table.number(5, "<b")
             width, height = table.number(6, "<h"), table.number(7, "<h")
             channels = 1 if form == GREY else _COLOUR.get(form, 0)
             count, pixels = table.vector(10, 1)
             if not channels or width <= 0 or height <= 0 or count != width * height * channels:
                 raise Wrong(f"a frame of {width} x {height} with {count} bytes of kind {form}")
-            if not last <= t_us < LATEST_US:
+            if not last <= t_ns < LATEST_US * 1000:
                 raise Wrong("frames whose times run backwards or are none")
-            last = t_us
-            yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_us)
+            last = t_ns
+            yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
     def _packets(self, number: int) -> Iterator[memoryview]:
         """Unpacked packets of one stream; the others are passed over."""
@@ -164,6 +166,20 @@ class Aedat4File:
         if len(found) != count:
             raise Wrong("is cut short")
         return found
+
+
+def _middle_ns(frame: Table) -> int:
+    """The middle of a frame's exposure; its time stamp where the file has no start and end.
+
+    The time stamp is the start of exposure in what dv-processing writes, and the middle in what
+    older programs write, which leave start and end out.
+    """
+    start, end = frame.number(_START_OF_EXPOSURE, "<q"), frame.number(_END_OF_EXPOSURE, "<q")
+    if start <= 0 or end <= 0:
+        return frame.number(0, "<q") * 1000
+    if end < start:
+        raise Wrong(f"a frame whose exposure starts at {start} us and ends at {end} us")
+    return (start + end) * 500
 
 
 def _length(data: bytes, most: int) -> int:

@@ -40,7 +40,7 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
     def all_frames() -> Iterator[FrameChunk]:
         with Aedat4File(path) as again:
             for number, picture in enumerate(again.pictures(frames or 0)):
-                t_ns = np.full(1, picture.t_us * 1000, np.int64)
+                t_ns = np.full(1, picture.t_ns, np.int64)
                 yield FrameChunk(
                     picture.image[None], np.full(1, number), t_ns, t_ns, np.zeros(1, np.uint8)
                 )

@@ -23,6 +23,7 @@ from storage.catalogue import catalogue
 from storage.derived import Derived
 from storage.exchange import lab_pickles as lab
 from storage.exchange.aedat4 import Aedat4File, Aedat4Writer, Stream
+from storage.exchange.dv_buffers import frame_buffer
 from storage.exchange.find import kind_of, name_of, trials_in
 from storage.exchange.foreign import Triggers
 from storage.exchange.hand_out import hand_out
@@ -162,7 +163,7 @@ def test_dv_processing_reads_what_we_write(tmp_path: Path) -> None:
     assert edges == np.stack([triggers.t_us, triggers.kind], 1).tolist()
     assert size == [640, 480]
     with Aedat4File(path) as file:
-        pictures = [(one.t_us, one.image.tolist()) for one in file.pictures(1)]
+        pictures = [(one.t_ns // 1000, one.image.tolist()) for one in file.pictures(1)]
     assert [(t, image) for t, image in frames] == pictures
 
 
@@ -184,6 +185,61 @@ def test_we_read_what_dv_processing_writes(tmp_path: Path) -> None:
         np.testing.assert_array_equal(reader.pulses("event_pulses"), (10**15 + np.arange(4)) * 1000)
 
 
+_EXPOSED_BY_DV = """
+import sys, datetime, numpy as np, dv_processing as dv
+config = dv.io.MonoCameraWriter.Config("theirs")
+config.addEventStream((640, 480)); config.addFrameStream((32, 24))
+writer = dv.io.MonoCameraWriter(sys.argv[1], config)
+store = dv.EventStore()
+store.push_back(10**15, 1, 1, True)
+writer.writeEvents(store)
+for start, exposure in ((0, 20_000), (50_000, 1_001), (100_000, 0)):
+    frame = dv.Frame(10**15 + start, np.zeros((24, 32), np.uint8))
+    frame.exposure = datetime.timedelta(microseconds=exposure)
+    writer.writeFrame(frame)
+"""
+
+
+def test_a_frame_is_at_the_middle_of_its_exposure(tmp_path: Path) -> None:
+    """dv-processing's `timestamp` is the start of exposure; start and end are in the file."""
+    path = tmp_path / "theirs.aedat4"
+    _by_library(_EXPOSED_BY_DV, path)
+    found = _import(tmp_path / "store", path).campaign("theirs").recording("theirs")
+    middles = 10**15 + np.array([10_000, 50_500, 100_000])
+    np.testing.assert_array_equal(found.frame_times(), middles * 1000 + [0, 500, 0])
+
+
+@pytest.mark.parametrize(
+    ("fields", "middle"),
+    [
+        ({0: 70, 3: 40, 4: 60}, 50_000),  # an older file: `timestamp` is something else
+        ({0: 70}, 70_000),
+        ({0: 70, 3: 40}, 70_000),  # no end
+    ],
+)
+def test_the_middle_of_exposure_in_older_files(
+    tmp_path: Path, fields: dict[int, int], middle: int
+) -> None:
+    path = tmp_path / "old.aedat4"
+    with Aedat4Writer(path, {0: Stream("FRME", "frames", (1, 1), "x")}) as file:
+        times = struct.pack("<5q", *(fields.get(n, 0) for n in range(5)))
+        made = frame_buffer(np.zeros((1, 1), np.uint8), 99)
+        file._write(0, made.replace(struct.pack("<5q", *(5 * [99])), times))
+    with Aedat4File(path) as file:
+        assert [one.t_ns for one in file.pictures(0)] == [middle]
+
+
+def test_an_exposure_that_ends_before_it_starts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.aedat4"
+    streams = {0: Stream("EVTS", "e", (8, 6), "x"), 1: Stream("FRME", "f", (1, 1), "x")}
+    with Aedat4Writer(path, streams) as file:
+        made = frame_buffer(np.zeros((1, 1), np.uint8), 99)
+        times = struct.pack("<5q", 99, 0, 0, 60, 40)
+        file._write(1, made.replace(struct.pack("<5q", *(5 * [99])), times))
+    with pytest.raises(InputError, match=r"bad\.aedat4.*exposure.* 60 .* 40 us"):
+        _import(tmp_path / "store", path)
+
+
 def test_aedat4_goes_round_with_every_trigger(tmp_path: Path) -> None:
     events, triggers = _aedat4(tmp_path / "a.aedat4")
     made = _import(tmp_path / "store", tmp_path / "a.aedat4")
@@ -198,7 +254,7 @@ def test_aedat4_goes_round_with_every_trigger(tmp_path: Path) -> None:
         times = np.concatenate([chunk.t_us for chunk in file.events(0)])
         np.testing.assert_array_equal(times, events.t_us)
         for mine, yours in zip(was.pictures(1), file.pictures(1), strict=True):
-            assert mine.t_us == yours.t_us
+            assert mine.t_ns == yours.t_ns
             np.testing.assert_array_equal(mine.image, yours.image)
 
 
