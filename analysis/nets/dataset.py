@@ -26,7 +26,7 @@ class SampleSet:
     Attributes:
         windows: event counts (n, steps, channels, cells, cells), sparse.
         y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross.
-        trial: int64 (n,), index of the trial each sample came from.
+        trial: int64 (n,), place of each sample's trial in the list of trials that was asked for.
         start_ns: int64 (n,), start of each window on its trial's time line.
     """
 

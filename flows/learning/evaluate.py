@@ -97,7 +97,7 @@ def make_job(
     change = {name: value for name, value in change.items() if value is not None}
     if change:
         change["choose"] = "protocol"
-    detection, trials, inputs = {}, [], [key_inputs(models)]
+    detection, trials, inputs = {}, [], [key_inputs(models, campaigns)]
     for item in campaigns:
         detection[item.name] = Detection.model_validate(
             {**item.settings.detection.model_dump(), **change}

@@ -14,6 +14,7 @@ from analysis.nets.dataset import SampleSet
 from flows.labelling.reviewed import Labels
 from flows.running.campaigns import Collected, training_campaigns
 from flows.running.trial_work import TrialWork, each_trial
+from protocols import Trial
 from protocols.hashing import hash_integer
 from protocols.settings import Samples, Windows
 from storage.derived import Derived, make_key
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
     from flows.running.cluster import Cluster
 
 STEP = "samples"
+_FORMAT = "numbered by place"
+"""Samples once had their trial's number in its campaign, which another campaign has, too."""
+
+TrialRef = tuple[Collected, Trial, Recording]
+"""A trial with its campaign and its recording."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,26 @@ class _Wanted:
     seed: int
 
 
+def split_trials(campaigns: list[Collected], split: str) -> list[TrialRef]:
+    """Return the trials of a split; `SampleSet.trial` of `load_samples` is the place in this list.
+
+    A trial without an onset gives no samples, and keeps its place.
+    """
+    return [
+        (item, trial, found)
+        for item in training_campaigns(campaigns)
+        for trial, found in item.of_split(split)
+    ]
+
+
+def several(campaigns: list[Collected]) -> list[str]:
+    """Return an extra input for the key of a result that tells windows apart by their trial.
+
+    Empty for one campaign: only with several was a window ever given to the wrong trial.
+    """
+    return [_FORMAT] if len(training_campaigns(campaigns)) > 1 else []
+
+
 def load_samples(
     labels: Labels, campaigns: list[Collected], split: str, cluster: Cluster | None = None
 ) -> SampleSet:
@@ -46,17 +72,20 @@ def load_samples(
     """
     used = training_campaigns(campaigns)
     windows = used[0].settings.windows
+    trials = split_trials(used, split)
     inputs = [
-        [item.name, trial.id, trial.index, recording.checksum, labels.key(item, recording)]
-        for item in used
-        for trial, recording in item.of_split(split)
+        [_FORMAT],
+        *(
+            [item.name, trial.id, trial.index, recording.checksum, labels.key(item, recording)]
+            for item, trial, recording in trials
+        ),
     ]
     settings = [item.settings.samples.model_dump(mode="json") for item in used]
     key = make_key(STEP, dataset.VERSION, inputs, [windows.model_dump(mode="json"), settings])
     kept = Derived.of(labels.store, STEP)
     path = kept.folder / f"{split}.arrays"
     if not (kept.fresh(split, key) and path.exists()):
-        made = _make(labels, used, split, windows, cluster)
+        made = _make(labels, trials, split, windows, cluster)
         kept.folder.mkdir(parents=True, exist_ok=True)
         made.save(path)
         kept.write(split, key, {"samples": len(made), "cells": len(made.windows.cell)})
@@ -65,7 +94,7 @@ def load_samples(
 
 def _make(
     labels: Labels,
-    used: list[Collected],
+    trials: list[TrialRef],
     split: str,
     windows: Windows,
     cluster: Cluster | None,
@@ -74,12 +103,11 @@ def _make(
         TrialWork(
             recording, item.name, "",
             _Wanted(
-                labels.read(item, recording), trial.index, windows,
+                labels.read(item, recording), place, windows,
                 item.settings.samples, hash_integer("samples", trial.id),
             ),
         )
-        for item in used
-        for trial, recording in item.of_split(split)
+        for place, (item, trial, recording) in enumerate(trials)
     ]  # fmt: skip
     parts: dict[int, SampleSet] = {}
     each_trial(

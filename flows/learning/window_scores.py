@@ -18,13 +18,11 @@ import numpy.typing as npt
 from analysis.nets import metrics, model_file, reliability, synaptic, training, window_groups
 from analysis.nets.baselines import evaluate_baselines
 from analysis.nets.dataset import SampleSet, recorded_span
-from flows.learning.samples import load_samples
+from flows.learning.samples import TrialRef, load_samples, several, split_trials
 from flows.learning.train import Model, training_settings
-from flows.running.campaigns import Collected, training_campaigns
-from protocols import Trial
+from flows.running.campaigns import Collected
 from storage.derived import Derived
 from storage.files import read_json
-from storage.recording import Recording
 from storage.store import Store
 
 if TYPE_CHECKING:
@@ -36,8 +34,6 @@ STEP = "windows"
 """The network's counts of the test windows are kept under it, for what is compared later."""
 NAME = "test"
 
-Owner = tuple[Collected, Trial, Recording]
-
 
 def score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
     """All figures of the test windows; see docs/metrics.md."""
@@ -46,8 +42,7 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]
     margin = settings.detection.margin
     validation = load_samples(job.labels, job.campaigns, "validation")
     counts = training.predict_counts(fitted, test.windows)
-    known = owners(training_campaigns(job.campaigns), "test")
-    trial = whose(known, test)
+    known, trial = split_trials(job.campaigns, "test"), test.trial
     hits = window_groups.strict_hits(counts, test.y)
     Derived.of(job.store, STEP).write(
         NAME, job.key, {}, {"counts": counts, "y": test.y, "trial": trial}
@@ -79,45 +74,14 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]
     }
 
 
-def owners(campaigns: list[Collected], split: str) -> list[Owner]:
-    """The trials of a split in the order in which their samples stand in a file."""
-    return [(item, trial, found) for item in campaigns for trial, found in item.of_split(split)]
-
-
-def whose(known: Sequence[Owner], samples: SampleSet) -> npt.NDArray[np.int64]:
-    """For each sample the place of its trial in `known`, (n,).
-
-    A sample knows only its trial's number in its campaign, which another campaign may have, too.
-    Samples stand in the order of their trials, so each run of one number belongs to the next trial
-    of that number.
-
-    Raises:
-        ValueError: the samples are not of these trials.
-    """
-    out = np.empty(len(samples), np.int64)
-    if not len(samples):
-        return out
-    edges = np.flatnonzero(np.diff(samples.trial)) + 1
-    place = -1
-    for begin, end in zip([0, *edges], [*edges, len(samples)], strict=True):
-        number = int(samples.trial[begin])
-        place += 1
-        while place < len(known) and known[place][1].index != number:
-            place += 1
-        if place == len(known):
-            raise ValueError(f"samples of the trial with number {number}, which is not there")
-        out[begin:end] = place
-    return out
-
-
-def _named(owner: Owner) -> dict[str, Any]:
-    item, trial, _ = owner
+def _named(of: TrialRef) -> dict[str, Any]:
+    item, trial, _ = of
     return {"campaign": item.name, "trial": trial.id, "condition": item.plan.describe(trial)}
 
 
 def _phases(
     labels: Labels,
-    known: Sequence[Owner],
+    known: Sequence[TrialRef],
     test: SampleSet,
     trial: npt.NDArray[np.int64],
     hits: npt.NDArray[np.float64],
@@ -180,9 +144,9 @@ def _seeds(job: Job, test: SampleSet, margin: float) -> dict[str, Any]:
 _KINDS = ("argmax", "strict", "margin")
 
 
-def key_inputs(models: Sequence[Model]) -> list[Any]:
+def key_inputs(models: Sequence[Model], campaigns: list[Collected]) -> list[Any]:
     """What the figures here depend on, beside the chosen model and the test trials."""
-    return [VERSION, *(model.key for model in models)]
+    return [VERSION, *several(campaigns), *(model.key for model in models)]
 
 
 def compared(

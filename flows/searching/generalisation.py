@@ -24,9 +24,8 @@ from flows.collecting.collect import collect
 from flows.labelling.label import label
 from flows.labelling.reviewed import Labels
 from flows.learning.evaluate import choose_model
-from flows.learning.samples import load_samples
+from flows.learning.samples import load_samples, several, split_trials
 from flows.learning.train import training_settings, wanted_models
-from flows.learning.window_scores import owners, whose
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
 from flows.searching.other_rig import other_order
@@ -67,7 +66,13 @@ class Generalisation:
             self.settings = self.settings.model_copy(update={"training": how})
         self.samples, self.place, self.known = all_samples(store, self.campaigns)
         ids = [[item.name, trial.id, recording.checksum] for item, trial, recording in self.known]
-        self.inputs = [VERSION, dataset.VERSION, ids, self.settings.model_dump(mode="json")]
+        self.inputs = [
+            VERSION,
+            dataset.VERSION,
+            *several(campaigns),
+            ids,
+            self.settings.model_dump(mode="json"),
+        ]
         self.made = 0
 
     def results(self) -> dict[str, Result]:
@@ -198,9 +203,9 @@ def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, I6
     parts, places = [], []
     known: list[Any] = []
     for split in ("train", "validation", "test"):
-        part, of = load_samples(labels, campaigns, split), owners(campaigns, split)
+        part, of = load_samples(labels, campaigns, split), split_trials(campaigns, split)
         parts.append(part)
-        places.append(whose(of, part) + len(known))
+        places.append(part.trial + len(known))
         known += of
     windows = campaigns[0].settings.windows
     return SampleSet.join(parts, windows), np.concatenate(places), known

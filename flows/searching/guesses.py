@@ -26,10 +26,9 @@ from flows.labelling.label import label
 from flows.labelling.reviewed import Labels
 from flows.learning import evaluate
 from flows.learning.evaluate import choose_model
-from flows.learning.samples import load_samples
+from flows.learning.samples import load_samples, several, split_trials
 from flows.learning.train import training_settings, wanted_models
 from flows.learning.trial_scores import score_row, summaries
-from flows.learning.window_scores import owners, whose
 from flows.planning.orders import Order
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
@@ -172,6 +171,7 @@ class Guesses:
         ]
         detection = {name: found.model_dump(mode="json") for name, found in self.detection.items()}
         inputs = [self.model.key, made_of, detection, labelling.VERSION, dataset.VERSION]
+        inputs += several(self.campaigns)
         return make_key(STEP, VERSION, inputs, [setting.parameter, setting.factor])
 
     def _order(self, item: Collected, setting: Setting, folder: Path) -> Order:
@@ -199,8 +199,11 @@ class Guesses:
         hits = window_groups.strict_hits(
             training.predict_counts(self.fitted, samples.windows), samples.y
         )
-        known = owners(used, "test")
-        windows = _by_trial(hits, whose(known, samples), [trial.id for _, trial, _ in known])
+        known = split_trials(used, "test")
+        names = [
+            f"{item.name}/{trial.id}" if several(used) else trial.id for item, trial, _ in known
+        ]
+        windows = _by_trial(hits, samples.trial, names)
         return {"windows": windows, "trials": rows, "experiments": summaries(rows)}
 
     def _hear(

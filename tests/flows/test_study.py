@@ -22,9 +22,8 @@ from flows.labelling.label_errors import read_check
 from flows.labelling.reviewed import Labels
 from flows.learning import window_baselines, window_checks
 from flows.learning.evaluate import evaluate
-from flows.learning.samples import load_samples
+from flows.learning.samples import load_samples, split_trials
 from flows.learning.train import train
-from flows.learning.window_scores import owners, whose
 from flows.planning.orders import Order, make_order
 from flows.reporting.report import read_summary, report
 from flows.running import trial_work
@@ -194,8 +193,7 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(
     found: dict[str, set[tuple[str, str]]] = {}
     for split in ("train", "validation", "test"):
         samples = load_samples(Labels(store), used, split)
-        known = owners(used, split)
-        of = whose(known, samples)
+        known, of = split_trials(used, split), samples.trial
         for k in np.unique(of).tolist():
             item, trial, recording = known[k]
             start, end = recorded_span(recording)

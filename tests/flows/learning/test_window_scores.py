@@ -1,32 +1,84 @@
-"""Whose a sample is, where campaigns number their trials alike."""
+"""Windows of several campaigns in one evaluation, where campaigns number their trials alike."""
 
-from types import SimpleNamespace
-from typing import Any
+from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from analysis.nets.dataset import SampleSet
-from analysis.nets.sparse import SparseWindows
-from flows.learning.window_scores import whose
+from flows.collecting.collect import collect
+from flows.labelling.label import label
+from flows.labelling.reviewed import Labels
+from flows.learning.evaluate import evaluate, evaluation_of
+from flows.learning.samples import load_samples, split_trials
+from flows.learning.train import train
+from flows.learning.window_scores import kept_counts
+from flows.planning.orders import make_order
+from flows.running.campaigns import collected
+from storage.review import Onsets, decide
+from storage.store import Store
+from tests.flows.conftest import tiny, write
 
 
-def samples(numbers: list[int]) -> SampleSet:
-    n = len(numbers)
-    x = SparseWindows.of(np.zeros((n, 1, 1, 2, 2), np.uint8))
-    return SampleSet(x, np.zeros(n, np.int64), np.array(numbers, np.int64), np.arange(n))
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
+    """Two campaigns with trials of the same numbers; a person rejected a test trial of the first.
+
+    The rejected one is the last of its campaign that has samples to give, so that the next sample
+    in the file is of the other campaign.
+    """
+    folder = tmp_path_factory.mktemp("two")
+    for name in ("first", "second"):
+        data = tiny()
+        data["name"] = name
+        data["analysis"]["training"] = {"epochs": 1}
+        collect(make_order(write(folder / f"{name}.yaml", data), rig_path, folder / "store"))
+    store = Store.open(folder / "store")
+    campaigns = collected(store)
+    label(store, campaigns)
+    rejected, recording = list(campaigns[0].of_split("test"))[-1]
+    decide(
+        store, "first", rejected.id, "reject",
+        label=Labels(store).key(campaigns[0], recording), old=Onsets(), new=Onsets(), seen=0,
+        who="a person", why="the skin was dirty",
+    )  # fmt: skip
+    train(store, campaigns, reviewed=True)
+    return store
 
 
-def trials(numbers: list[int]) -> list[Any]:
-    return [(None, SimpleNamespace(index=number), None) for number in numbers]
+def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> None:
+    campaigns = collected(two)
+    assert [t.index for t, _ in campaigns[0].of_split("test")] == [
+        t.index for t, _ in campaigns[1].of_split("test")
+    ]
+    assert evaluate(two, campaigns, reviewed=True)["done"] == 1
+    key, found = evaluation_of(two)
+    first, second = ([t.id for t, _ in item.of_split("test")] for item in campaigns)
+    rows = {(row["campaign"], row["trial"]): row["n"] for row in found["windows"]["by_trial"]}
+    expected = {("first", first[0]), *(("second", name) for name in second)}
+    assert rows.keys() == expected
+    kept = kept_counts(two, key)
+    assert kept is not None
+    labels = Labels(two, reviewed=True)
+    for place, (item, trial, recording) in enumerate(split_trials(campaigns, "test")):
+        ours = int(np.count_nonzero(kept["trial"] == place))
+        assert ours == rows.get((item.name, trial.id), 0)
+        onset = labels.read(item, recording)["incipient_ns"]
+        assert (onset is None) == (ours == 0)
 
 
-def test_samples_belong_to_the_next_trial_of_their_number() -> None:
-    known = trials([0, 3, 5, 0, 5])  # two campaigns; the trial 3 gave no samples
-    assert whose(known, samples([0, 0, 5, 0, 0, 5])).tolist() == [0, 0, 2, 3, 3, 4]
-    assert whose(known, samples([])).tolist() == []
-
-
-def test_samples_of_no_trial_are_refused() -> None:
-    with pytest.raises(ValueError, match="number 4"):
-        whose(trials([0, 3]), samples([0, 4]))
+def test_each_sample_says_its_trial(two: Store) -> None:
+    """The last window of no slip ends at the onset of its own trial."""
+    campaigns = collected(two)
+    labels = Labels(two, reviewed=True)
+    for split in ("train", "validation", "test"):
+        samples = load_samples(labels, campaigns, split)
+        length_ns = campaigns[0].settings.windows.length_ms * 1_000_000
+        for place, (item, _, recording) in enumerate(split_trials(campaigns, split)):
+            onset = labels.read(item, recording)["incipient_ns"]
+            still = samples.start_ns[(samples.trial == place) & (samples.y == 0)]
+            if onset is None:
+                assert not len(still)
+            else:
+                assert still.max() + length_ns == onset
