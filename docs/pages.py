@@ -103,7 +103,10 @@ def commands() -> str:
         "",
         "Every command takes `--json`: one JSON object on standard output, everything else on",
         "standard error. Exit codes: 0 done, 1 it ran and failed, 2 the input was wrong (the",
-        "message names file, key, value and what would be right), 130 interrupted.",
+        "message names file, key, value and what would be right; a missing store is wrong input),",
+        "130 interrupted. With `--json` a command that ends before it has a result prints",
+        '`{"error": {"file", "key", "value", "message", "exit_code"}}`, null where nothing is',
+        "known; `key` is the option or argument where no file is wrong.",
         "",
     ]
     for words, command in _walk("sliplab", typer.main.get_command(app)):

@@ -28,6 +28,10 @@ class InputError(ValueError):
         self.expected = expected
         super().__init__(self.message)
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str | None, ...]]:
+        """Its own arguments: it may come from another process."""
+        return type(self), (self.file, self.key, self.value, self.expected)
+
     @property
     def message(self) -> str:
         """``file: key = value: expected`` in one line."""

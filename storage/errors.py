@@ -7,11 +7,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from protocols.errors import InputError
 from storage.files import disk_fault, disk_full
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be used as asked; the message names the path and what to do."""
+    """A store cannot be used as asked; the message begins with the path and says what to do."""
+
+
+class NoStore(InputError, StoreError):
+    """The path or URL of a store was given, and no store can be there: wrong input.
+
+    Args:
+        place: as it was given.
+        why: what is there instead, and what to do.
+    """
+
+    def __init__(self, place: Path | str, why: str) -> None:
+        super().__init__(place, "", None, why)
+
+    def __reduce__(self) -> tuple[type[NoStore], tuple[str, ...]]:
+        """Its own arguments: it may come from another process."""
+        return type(self), (str(self.file), self.expected)
 
 
 def disk_error(folder: Path, error: BaseException) -> StoreError | None:

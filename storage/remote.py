@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from protocols.errors import InputError
-from storage.errors import StoreError
+from storage.errors import NoStore, StoreError
 from storage.files import json_text, make_folder, read_blocks, write_blocks
 from storage.streams import Json
 from storage.urls import check_url
@@ -40,6 +40,10 @@ class RemoteError(StoreError):
 
 class RemoteMissing(RemoteError):
     """An object is not there."""
+
+
+class NoPushedStore(NoStore, RemoteMissing):
+    """Nothing was ever pushed to the URL that was given."""
 
 
 class Remote:
@@ -94,15 +98,14 @@ class Remote:
     def check(self) -> None:
         """
         Raises:
-            RemoteMissing: nothing was ever pushed there.
+            NoPushedStore: nothing was ever pushed there.
             RemoteError: it is of a newer version, or damaged.
         """
         try:
             data = self.read(LAYOUT_FILE)
         except RemoteMissing:
-            raise RemoteMissing(
-                f"{self.url}: holds no pushed store (no {LAYOUT_FILE}); `sliplab push` makes one"
-            ) from None
+            why = f"holds no pushed store (no {LAYOUT_FILE}); `sliplab push` makes one"
+            raise NoPushedStore(self.url, why) from None
         try:
             layout = json.loads(data)["layout"]
         except (ValueError, KeyError, TypeError):

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.errors import StoreError, disk_explained
+from storage.errors import NoStore, StoreError, disk_explained
 from storage.files import (
     json_text,
     make_folder,
@@ -300,13 +300,12 @@ class Store:
         """An existing store.
 
         Raises:
-            StoreError: no store there, or one of another format.
+            NoStore: no store there.
+            StoreError: one of another format, or a damaged one.
         """
         path = folder / STORE
         if not path.is_file():
-            raise StoreError(
-                f"{folder}: is not a store (no store.json); `sliplab collect` makes one"
-            )
+            raise NoStore(folder, "is not a store (no store.json); `sliplab collect` makes one")
         try:
             found = read_json(path).get("format")
         except (OSError, ValueError) as error:
@@ -332,17 +331,29 @@ class Store:
         return int(read_json(self.folder / STORE)["format"])
 
     @staticmethod
+    def exists(folder: Path) -> bool:
+        """Return whether a store is there already, in a folder that could hold one.
+
+        Raises:
+            NoStore: it is a file, or a folder that holds something else.
+        """
+        if (folder / STORE).exists():
+            return True
+        if folder.exists() and not folder.is_dir():
+            raise NoStore(folder, "is a file; give a folder for the store")
+        if folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir()):
+            raise NoStore(folder, "holds other files; give an empty folder or a store")
+        return False
+
+    @staticmethod
     def create(folder: Path) -> Store:
         """The store in `folder`, made if there is none.
 
         Raises:
-            StoreError: the folder holds something else, or nothing can be written there.
+            NoStore: the folder holds something else.
+            StoreError: nothing can be written there.
         """
-        if not (folder / STORE).exists():
-            if folder.exists() and not folder.is_dir():
-                raise StoreError(f"{folder}: is a file; give a folder for the store")
-            if folder.is_dir() and any(not p.name.startswith(".") for p in folder.iterdir()):
-                raise StoreError(f"{folder}: holds other files; give an empty folder or a store")
+        if not Store.exists(folder):
             with disk_explained(folder):
                 make_folder(folder)
                 write_json(folder / STORE, {"format": FORMAT})

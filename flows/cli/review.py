@@ -63,6 +63,8 @@ def view(
     subject = looking.find(Store.open(store), trial, campaign)
     if save is None:
         looking.show(subject)
+        if as_json:
+            console.print_json({"trial": trial, "file": None})
         return
     if save.suffix != ".rrd" or not save.parent.is_dir():
         raise InputError("--save", "", str(save), "must end in .rrd and stand in a folder")

@@ -23,7 +23,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a protocol or rig file."""
     if kind not in KINDS:
-        raise InputError("schema", "KIND", kind, f"must be one of {', '.join(KINDS)}")
+        raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
     from flows.planning.schema import file_schema
     from storage.files import write_json
 

@@ -88,7 +88,7 @@ def tradeoff(
     """Measure what accuracy costs: of simulating a scene, or of the detector on a store."""
     if (scene is None) == (detector is None):
         raise InputError(
-            "tradeoff", "", None, "give exactly one of --scene PROTOCOL and --detector STORE"
+            "--scene", "", None, "give exactly one of --scene PROTOCOL and --detector STORE"
         )
     of_detector = {
         "--samples": samples, "--epochs": epochs, "--seeds": seeds, "--stride": stride,

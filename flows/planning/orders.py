@@ -68,7 +68,8 @@ def make_order(
 
     Raises:
         InputError: protocol, rig, or a plan that this rig or this disk cannot take.
-        StoreError: the folder is no store, or the campaign was begun under another collection.
+        NoStore: the folder holds something else.
+        StoreError: the campaign was begun under another collection.
     """
     plan = load_plan(protocol, enable)
     rig_file, rig_text = load_rig_file(rig)
@@ -77,7 +78,7 @@ def make_order(
         raise InputError(rig, "devices.plate", None, f"is needed: {protocol} moves a sliding plate")
     name = campaign or plan.protocol.name
     begun = None
-    if (store / "store.json").exists():
+    if Store.exists(store):
         found = Store.open(store).campaign(name)
         begun = found if found.begun else None
     # one campaign, one physics: a level of a factor that is added later must not change it

@@ -137,7 +137,8 @@ def show(subject: Subject) -> None:
 
 @contextmanager
 def _viewer(path: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    viewer = subprocess.Popen([program(), str(path)], env=environment)
+    # what it prints is for people: standard output has nothing but the command's result
+    viewer = subprocess.Popen([program(), str(path)], env=environment, stdout=2)
     try:
         yield viewer
     finally:

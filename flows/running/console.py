@@ -46,9 +46,32 @@ def say(text: str) -> None:
     messages.print(masked(text), markup=False)
 
 
+_as_json = _printed = False
+
+
+def begin(*, as_json: bool) -> None:
+    """A command begins: its errors are objects, too, with `as_json`."""
+    global _as_json, _printed
+    _as_json, _printed = as_json, False
+
+
+def print_error(named: Mapping[str, str | None], exit_code: int) -> None:
+    """The error as the one JSON object of a command that was asked for one and has none yet.
+
+    Args:
+        named: ``file``, ``key``, ``value`` and ``message``.
+    """
+    if _as_json and not _printed:
+        shown = {name: text and masked(text) for name, text in named.items()}
+        print_json({"error": {**shown, "exit_code": exit_code}})
+
+
 def print_json(data: Any) -> None:
     """The one JSON object of a command."""
-    sys.stdout.write(json.dumps(data, allow_nan=False, ensure_ascii=False) + "\n")
+    global _printed
+    text = json.dumps(data, allow_nan=False, ensure_ascii=False)
+    _printed = True
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 

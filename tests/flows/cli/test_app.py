@@ -57,7 +57,7 @@ def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:
 
 def test_a_store_that_is_none_is_said() -> None:
     done = here("label", "docs")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "is not a store" in done.stderr
 
 

@@ -100,7 +100,7 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     protocol = write(tmp_path / "p.yaml", data)
     store = tmp_path / "store"
     collect = ("collect", protocol, "--rig", RIG, "--store", store)
-    assert here("pause", store).returncode == 1  # no store yet
+    assert here("pause", store).returncode == 2  # no store yet
     one = asked(*collect, "--trials", 1)
     assert (one["committed"], one["causes"]) == (1, [])
     assert asked("stop", store)["holder"] is None

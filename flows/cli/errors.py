@@ -1,0 +1,117 @@
+"""Ends a command that failed: its message for people, its error object for programs, its exit code.
+
+Without ``--json`` an error is one message on standard error. With it, standard output has one
+object as well, unless the command has printed its own before it failed:
+``{"error": {"file", "key", "value", "message", "exit_code"}}``, null where nothing is known.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from pydantic import ValidationError
+from typer.exceptions import TyperException
+
+from flows.running import console
+from protocols.errors import InputError
+from storage.errors import StoreError, disk_error
+
+INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
+_EXPECTED = {"RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError"}
+"""Errors whose message says all there is to say, by name: their modules take long to load."""
+_OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|TRIAL|URL")
+"""An `InputError` about an option or an argument has its name where others have a file."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What ended a command.
+
+    Attributes:
+        file: the file, folder or URL that is wrong; None where there is none.
+        key: the key inside it, or the option or argument.
+        value: what stood there, as written.
+        trace: where the program failed, if the fault is the program's own.
+    """
+
+    message: str
+    exit_code: int
+    file: str | None = None
+    key: str | None = None
+    value: str | None = None
+    trace: str = ""
+
+    def report(self) -> int:
+        """Say it to people, and to programs if they asked; returns the exit code."""
+        if self.trace:
+            console.say(self.trace)
+        if self.message:
+            console.say(self.message if self.interrupted else f"error: {self.message}")
+        named = {"file": self.file, "key": self.key, "value": self.value}
+        console.print_error({**named, "message": self.message}, self.exit_code)
+        return self.exit_code
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether nothing went wrong: somebody stopped the program."""
+        return self.exit_code == console.INTERRUPTED
+
+
+def interruption() -> Failure:
+    """Somebody stopped the program."""
+    return Failure(INTERRUPTED, console.INTERRUPTED)
+
+
+def failure(error: Exception) -> Failure:
+    """Name what `error` is about, and choose the exit code."""
+    if isinstance(error, InputError):
+        return _wrong_input(error)
+    if isinstance(error, typer.Abort):
+        return interruption()
+    if isinstance(error, TyperException):
+        return _wrong_usage(error)
+    if isinstance(error, OSError) and error.filename:
+        error = disk_error(Path(os.fsdecode(error.filename)), error) or error
+    if isinstance(error, StoreError):
+        return Failure(str(error), console.FAILED, _place(str(error)))
+    trace = ""
+    if type(error).__name__ not in _EXPECTED:
+        trace = "".join(traceback.format_exception(error, limit=-8))
+    return Failure(str(error) or type(error).__name__, console.FAILED, trace=trace)
+
+
+def _place(message: str) -> str | None:
+    """Return the path or URL that the message of a `StoreError` begins with, if it does."""
+    head, colon, _ = message.partition(": ")
+    return head if colon and ("/" in head or os.path.exists(head)) else None
+
+
+def _wrong_input(error: InputError) -> Failure:
+    file, key = error.file, error.key
+    if _OPTION.fullmatch(file):
+        file, key = "", f"{file} {key}".strip()
+    return Failure(error.message, console.WRONG_INPUT, file or None, key or None, error.value)
+
+
+def _wrong_usage(error: TyperException) -> Failure:
+    """Of the command line: an unknown option, a missing argument, a value that is none."""
+    message = error.format_message()  # empty without a command: its help has been printed
+    key = getattr(error, "option_name", None)
+    value = None
+    parameter = getattr(error, "param", None)
+    if parameter is not None:
+        key = parameter.opts[0]
+        key = key if key.startswith("-") else key.upper()
+    if isinstance(error.__cause__, ValidationError):
+        found = error.__cause__.errors()[0]
+        value = str(found["input"])
+        expected = re.sub("^Input should", "must", found["msg"].removeprefix("Value error, "))
+        message = f"{key} = {value}: {expected}"
+    if message:
+        message += " (see --help)"
+    return Failure(message, console.WRONG_INPUT, None, key, value)

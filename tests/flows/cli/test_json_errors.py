@@ -1,0 +1,211 @@
+"""Errors of every command under ``--json``: one object for programs, and its exit code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from flows.cli.app import app
+from flows.running import stopping
+from flows.running.cluster import ClusterError
+from storage.errors import StoreError
+from storage.store import Store
+from tests.command_line import SECRET, here
+from tests.conftest import ROOT
+
+KEYS = ["file", "key", "value", "message", "exit_code"]
+NOWHERE = "nowhere"
+
+WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
+    # command: arguments, and the file, key and value that its error names; ROOM is a folder
+    "plan": (("ROOM/nowhere",), "ROOM/nowhere", None, None),
+    "check": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
+    "collect": (("ROOM/nowhere", "--rig", "mock", "--store", "ROOM/s"), "ROOM/nowhere", None, None),
+    **dict.fromkeys(
+        (
+            "sync", "label", "train", "evaluate", "report", "generalise", "guesses", "trials",
+            "verify", "migrate", "pause", "resume", "stop", "review",
+        ),
+        (("ROOM/nowhere",), "ROOM/nowhere", None, None),
+    ),
+    "tradeoff": (("--detector", "ROOM/nowhere"), "ROOM/nowhere", None, None),
+    "study": (("ROOM/nowhere", "--status"), None, "FOLDER", "ROOM/nowhere"),
+    "demo": (("ROOM/file",), "ROOM/file", None, None),
+    "push": (("ROOM/nowhere", "file://ROOM/u"), "ROOM/nowhere", None, None),
+    "pull": (("file://ROOM/nowhere", "ROOM/p"), "file://ROOM/nowhere", None, None),
+    "rigs": (("--sped",), None, "--sped", None),
+    "skip": (("ROOM/nowhere", "x", "--why", "torn"), "ROOM/nowhere", None, None),
+    "again": (("ROOM/nowhere", "x", "--why", " "), None, "--why", ""),
+    "serve": (("--store", "ROOM/file", "--rig", "mock"), "ROOM/file", None, None),
+    "import": (("ROOM/nowhere", "--store", "ROOM/i", "--name", "n"), "ROOM/nowhere", None, None),
+    "export": (("ROOM/nowhere", "x", "--output", "ROOM/o"), "ROOM/nowhere", None, None),
+    "view": (("ROOM/nowhere", "x"), "ROOM/nowhere", None, None),
+    "detect": (("--rig", "mock", "--model", "ROOM/nowhere"), "ROOM/nowhere", None, None),
+    "export-model": (("ROOM/nowhere", "--out", "ROOM/e"), "ROOM/nowhere", None, None),
+    "schema": (("robot",), None, "KIND", "robot"),
+    **dict.fromkeys(
+        ("teach plane", "teach zero", "teach tool", "calibrate lens", "calibrate crop"),
+        (("--rig", "ROOM/nowhere"), "ROOM/nowhere", None, None),
+    ),
+    "calibrate board": (("--out", "ROOM/x.doc"), None, "--out", "ROOM/x.doc"),
+}  # fmt: skip
+
+
+def commands() -> Iterator[str]:
+    """All commands of the command line, by the words that call them."""
+
+    def walk(group: Any, words: tuple[str, ...]) -> Iterator[str]:
+        for name, command in group.commands.items():
+            if hasattr(command, "commands"):
+                yield from walk(command, (*words, name))
+            else:
+                yield " ".join((*words, name))
+
+    return walk(typer.main.get_command(app), ())
+
+
+def error_of(*words: object) -> dict[str, Any]:
+    """The error that a command printed as its one JSON object; its exit code stands in it."""
+    done = here(*words, "--json")
+    assert "Traceback" not in done.stderr
+    (line,) = done.stdout.splitlines()
+    data = json.loads(line)
+    assert list(data) == ["error"]
+    error: dict[str, Any] = data["error"]
+    assert list(error) == KEYS
+    assert error["exit_code"] == done.returncode
+    assert error["message"] in done.stderr
+    return error
+
+
+def test_the_table_has_every_command() -> None:
+    assert set(WRONG) == set(commands())
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_input_is_one_object_and_exit_2(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no store")
+    before = sorted(tmp_path.rglob("*"))
+    words, *named = WRONG[name]
+
+    def placed(text: str | None) -> str | None:
+        return None if text is None else text.replace("ROOM", str(tmp_path))
+
+    error = error_of(*name.split(), *map(placed, words))
+    assert error["exit_code"] == 2
+    assert [error["file"], error["key"], error["value"]] == [placed(text) for text in named]
+    assert error["message"]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", list(WRONG))
+def test_usage_errors_are_objects_too(name: str) -> None:
+    error = error_of(*name.split(), "--no-such-option")
+    assert (error["exit_code"], error["key"]) == (2, "--no-such-option")
+
+
+@pytest.mark.parametrize(
+    ("words", "key", "value"),
+    [
+        ((), "--json", None),
+        (("colect",), None, None),
+        (("teach",), "--json", None),
+        (("plan",), "PROTOCOL", None),
+        (("collect", "p.yaml", "--rig", "mock"), "--store", None),
+        (("serve", "--rig", "mock", "--store", "s", "--port", "99999"), "--port", "99999"),
+        (("evaluate", "s", "--smoothing", "many"), "--smoothing", "many"),
+        (("teach", "plane", "--rig", "mock", "--by", "foot"), "--by", "foot"),
+        (("trials", "s3://anna:geheim@host/s"), "URL", "s3://.../s"),
+    ],
+)
+def test_options_and_arguments_are_named(
+    words: tuple[str, ...], key: str | None, value: str | None
+) -> None:
+    error = error_of(*words)
+    assert (error["exit_code"], error["file"], error["key"], error["value"]) == (
+        2,
+        None,
+        key,
+        value,
+    )
+
+
+@pytest.mark.parametrize("place", ["ROOM", "ROOM/file", "file://ROOM/nowhere"])
+@pytest.mark.parametrize("name", ["trials", "verify", "sync", "label", "report"])
+def test_a_missing_store_is_exit_2_wherever_it_was_looked_for(
+    name: str, place: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("no store")
+    where = place.replace("ROOM", str(tmp_path))
+    error = error_of(name, where)
+    assert (error["exit_code"], error["file"]) == (2, where)
+
+
+def test_one_object_after_a_result_was_printed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Review prints its address first; what ends it later must not be a second object."""
+    from flows.reviewing import review_server
+
+    def serve(*arguments: Any) -> None:
+        *_, ready = arguments
+        ready("http://127.0.0.1:1/x", type("Trials", (), {"rows": ()})())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(review_server, "serve", serve)
+    Store.create(tmp_path / "s")
+    done = here("review", tmp_path / "s", "--json")
+    assert done.returncode == 130
+    assert list(json.loads(done.stdout)) == ["url", "trials", "to_decide"]
+
+
+def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    from flows.reviewing import view
+
+    monkeypatch.setattr(view, "find", lambda *_: None)
+    monkeypatch.setattr(view, "show", lambda _: None)
+    monkeypatch.setattr(Store, "open", lambda _: None)
+    done = here("view", "s", "depth=1mm", "--json")
+    assert json.loads(done.stdout) == {"trial": "depth=1mm", "file": None}
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ClusterError("--dask h:1: no scheduler answers"), 1, "no scheduler answers"),
+        (StoreError("s: holds trials that the protocol no longer has"), 1, "no longer has"),
+        (ZeroDivisionError("division by zero"), 1, "division by zero"),
+        (AssertionError(), 1, "AssertionError"),
+        (StoreError(f"https://anna:geheim-1@host/s with {SECRET}: no"), 1, "https://anna:****@"),
+    ],
+)
+def test_whatever_ends_a_command_is_an_object(
+    raised: BaseException, code: int, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setenv("PREFECT_API_KEY", SECRET)
+    monkeypatch.setattr("protocols.plan.load_plan", fail)
+    done = here("plan", ROOT / "protocols" / "pilot.yaml", "--json")
+    error = json.loads(done.stdout)["error"]
+    assert (done.returncode, error["exit_code"]) == (code, code)
+    assert message in error["message"]
+    assert "geheim" not in done.stdout + done.stderr
+    assert SECRET not in done.stdout + done.stderr
+    plain = here("plan", ROOT / "protocols" / "pilot.yaml")
+    assert (plain.returncode, plain.stdout) == (code, "")
+    assert not stopping.requested()
+
+
+def test_a_missing_file_of_a_store_is_named(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "s")
+    (store.folder / "store.json").write_text("{")
+    error = error_of("trials", store.folder)
+    assert (error["exit_code"], error["file"]) == (1, str(store.folder / "store.json"))
