@@ -5,7 +5,8 @@ them costs more than their data. So every file begins as a copy of one that has 
 rows, and rows wait in memory until they are whole chunks.
 
 Format 2 differs from 1 in how events are kept: LZ4 instead of zstd, and times after the offset in
-32 bits (docs/decisions/0020). A reader need not know which it has.
+32 bits (docs/decisions/0020). A reader need not know which it has. Format 3 is format 2 with an
+index that ends before the last event (docs/decisions/0067).
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ Array = npt.NDArray[Any]
 Kind = tuple[str, tuple[int, ...], str]
 """Type, shape of a row, unit."""
 
-FORMAT = 2
+FORMAT, INDEX_CUT_FORMAT = 2, 3
+"""What a file is written as; the second one where its index ends before its events do."""
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
@@ -67,6 +69,8 @@ TIMES = "events/t"
 WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 """The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
 INDEX, OFFSET = "ms_to_idx", "t_offset"
+INDEXED_MS = 2**32 // 1000 + 1
+"""Milliseconds that the index reaches to: those that DSEC's 32-bit times can tell."""
 # one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
 _SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
 _EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")

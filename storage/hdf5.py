@@ -1,6 +1,7 @@
 """One HDF5 file a trial for everything but frames, in the event layout of the DSEC data set.
 
 ``events/{x,y,p,t}`` with ``ms_to_idx`` and ``t_offset`` opens in the tools that read DSEC; the
+index reaches as far as their 32-bit times (71.6 min), later events are found by bisection. The
 other streams stand beside them. Columns are chunked and compressed with bitshuffle, events in
 LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
 same data are the same bytes.
@@ -8,6 +9,7 @@ same data are the same bytes.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from pathlib import Path
 from types import TracebackType
 
@@ -16,9 +18,11 @@ import numpy as np
 
 from storage.columns import (
     COLUMNS,
-    FORMAT,
     INDEX,
+    INDEX_CUT_FORMAT,
+    INDEXED_MS,
     OFFSET,
+    SMALL_HELD,
     TIMES,
     TIMING,
     TRACKS,
@@ -83,10 +87,15 @@ class StreamFile:
         self._append(TIMES, times)
 
     def _mark(self, times: I64, end_ms: int) -> None:
-        """Note the first event at or after each millisecond before `end_ms`."""
-        marks = np.arange(self._next_ms, end_ms, dtype=np.int64) * 1000
+        """Note the first event at or after each millisecond before `end_ms`.
+
+        Block by block and up to `INDEXED_MS`: a gap may be of any length.
+        """
         before = self._columns[TIMES].count
-        self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
+        for low in range(self._next_ms, min(end_ms, INDEXED_MS), SMALL_HELD):
+            high = min(low + SMALL_HELD, end_ms, INDEXED_MS)
+            marks = np.arange(low, high, dtype=np.int64) * 1000
+            self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
         self._next_ms = max(end_ms, self._next_ms)
 
     def add_pulses(self, group: str, chunk: PulseChunk) -> None:
@@ -155,8 +164,10 @@ class StreamFile:
 
     def finish(self) -> None:
         """Write what is held back and the index, and close the file."""
-        # one more mark, so that the last millisecond has an end
-        self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
+        if self._next_ms > INDEXED_MS:
+            self._file.attrs["format"] = INDEX_CUT_FORMAT
+        else:  # one more mark, so that the last millisecond has an end
+            self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
         for column in self._columns.values():
             column.flush()
         self._file[OFFSET][()] = self._offset or 0
@@ -179,11 +190,12 @@ class StreamReader:
         self._file = RowFile(path)
         try:
             found = self._file.attribute("format", 1)
-            if found > FORMAT:
+            if found > INDEX_CUT_FORMAT:
                 raise StoreError(
                     f"{path}: format = {found}: was written by a newer version of SlipLab; this "
-                    f"one reads formats up to {FORMAT}: update it"
+                    f"one reads formats up to {INDEX_CUT_FORMAT}: update it"
                 )
+            self._index_cut = found == INDEX_CUT_FORMAT
             self.t_offset_us = int(self._file.rows(OFFSET).read())
         except BaseException:
             self._file.close()
@@ -217,9 +229,9 @@ class StreamReader:
         low, high = 0, len(self._file.rows(TIMES))
         marks = self._file.rows(INDEX)
         if start_us is not None and len(marks):
-            low = _bracket(marks, start_us - self.t_offset_us, high)[0]
+            low = self._bracket(marks, start_us - self.t_offset_us, high)[0]
         if end_us is not None and len(marks):
-            high = _bracket(marks, end_us - self.t_offset_us, high)[1]
+            high = self._bracket(marks, end_us - self.t_offset_us, high)[1]
         high = max(low, high)
         times = self._times(low, high)
         first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
@@ -229,6 +241,20 @@ class StreamReader:
         return EventChunk(
             x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
         )
+
+    def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
+        """Indices that enclose time `t_us` after the offset, from the index or behind its end."""
+        ms = t_us // 1000
+        near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
+        if ms < 0:
+            return 0, near[0] if ms == -1 and near else 0
+        if self._index_cut and len(near) < 2:
+            times = self._file.rows(TIMES)
+            rows = range(near[0] if near else 0, count)
+            found = bisect_left(rows, t_us, key=lambda row: int(times.read(row, row + 1)[0]))
+            return rows.start + found, rows.start + found
+        near += [count, count]
+        return near[0], near[1]
 
     def pulses(self, group: str) -> I64:
         """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
@@ -267,13 +293,3 @@ class StreamReader:
             name: len(self._file.rows(name)) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS, *TIMING)
         }
-
-
-def _bracket(marks: Rows, t_us: int, count: int) -> tuple[int, int]:
-    """Indices that enclose time `t_us` after the offset, from the millisecond index."""
-    ms = t_us // 1000
-    near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
-    if ms < 0:
-        return 0, near[0] if ms == -1 and near else 0
-    near += [count, count]
-    return near[0], near[1]

@@ -49,6 +49,8 @@ def import_(
         found = (replace(trial, simulated=True) for trial in found)
     with owned(opened):
         result = take_in(opened, name, found, where, kind, lambda trial: console.say(trial))
+    for text in result.get("warnings", ()):
+        console.say(f"warning: {text}")
     finish(result, f"imported into {store}", as_json)
 
 

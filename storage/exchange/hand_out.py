@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from storage.streams import I64, EventChunk, Json
 
 SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
 """Of the files of each format."""
-_PIECE_US = 10_000_000
+_PIECE = 1 << 20
 
 
 def hand_out(
@@ -120,14 +120,12 @@ _WRITERS: dict[str, Callable[[Recording, Path], dict[str, int]]] = {
 }
 
 
-def _pieces(recording: Recording) -> list[EventChunk]:
+def _pieces(recording: Recording) -> Iterator[EventChunk]:
+    """All events, about `_PIECE` at a time."""
     with recording.open() as reader:
-        times = reader.event_times()
-        if not len(times):
-            return []
-        first, last = int(times[0]), int(times[-1])
-        starts = range(first, last + 1, _PIECE_US)
-        return [reader.events(start, start + _PIECE_US) for start in starts]
+        cuts = np.unique(reader.event_times()[::_PIECE]).tolist()
+        for start, end in zip(cuts, [*cuts[1:], None], strict=True):
+            yield reader.events(start, end)
 
 
 def _triggers(recording: Recording) -> Triggers:

@@ -11,6 +11,8 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
+
 from protocols.errors import InputError
 from storage.clockmap import IDENTITY
 from storage.exchange.foreign import ForeignTrial, Wrong
@@ -23,6 +25,7 @@ from storage.writer import TrialWriter
 
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""
+_LONG_GAP_US = 3_600_000_000
 _FRAME_RATE = 100
 """Of the video's own time base only; when frames were taken stands in their times."""
 
@@ -43,7 +46,8 @@ def take_in(
         kind: the format's name.
 
     Returns:
-        ``imported`` and ``there`` (already) with ids, and ``events`` and ``frames`` imported.
+        ``imported`` and ``there`` (already) with ids, ``events`` and ``frames`` imported, and
+        ``warnings`` for people where there are any.
 
     Raises:
         InputError: a file is damaged or cannot be right. Trials before it stay committed; of this
@@ -57,6 +61,7 @@ def take_in(
     made: list[str] = []
     found: list[str] = []
     counts = {"events": 0, "frames": 0}
+    warnings: list[str] = []
     try:
         for trial in trials:
             on_trial(trial.name)
@@ -67,15 +72,17 @@ def take_in(
                 raise Wrong(f"two files for the trial {trial.name}")
             if not campaign.begun:
                 _describe(campaign, trial, origin, kind)
-            taken = _take(campaign, trial, kind)
+            taken, warned = _take(campaign, trial, kind)
             made.append(trial.name)
+            warnings += [f"{trial.source}: {text}" for text in warned]
             counts = {key: counts[key] + taken[key] for key in counts}
     except Wrong as error:
         raise InputError(origin, "", None, str(error)) from None
     finally:
         if fresh and not made and campaign.folder.exists():
             shutil.rmtree(campaign.folder)
-    return {"campaign": name, "imported": made, "there": found, **counts}
+    result = {"campaign": name, "imported": made, "there": found, **counts}
+    return {**result, "warnings": warnings} if warnings else result
 
 
 def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) -> None:
@@ -85,10 +92,11 @@ def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) 
     campaign.update(info, text, text.replace("protocol", "rig file"))
 
 
-def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> dict[str, int]:
+def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str, int], list[str]]:
+    """Commit one trial; its counts and warnings."""
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
-        first_us, last_us = _fill(writer, trial)
+        (first_us, last_us), warnings = _fill(writer, trial)
         counts = writer.counts
         told = {
             "events": counts["events/t"],
@@ -97,6 +105,8 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> dict[str, int]:
             "pulses": 0,
         }
         record = _record(campaign, trial, kind, told, (last_us - first_us) / 1e6)
+        if warnings:
+            record[IMPORTED]["warnings"] = warnings
         writer.commit(record, {"imported": now(), "from": trial.source})
     except Wrong as error:
         writer.discard()
@@ -104,18 +114,23 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> dict[str, int]:
     except BaseException:
         writer.discard()
         raise
-    return {"events": told["events"], "frames": told["frames"]}
+    return {"events": told["events"], "frames": told["frames"]}, warnings
 
 
-def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[int, int]:
-    """All streams into the trial; the times of the first and the last event, us."""
+def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
+    """All streams into the trial; the times of the first and the last event, us, and warnings."""
     first_us = last_us = None
+    gap_us = gap_end_us = 0
     for chunk in trial.events():
         if not len(chunk):
             continue
         if last_us is not None and int(chunk.t_us[0]) < last_us:
             raise Wrong("events whose times run backwards")
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
+        steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
+        widest = int(steps.argmax())
+        if int(steps[widest]) > gap_us:
+            gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
         last_us = int(chunk.t_us[-1])
         writer.add_events(chunk)
     if trial.triggers is not None:
@@ -127,7 +142,16 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[int, int]:
         if (width, height) != trial.frame_px:
             raise Wrong(f"a frame of {width} x {height} among others of {trial.frame_px}")
         writer.add_frames(frames)
-    return first_us or 0, last_us or 0
+    return (first_us or 0, last_us or 0), _gap_warnings(gap_us, gap_end_us)
+
+
+def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
+    if gap_us < _LONG_GAP_US:
+        return []
+    return [
+        f"{gap_us / 3.6e9:,.1f} hours without an event between {end_us - gap_us} and {end_us} us: "
+        "the camera's clock was set there, or the times on one side are wrong; kept as they are"
+    ]
 
 
 def _record(

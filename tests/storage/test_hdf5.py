@@ -163,3 +163,51 @@ def test_a_file_without_anything_has_every_column(tmp_path: Path) -> None:
         assert len(reader.event_times()) == 0
     with h5py.File(tmp_path / "t.h5") as file:
         assert all(file[name].attrs["unit"] for name in (*COLUMNS, "ms_to_idx", "t_offset"))
+
+
+def _sparse(times: list[int]) -> EventChunk:
+    count = len(times)
+    column = np.arange(count, dtype=np.uint16)
+    return EventChunk(
+        column, column, (column % 2).astype(np.uint8), np.asarray(times, dtype=np.int64)
+    )
+
+
+DAY_US = 86_400 * 10**6
+EPOCH_US = 1_795_000_000_000_000
+SPARSE = {
+    "one event at 0, the rest at today's epoch": [0, *range(EPOCH_US, EPOCH_US + 400, 4)],
+    "three days": [*range(0, 3 * DAY_US, DAY_US // 300)],
+    "ends where the index does": [0, 5, 2**32 - 700, 2**32 - 1],
+    "ends after the index": [0, 5, 2**32 - 700, 2**32 + 700, 2**32 + 701, 2**33],
+}
+
+
+@pytest.mark.parametrize("name", SPARSE)
+def test_a_gap_costs_neither_memory_nor_a_window(name: str, tmp_path: Path) -> None:
+    whole = _sparse(SPARSE[name])
+    write(tmp_path / "t.h5", whole, 3)
+    assert (tmp_path / "t.h5").stat().st_size < 1_000_000
+    with h5py.File(tmp_path / "t.h5") as file:
+        marks = file["ms_to_idx"][:]
+        times = file["events/t"][:]
+    assert len(marks) <= 2**32 // 1000 + 2
+    for ms in {0, 1, len(marks) // 2, len(marks) - 1}:
+        assert marks[ms] == np.searchsorted(times, ms * 1000)
+    edges = sorted({t + d for t in whole.t_us[[0, 1, 2, -2, -1]].tolist() for d in (-1, 0, 1)})
+    with StreamReader(tmp_path / "t.h5") as reader:
+        assert np.array_equal(reader.events().t_us, whole.t_us)
+        for start in edges:
+            for end in edges:
+                found = reader.events(start, end)
+                mask = (whole.t_us >= start) & (whole.t_us < end)
+                assert np.array_equal(found.t_us, whole.t_us[mask])
+                assert np.array_equal(found.x, whole.x[mask])
+
+
+def test_only_a_file_whose_index_ends_early_has_the_newer_format(tmp_path: Path) -> None:
+    """A version that expects the index to reach the last event would find nothing behind it."""
+    for name, times in (("whole", [0, 2**32 - 1]), ("cut", [0, 2**32 + 10**6])):
+        write(tmp_path / name, _sparse(times), 1)
+    with h5py.File(tmp_path / "whole") as whole, h5py.File(tmp_path / "cut") as cut:
+        assert (whole.attrs["format"], cut.attrs["format"]) == (2, 3)

@@ -240,6 +240,29 @@ def test_an_exposure_that_ends_before_it_starts_is_refused(tmp_path: Path) -> No
         _import(tmp_path / "store", path)
 
 
+@pytest.mark.parametrize("later", [1_795_000_000_000_000, 3 * 86_400 * 10**6])
+def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, later: int) -> None:
+    column = np.arange(300, dtype=np.uint16)
+    times = np.concatenate([[0], later + np.arange(299)]).astype(np.int64)
+    whole = EventChunk(column, column, (column % 2).astype(np.uint8), times)
+    with Aedat4Writer(tmp_path / "a.aedat4", {0: Stream("EVTS", "e", (346, 300), "x")}) as file:
+        file.events(0, whole)
+    made = Store.create(tmp_path / "store")
+    path = tmp_path / "a.aedat4"
+    result = take_in(made, "theirs", trials_in(path, "aedat4"), path, "aedat4")
+    (text,) = result["warnings"]
+    assert text.startswith("a.aedat4: ")
+    assert f"between 0 and {later} us" in text
+    found = made.campaign("theirs").recording("a")
+    assert [f"a.aedat4: {one}" for one in found.record["imported"]["warnings"]] == [text]
+    _same(_events(found), whole)
+    assert verify(made) == []
+    hand_out([found], tmp_path / "out", "aedat4", "theirs")
+    with Aedat4File(tmp_path / "out" / "a.aedat4") as again:
+        back = [chunk.t_us for chunk in again.events(0)]
+    np.testing.assert_array_equal(np.concatenate(back), times)
+
+
 def test_aedat4_goes_round_with_every_trigger(tmp_path: Path) -> None:
     events, triggers = _aedat4(tmp_path / "a.aedat4")
     made = _import(tmp_path / "store", tmp_path / "a.aedat4")
