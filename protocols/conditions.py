@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from protocols.factors import LevelField
+from protocols.factors import MAX_TRIALS, LevelField
 from protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
@@ -85,10 +85,10 @@ class Gates(StrictModel):
 
     sync_uncertainty: SyncGates = SyncGates()
     """95 % uncertainty of events against frames and poses, by grade."""
-    frames_lost: Annotated[int, Field(ge=0)] = 0
+    frames_lost: Annotated[int, Field(ge=0, le=1_000_000)] = 0
     event_gap: PositiveSeconds = Decimal("0.05")
     """Longest silence of the event camera while the arm moves in contact."""
-    event_burst: Annotated[int, Field(ge=1)] = 50_000
+    event_burst: Annotated[int, Field(ge=1, le=1_000_000_000)] = 50_000
     """Most events in any 10 ms: more is flicker, not skin."""
     path_deviation: PositiveMillimetres = Decimal("0.1")
     """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
@@ -101,7 +101,7 @@ class Gates(StrictModel):
 class References(StrictModel):
     """One condition taken again and again, to see the skin wear and the rig drift."""
 
-    every: Annotated[int, Field(ge=1)]
+    every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]
     condition: dict[str, LevelField]
 
 
@@ -117,7 +117,7 @@ class WarmUp(StrictModel):
 class Rezero(StrictModel):
     """Depth zero found again by touching off, before every so many trials."""
 
-    every: Annotated[int, Field(ge=1)]
+    every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]
     speed: PositiveSpeed
     search: PositiveMillimetres
     """How far beyond the taught plane the touch may be looked for; a hard limit."""
@@ -126,7 +126,7 @@ class Rezero(StrictModel):
 class Cleaning(StrictModel):
     """A person cleans skin and plate before every so many trials."""
 
-    every: Annotated[int, Field(ge=1)]
+    every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]
     prompt: Annotated[str, Field(min_length=1, max_length=400)]
 
 

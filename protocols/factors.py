@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from decimal import Decimal
 from typing import Annotated, Literal
 
@@ -16,8 +17,8 @@ from pydantic import (
     model_validator,
 )
 
-from protocols.quantity import UNITS, canonical, to_decimal
-from protocols.yaml_file import StrictModel
+from protocols.quantity import UNITS, canonical, check_size, to_decimal
+from protocols.yaml_file import KeyedError, StrictModel
 
 MAX_TRIALS = 1_000_000
 _UNITS = sorted({kind for kind, _ in UNITS.values()})
@@ -130,10 +131,16 @@ class Factor(StrictModel):
             if level in seen:
                 raise ValueError(f"has the level {_write_level(level)} twice")
             seen.add(level)
-            if isinstance(level, str) == (self.unit is not None):
-                raise ValueError(
-                    f"has the level {_write_level(level)}: numbers need a unit, words have none"
-                )
+            if isinstance(level, str) or self.unit is None:
+                if isinstance(level, str) == (self.unit is not None):
+                    raise ValueError(
+                        f"has the level {_write_level(level)}: numbers need a unit, words have none"
+                    )
+                continue
+            try:
+                check_size(level, self.unit)
+            except ValueError as error:
+                raise KeyedError(f".{self.place(level)}", level, str(error)) from None
         return self
 
     def levels(self) -> tuple[Level, ...]:
@@ -142,6 +149,19 @@ class Factor(StrictModel):
             return self.range.levels()
         return self.values or ()
 
+    def place(self, level: Level) -> str:
+        """The key below the factor that gives one of its levels: ``values[2]``, ``range``."""
+        for key in ("values", "optional"):
+            levels = getattr(self, key) or ()
+            if level in levels:
+                return f"{key}[{levels.index(level)}]"
+        return "range"
+
     def text(self, level: Level) -> str:
         """A level with its unit: ``2.4 mm``, ``left``."""
         return level if isinstance(level, str) else f"{canonical(level)} {self.unit}"
+
+
+def unknown_factor(name: str, factors: Iterable[str]) -> str:
+    """The message for a `name` that is none of the defined `factors`."""
+    return f"unknown factor {name}; defined factors: {', '.join(factors)}"

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from protocols.conditions import Gates, Limits, Maintenance, PlateSetup, Recording, References
-from protocols.factors import MAX_TRIALS, Factor
+from protocols.factors import MAX_TRIALS, Factor, unknown_factor
 from protocols.phases import Phase
 from protocols.quantity import FactorRef
 from protocols.settings import AnalysisSettings
@@ -98,7 +98,7 @@ class Collection(StrictModel):
                 raise KeyedError(
                     f"collection.references.condition.{name}",
                     given[name],
-                    f"is not a factor; the factors are {', '.join(self.factors)}",
+                    unknown_factor(name, self.factors),
                 )
 
     def _check_motion(self) -> None:
@@ -129,12 +129,15 @@ class Collection(StrictModel):
             fail("cannot hold before the approach")
         if ("plate" in names) != (self.plate is not None):
             fail("phases 'plate' and the section 'plate' belong together")
-        references = [*_references_in(self.motion), *_references_in(self.plate)]
-        used = {str(ref) for ref in references}
-        for ref in sorted(used):
-            if ref[1:] not in self.factors:
-                fail(f"names a factor that is not there; there are {', '.join(self.factors)}", ref)
-        for each in references:
+        references = [
+            *_references_in(self.motion, "collection.motion"),
+            *_references_in(self.plate, "collection.plate"),
+        ]
+        used = {str(ref) for _, ref in references}
+        for key, ref in references:
+            if ref.factor not in self.factors:
+                raise KeyedError(key, ref, unknown_factor(str(ref), self.factors))
+        for _, each in references:
             unit = self.factors[each.factor].unit
             if unit is not None and unit != each.unit:
                 raise KeyedError(
@@ -151,16 +154,16 @@ class Collection(StrictModel):
                 )
 
 
-def _references_in(part: Any) -> list[FactorRef]:
+def _references_in(part: Any, key: str) -> list[tuple[str, FactorRef]]:
+    """Each reference to a factor in `part`, with the key that it stands at."""
     if isinstance(part, FactorRef):
-        return [part]
+        return [(key, part)]
+    inner: list[tuple[str, Any]] = []
     if isinstance(part, tuple):
-        return [ref for item in part for ref in _references_in(item)]
-    if isinstance(part, StrictModel):
-        return [
-            ref for name in type(part).model_fields for ref in _references_in(getattr(part, name))
-        ]
-    return []
+        inner = [(f"{key}[{index}]", item) for index, item in enumerate(part)]
+    elif isinstance(part, StrictModel):
+        inner = [(f"{key}.{name}", getattr(part, name)) for name in type(part).model_fields]
+    return [found for place, item in inner for found in _references_in(item, place)]
 
 
 class Protocol(StrictModel):

@@ -130,9 +130,8 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
             yield field, key
             return
         written = collection.factors[field.factor]
-        for index, level in enumerate(enabled[field.factor]):
-            place = f".values[{index}]" if written.values is not None else ".range"
-            yield level, f"collection.factors.{field.factor}{place}"
+        for level in enabled[field.factor]:
+            yield level, f"collection.factors.{field.factor}.{written.place(level)}"
 
     def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> None:
         for value, where in levels(field, key):

@@ -14,8 +14,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from protocols.consistency import check_consistency
 from protocols.errors import InputError
-from protocols.factors import Level
+from protocols.factors import Level, unknown_factor
 from protocols.hashing import hash_data, hash_integer
 from protocols.model import Protocol
 from protocols.motion import build_program, check_limits
@@ -189,16 +190,23 @@ class Plan:
         return hash_data(self.protocol.analysis.model_dump(mode="json"))
 
 
-def load_plan(path: Path, enable: Iterable[str] = ()) -> Plan:
+def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -> Plan:
     """Read the protocol at `path` and expand it.
 
     Args:
         enable: levels to switch on, as ``factor=level`` (``disturbance=125``).
+        stored: it is a campaign's own copy, which is not held to rules that came after it.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
-    return make_plan(load(Protocol, path, "protocol"), str(path), enable)
+    plan = make_plan(load(Protocol, path, "protocol"), str(path), enable)
+    if not stored:
+        try:
+            check_consistency(plan.protocol)
+        except KeyedError as error:
+            raise InputError(path, error.key, error.value, str(error)) from None
+    return plan
 
 
 def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:
@@ -239,7 +247,7 @@ def _enabled(protocol: Protocol, enable: Iterable[str]) -> dict[str, tuple[Level
     for text in enable:
         name, _, raw = text.partition("=")
         if name not in factors:
-            raise InputError("--enable", name, text, f"must name a factor: {', '.join(factors)}")
+            raise InputError("--enable", "", text, unknown_factor(name or text, factors))
         factor = factors[name]
         try:
             level: Level = raw if factor.unit is None else to_decimal(raw.strip())

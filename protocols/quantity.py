@@ -43,6 +43,14 @@ FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}
 
 _PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
 _LARGEST = Decimal("1e9")
+# by canonical unit, far beyond any rig: what is larger was meant in another unit, or not at all
+_SIZES = {
+    unit: Decimal(size)
+    for unit, size in {
+        "mm": "1e5", "mm/s": "1e5", "s": "1e6", "deg": "360", "kg": "1e3", "percent": "1e4",
+        "px": "1e6",
+    }.items()
+}  # fmt: skip
 _DECIMALS = 40
 
 
@@ -90,7 +98,20 @@ def parse(raw: object, unit: str) -> Decimal:
     if base != unit:
         allowed = ", ".join(name for name, (kind, _) in UNITS.items() if kind == unit)
         raise ValueError(f"has the unit '{written}' where one of these belongs: {allowed}")
-    return to_decimal(number) * factor
+    value = to_decimal(number) * factor
+    check_size(value, unit)
+    return value
+
+
+def check_size(value: Decimal, unit: str) -> None:
+    """Hold a value in a canonical unit against the largest size that has a meaning.
+
+    Raises:
+        ValueError: it is larger.
+    """
+    size = _SIZES.get(unit, _LARGEST)
+    if value.copy_abs() > size:
+        raise ValueError(f"must be from -{size:f} to {size:f} {unit}")
 
 
 @dataclass(frozen=True)

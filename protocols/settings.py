@@ -7,11 +7,15 @@ model is handed whole to the step that uses it, and that step is stale when its 
 from __future__ import annotations
 
 import re
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from protocols.yaml_file import KeyedError, StrictModel
+
+Scale = Annotated[float, Field(ge=0, le=1e6)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Spikes = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Labelling(StrictModel):
@@ -21,7 +25,7 @@ class Labelling(StrictModel):
     """Which onsets rule downstream; both are kept (docs/labels.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
-    reference_ms: float = Field(default=200.0, gt=0)
+    reference_ms: float = Field(default=200.0, gt=0, le=1e6)
     """The markers' reference positions are their means over this last part of the hold."""
 
 
@@ -106,7 +110,7 @@ class Network(StrictModel):
     conv1_kernel: Literal[1, 3, 5, 7] = 5
     conv2_kernel: Literal[1, 3, 5, 7] = 3
     """Side of the square kernels, cells."""
-    weight_scale: tuple[float, float, float, float] = (4.0, 3.0, 4.0, 3.0)
+    weight_scale: tuple[Scale, Scale, Scale, Scale] = (4.0, 3.0, 4.0, 3.0)
     """Factors on the default initial weights; without them the deep layers stay silent."""
 
 
@@ -131,9 +135,9 @@ class Training(StrictModel):
     mirror: bool = True
     """Each epoch shows each training window as it is, or mirrored along one side or both, drawn
     anew: a slide to the left is as good as one to the right."""
-    patience: int = Field(default=5, ge=1)
+    patience: int = Field(default=5, ge=1, le=10_000)
     """Epochs without a better validation accuracy before it stops."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[Seed, ...] = (0,)
     device: str = Field(
         default="cpu",
         json_schema_extra={"pattern": _DEVICE, "patternErrorMessage": f"must be {_DEVICES}"},
@@ -164,7 +168,7 @@ class Comparison(StrictModel):
     stride_ms: int | None = Field(default=None, ge=1, le=1000)
     """The finer of two strides that they are compared at; by default a third of the window's
     length where that is whole, else the length."""
-    train_trials: int = Field(default=200, ge=1)
+    train_trials: int = Field(default=200, ge=1, le=1_000_000)
     """Training trials, of the plan's first ones, that they learn from."""
     carried: bool = False
     """Also the network with its neurons' states carried from window to window."""
@@ -182,10 +186,10 @@ class Detection(StrictModel):
 
     smoothing: int = Field(default=4, ge=1, le=1000)
     """Windows over which spike counts are averaged."""
-    margin: float = Field(default=8.0, ge=0)
+    margin: Spikes = 8.0
     """The winner must exceed every other class by at least this many mean spikes. By default two,
     as in the paper, for each of a class's ``network.outputs_per_class`` neurons."""
-    false_early_ms: float = Field(default=30.0, ge=0)
+    false_early_ms: float = Field(default=30.0, ge=0, le=1e6)
     """A detection earlier than the true onset by more than this is false."""
     stride_ms: int | None = Field(default=None, ge=1, le=1000)
     """From one window's begin to the next one's; by default a window's length, so that they
@@ -193,8 +197,8 @@ class Detection(StrictModel):
     choose: Literal["protocol", "validation", "test"] = "protocol"
     """Where smoothing and margin come from: this file; the grid below, by validation trials; or
     by the test trials themselves, as in the paper, which flatters the result."""
-    smoothing_grid: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
-    margin_grid: tuple[float, ...] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+    smoothing_grid: tuple[Annotated[int, Field(le=1000)], ...] = (1, 2, 3, 4, 6, 8)
+    margin_grid: tuple[Spikes, ...] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
     """What `choose` tries: every smoothing with every margin. By default from a half to eight
     for each of a class's output neurons."""
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from protocols.factors import Factor, Level
+from protocols.factors import Factor, Level, unknown_factor
 from protocols.hashing import hash_integer
 from protocols.quantity import canonical, parse
 from protocols.settings import Split
@@ -79,7 +79,7 @@ def check_split(split: Split, factors: Mapping[str, Factor]) -> Split:
         for name, levels in getattr(split, part).items():
             key = f"analysis.split.{part}.{name}"
             if name not in factors:
-                raise KeyedError(key, name, f"is not a factor; there are {', '.join(factors)}")
+                raise KeyedError(key, name, unknown_factor(name, factors))
             factor = factors[name]
             known = {factor.text(level) for level in (*factor.levels(), *factor.optional)}
             texts = []

@@ -50,7 +50,7 @@ class Delay(StrictModel):
     @model_validator(mode="after")
     def _ordered(self) -> Delay:
         if not self.shortest_us < self.longest_us:
-            raise KeyedError("longest_us", self.longest_us, "must be above shortest_us")
+            raise KeyedError(".longest_us", self.longest_us, "must be above shortest_us")
         return self
 
 

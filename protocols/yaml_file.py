@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import stat
+from collections.abc import Mapping
+from datetime import date
 from decimal import Decimal
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from protocols.errors import InputError
 
@@ -25,26 +29,88 @@ MAX_DEPTH = 32
 
 
 class StrictModel(BaseModel):
-    """Base of every model read from a file: frozen, and an unknown key is an error."""
+    """Base of every model read from a file: frozen, and an unknown key is an error.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    Numbers are finite, and neither switches nor days: ``yes`` is not 1, and 5 is no day of 1970.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_their_own_kind(cls, data: Any) -> Any:
+        for name, value in data.items() if isinstance(data, dict) else ():
+            leaves = _leaves(cls).get(name, _NOTHING)
+            if bool not in leaves and leaves & _NUMBERS:
+                _refuse_switch(value, f".{name}")
+            if date in leaves and (isinstance(value, int | float | Decimal) or _is_number(value)):
+                raise KeyedError(f".{name}", value, "must be a day, such as 2026-11-23")
+        return data
+
+
+_NOTHING: frozenset[Any] = frozenset()
+_NUMBERS: frozenset[Any] = frozenset({int, float, Decimal})
+
+
+@cache
+def _leaves(model: type[BaseModel]) -> dict[str, frozenset[Any]]:
+    """Plain types that each key may hold, inside lists too; a literal counts by its values."""
+    kinds = {}
+    for name, field in model.model_fields.items():
+        found: set[Any] = set()
+        todo: list[Any] = [field.annotation]
+        while todo:
+            part = todo.pop()
+            inner = get_args(part)
+            todo += inner
+            if not inner:
+                found.add(part if isinstance(part, type) else type(part))
+        kinds[field.alias or name] = frozenset(found)
+    return kinds
+
+
+def _refuse_switch(value: Any, key: str) -> None:
+    if isinstance(value, bool):
+        raise KeyedError(key, value, "must be a number")
+    if isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            _refuse_switch(item, f"{key}[{index}]")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"[+-]?[\d.]+", value.strip()) is not None
 
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
+class Document(dict[str, Any]):
+    """A YAML mapping as read, with the text of each scalar by its key.
+
+    Attributes:
+        written: such as ``{"collection.repetitions": "yes"}``, for messages.
+    """
+
+    def __init__(self, data: Mapping[str, Any], written: Mapping[str, str]) -> None:
+        super().__init__(data)
+        self.written = dict(written)
+
+
+_ALIAS, _TAG = "!alias", "tag:yaml.org,2002:"
+_SPECIAL = {".inf": "Infinity", "+.inf": "Infinity", "-.inf": "-Infinity", ".nan": "NaN"}
+_CUT_NUMBER = re.compile(r"[+-]?\d+")
+_REST_OF_NUMBER = re.compile(r"\d+(\s*[^\W\d_][\w/%]*|\s*%)?")
+
+
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """PyYAML's safe loader without aliases, with decimals for floats and unique keys."""
+    """PyYAML's safe loader as far as nodes; aliases are not followed."""
 
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.events.AliasEvent):
-            event = self.peek_event()
-            raise yaml.MarkedYAMLError(
-                problem=f"the alias '*{event.anchor}'; aliases are not read here, write it out",
-                problem_mark=event.start_mark,
-            )
+            event = self.get_event()
+            return yaml.ScalarNode(_ALIAS, f"*{event.anchor}", event.start_mark, event.end_mark)
         self.depth += 1
         if self.depth > MAX_DEPTH:
             raise yaml.MarkedYAMLError(
@@ -55,47 +121,103 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         self.depth -= 1
         return node
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        seen: set[object] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key {key!r} is not text", problem_mark=key_node.start_mark
-                )
-            if key in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key '{key}' stands twice", problem_mark=key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+
+class _Builder:
+    """Plain data from nodes, with the key of whatever is wrong."""
+
+    def __init__(self, loader: _Loader, path: str | Path) -> None:
+        self.written: dict[str, str] = {}
+        self._loader, self._path = loader, path
+
+    def build(self, node: Any, key: str) -> Any:
+        """The data of a node; `key` is where it stands."""
+        if isinstance(node, yaml.MappingNode) and node.tag == f"{_TAG}map":
+            return self._mapping(node, key)
+        if isinstance(node, yaml.SequenceNode) and node.tag == f"{_TAG}seq":
+            return [self.build(item, f"{key}[{index}]") for index, item in enumerate(node.value)]
+        if isinstance(node, yaml.ScalarNode):
+            return self._scalar(node, key)
+        raise self._wrong(node, key, None, _no_tag(node.tag))
+
+    def _mapping(self, node: Any, key: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        before: Any = None
+        for key_node, value_node in node.value:
+            if key_node.tag == f"{_TAG}merge":
+                text = "cannot be read: '<<' takes over nothing here, write the keys out"
+                raise self._wrong(key_node, f"{key}.<<" if key else "<<", None, text)
+            if _is_rest(key_node, value_node, before):
+                last, number = before[0].value, f"{before[1].value},{key_node.value}"
+                text = f"has a decimal comma; write {number.replace(',', '.', 1)}"
+                raise self._wrong(key_node, f"{key}.{last}" if key else last, number, text)
+            name = self._name(key_node, key)
+            inner = f"{key}.{name}" if key else name
+            if name in found:
+                raise self._wrong(key_node, inner, None, "cannot be read: the key stands twice")
+            found[name] = self.build(value_node, inner)
+            before = key_node, value_node
+        return found
+
+    def _name(self, node: Any, key: str) -> str:
+        name = self._scalar(node, key) if isinstance(node, yaml.ScalarNode) else None
+        if not isinstance(name, str):
+            text = "cannot be read: a key must be text; quote it if it is meant"
+            written = node.value if isinstance(node, yaml.ScalarNode) else None
+            raise self._wrong(node, key, written, text)
+        return name
+
+    def _scalar(self, node: Any, key: str) -> Any:
+        text: str = node.value
+        self.written[key] = text
+        kind = node.tag.removeprefix(_TAG)
+        try:
+            if kind == "null":
+                return None
+            if kind in {"str", "value"}:
+                return text
+            if kind == "bool":
+                return self._loader.construct_yaml_bool(node)
+            if kind == "int":
+                return int(text.replace("_", ""), 10)
+            if kind == "float" and ":" not in text:
+                plain = text.replace("_", "").lower()
+                return Decimal(_SPECIAL.get(plain, plain))
+            if kind == "timestamp":
+                return self._loader.construct_yaml_timestamp(node)
+        except (ValueError, ArithmeticError, LookupError, AttributeError):
+            pass
+        if kind == "timestamp":
+            expected = "is no day of the calendar; write one like 2026-02-28"
+        elif kind in {"int", "float"} and ":" in text:
+            expected = "reads as a base-60 number; quote it or write it out"
+        elif kind in {"int", "float", "bool"}:
+            words = {"int": "a decimal number", "float": "a number", "bool": "true or false"}
+            expected = f"is not {words[kind]}"
+        elif node.tag == _ALIAS:
+            expected = "cannot be read: aliases are not read here, write it out"
+        else:
+            expected = _no_tag(node.tag)
+        raise self._wrong(node, key, text, expected)
+
+    def _wrong(self, node: Any, key: str, value: object, expected: str) -> InputError:
+        line = node.start_mark.line + 1
+        return InputError(self._path, key, value, f"{expected} (line {line})")
 
 
-def _decimal(loader: _Loader, node: Any) -> Decimal:
-    text = node.value.replace("_", "").lower()
-    special = {".inf": "Infinity", "+.inf": "Infinity", "-.inf": "-Infinity", ".nan": "NaN"}
-    if text in special:
-        return Decimal(special[text])
-    if ":" in text:
-        raise yaml.MarkedYAMLError(
-            problem=f"'{node.value}' reads as a base-60 number; quote it or write it out",
-            problem_mark=node.start_mark,
-        )
-    return Decimal(text)
+def _no_tag(tag: str) -> str:
+    return f"cannot be read: the tag {tag.replace(_TAG, '!!')} is not read here, write the value"
 
 
-def _integer(loader: _Loader, node: Any) -> int:
-    text = node.value.replace("_", "")
-    try:
-        return int(text, 10)
-    except ValueError:
-        raise yaml.MarkedYAMLError(
-            problem=f"'{node.value}' is not a decimal number", problem_mark=node.start_mark
-        ) from None
-
-
-_Loader.add_constructor("tag:yaml.org,2002:float", _decimal)
-_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+def _is_rest(key_node: Any, value_node: Any, before: Any) -> bool:
+    """Whether a key is what follows a decimal comma: ``{speed: 2,5 mm/s}``."""
+    return (
+        before is not None
+        and isinstance(key_node, yaml.ScalarNode)
+        and isinstance(before[1], yaml.ScalarNode)
+        and value_node.value == ""
+        and _REST_OF_NUMBER.fullmatch(key_node.value) is not None
+        and _CUT_NUMBER.fullmatch(before[1].value) is not None
+    )
 
 
 def read_text(path: Path, what: str) -> str:
@@ -133,24 +255,30 @@ def _at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)
 
 
-def parse_yaml(text: str, path: str | Path) -> dict[str, Any]:
-    """YAML text as a mapping.
+def parse_yaml(text: str, path: str | Path) -> Document:
+    """YAML text as a mapping, floats as decimals.
 
     Raises:
-        InputError: not YAML, not a mapping, an alias, a key twice, nested too deep.
+        InputError: not YAML, not a mapping, an alias, a tag, a key twice, nested too deep.
     """
     try:
-        data = yaml.load(text, Loader=_Loader)
+        loader = _Loader(text)
+        builder = _Builder(loader, path)
+        try:
+            node = loader.get_single_node()
+            data = None if node is None else builder.build(node, "")
+        finally:
+            loader.dispose()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}"
         raise InputError(path, where, None, f"cannot be read: {error.problem}") from None
-    except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:
+    except (yaml.YAMLError, RecursionError) as error:
         raise InputError(path, "", None, f"is not YAML: {error}") from None
     if not isinstance(data, dict):
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(path, "", None, f"holds {found} where a mapping (key: value) belongs")
-    return data
+    return Document(data, builder.written)
 
 
 def validate(model: type[ModelT], data: dict[str, Any], path: str | Path) -> ModelT:
@@ -158,7 +286,11 @@ def validate(model: type[ModelT], data: dict[str, Any], path: str | Path) -> Mod
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise _explain(model, error, path) from None
+        found = _explain(model, error, path)
+    written = data.written.get(found.key) if isinstance(data, Document) else None
+    if written and found.value is not None:
+        found = InputError(path, found.key, written, found.expected)
+    raise found
 
 
 def load(model: type[ModelT], path: Path, what: str) -> ModelT:
@@ -172,10 +304,12 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
     loc = first["loc"]
     value: object | None = first.get("input")
     kind, context = first["type"], first.get("ctx", {})
+    key = _key(loc)
     if kind == "value_error" and isinstance(context.get("error"), KeyedError):
         keyed = context["error"]
-        return InputError(path, keyed.key, keyed.value, str(keyed))
-    key = _key(loc)
+        below = keyed.key == "" or keyed.key[0] in ".["
+        whole = (key + keyed.key).lstrip(".") if below else keyed.key
+        return InputError(path, whole, keyed.value, str(keyed))
     if kind == "extra_forbidden":
         names = _fields_at(model, loc[:-1])
         close = difflib.get_close_matches(str(loc[-1]), names, n=1)
@@ -191,12 +325,45 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
         tag = str(context.get("discriminator", "'kind'")).strip("'")
         found = value.get(tag) if isinstance(value, dict) else value
         return InputError(path, f"{key}.{tag}", found, f"must be one of {tags}")
+    if kind in _EXPECTED:
+        expected = _EXPECTED[kind]
+        if value is None:
+            return InputError(path, key, None, f"is empty; {expected}")
+        if kind == "string_type" and not isinstance(value, list | tuple | dict):
+            reads = "a switch" if isinstance(value, bool) else "a day"
+            reads = "a number" if isinstance(value, int | Decimal) and reads == "a day" else reads
+            expected += f" and reads as {reads}: quote it"
+        return InputError(path, key, value, expected)
     message = first["msg"]
     return InputError(path, key, value, message[0].lower() + message[1:])
 
 
+_LIST, _MAPPING = "must be a list ([a, b], or lines that begin with -)", "must be a mapping"
+_EXPECTED = {
+    "string_type": "must be text",
+    "tuple_type": _LIST,
+    "list_type": _LIST,
+    "model_type": f"{_MAPPING} (key: value)",
+    "model_attributes_type": f"{_MAPPING} (key: value)",
+    "dict_type": f"{_MAPPING} (key: value)",
+    "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "float_parsing": "must be a number",
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+}
+"""By pydantic's kinds of error."""
+
+
 class KeyedError(ValueError):
-    """A fault found by looking at several keys together, blamed on one of them."""
+    """A fault found by looking at several keys together, blamed on one of them.
+
+    Its key is a whole one, or begins with ``.`` or ``[`` and goes on from the model or field that
+    raises it.
+    """
 
     def __init__(self, key: str, value: object, expected: str) -> None:
         super().__init__(expected)
@@ -251,8 +418,6 @@ def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 def _inner(annotation: Any) -> Any:
     """The model inside ``list[...]``, ``X | None`` and the like; unions of phases stay whole."""
-    from typing import get_args
-
     if hasattr(annotation, "model_fields"):
         return annotation
     models = [part for part in map(_inner, get_args(annotation)) if part is not None]

@@ -120,7 +120,7 @@ def _check_same(order: Order, campaign: Campaign) -> None:
 def _changed(order: Order, campaign: Campaign) -> str:
     """What differs from the campaign's own copy of its protocol, if that can be read."""
     try:
-        begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()))
+        begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()), stored=True)
     except InputError:
         return ""
     old, new = begun.collection_data, order.plan.collection_data

@@ -31,7 +31,8 @@ class Collected:
     @cached_property
     def plan(self) -> Plan:
         """The plan of the campaign."""
-        return load_plan(self.campaign.protocol_file, self.campaign.info.get("enabled", ()))
+        enabled = self.campaign.info.get("enabled", ())
+        return load_plan(self.campaign.protocol_file, enabled, stored=True)
 
     @property
     def experiment(self) -> str:

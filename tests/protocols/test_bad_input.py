@@ -1,5 +1,6 @@
 """Whatever is wrong with a protocol file is said with file, key, value and what would be right."""
 
+import copy
 import os
 from collections.abc import Callable
 from decimal import Decimal
@@ -10,6 +11,7 @@ import pytest
 import yaml
 
 from protocols import InputError, load_plan
+from tests.conftest import ROOT
 
 Change = Callable[[dict[str, Any]], None]
 
@@ -33,6 +35,7 @@ def _drop(*path: Any) -> Change:
 
 
 COLLECTION = "collection"
+LEFT_OUT = {"method": "leave_conditions_out", "test_levels": {"depth": ["2.4 mm"]}}
 CASES: dict[str, tuple[Change, str, str]] = {
     "unknown key": (
         _set(COLLECTION, "repetition", to=2),
@@ -148,8 +151,8 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "missing section": (_drop(COLLECTION, "limits"), "collection.limits", "is missing"),
     "reference to nothing": (
         _set(COLLECTION, "motion", 1, "depth", to="$deep"),
-        "collection.motion",
-        "not there",
+        "collection.motion[1].depth",
+        "unknown factor $deep; defined factors: depth, speed, direction",
     ),
     "unused factor": (
         _set(COLLECTION, "factors", "extra", to={"values": ["a"]}),
@@ -212,6 +215,85 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "add up to 1",
     ),
     "name that leads out of the store": (_set("name", to="../x"), "name", "pattern"),
+    "strata that are no factors": (
+        _set("analysis", "split", "strata", to=["depht", "speed"]),
+        "analysis.split.strata[0]",
+        "= depht: unknown factor depht; defined factors: depth, speed, direction",
+    ),
+    "a stratum twice": (
+        _set("analysis", "split", "strata", to=["depth", "depth"]),
+        "analysis.split.strata[1]",
+        "stands twice",
+    ),
+    "a factor held out that is none": (
+        _set("analysis", "split", to={**LEFT_OUT, "test_levels": {"depht": ["2.4 mm"]}}),
+        "analysis.split.test_levels.depht",
+        "unknown factor depht; defined factors: depth, speed, direction",
+    ),
+    "nothing held out": (
+        _set("analysis", "split", to={**LEFT_OUT, "test_levels": {"depth": []}}),
+        "analysis.split.test_levels.depth",
+        "at least one level",
+    ),
+    "a level held out twice over": (
+        _set("analysis", "split", to={**LEFT_OUT, "validation_levels": {"depth": ["0.24 cm"]}}),
+        "analysis.split.validation_levels.depth",
+        "is held out for the test already",
+    ),
+    "a reference to a factor that is none": (
+        _set(COLLECTION, "motion", 3, "speed", to="$sped"),
+        "collection.motion[3].speed",
+        "= $sped: unknown factor $sped; defined factors: depth, speed, direction",
+    ),
+    "a reference condition of another factor": (
+        _set(
+            COLLECTION,
+            "references",
+            to={"every": 5, "condition": {"depth": 2, "speed": 1, "direction": 0, "sped": 1}},
+        ),
+        "collection.references.condition.sped",
+        "unknown factor sped; defined factors: depth, speed, direction",
+    ),
+    "one direction twice": (
+        _set(COLLECTION, "factors", "direction", "values", to=[0, 90, 360]),
+        "collection.factors.direction.values[2]",
+        "= 360: 360 deg is the same direction as 0 deg",
+    ),
+    "one direction twice, in a range": (
+        _set(
+            COLLECTION,
+            "factors",
+            "direction",
+            to={"unit": "deg", "range": {"from": -180, "to": 180, "step": 90}},
+        ),
+        "collection.factors.direction.range",
+        "180 deg is the same direction as -180 deg",
+    ),
+    "one direction twice, when it is switched on": (
+        _set(COLLECTION, "factors", "direction", "optional", to=[-90]),
+        "collection.factors.direction.optional[0]",
+        "is the same direction as 270 deg",
+    ),
+    "many turns": (
+        _set(COLLECTION, "factors", "direction", "values", to=[0, -1e9]),
+        "collection.factors.direction.values[1]",
+        "must be from -360 to 360 deg",
+    ),
+    "many turns in a phase": (
+        _set(COLLECTION, "motion", 3, "direction", to="1e6 deg"),
+        "collection.motion[3].direction",
+        "must be from -360 to 360 deg",
+    ),
+    "a length of planets": (
+        _set(COLLECTION, "recording", "region", "width", to="9e8 m"),
+        "collection.recording.region.width",
+        "must be from -100000 to 100000 mm",
+    ),
+    "a switch in a list of numbers": (
+        _set("analysis", "training", to={"seeds": [0, True]}),
+        "analysis.training.seeds[1]",
+        "= true: must be a number",
+    ),
 }
 
 
@@ -220,7 +302,7 @@ def test_the_message_names_key_and_cure(case: str, small: dict[str, Any], tmp_pa
     change, key, says = CASES[case]
     change(small)
     path = tmp_path / "wrong.yaml"
-    path.write_text(yaml.safe_dump(small))
+    path.write_text(yaml.safe_dump(small, sort_keys=False))
     with pytest.raises(InputError) as caught:
         load_plan(path)
     assert str(path) in caught.value.message
@@ -282,7 +364,7 @@ def test_ids_that_no_folder_can_have_are_refused(
     small: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "long.yaml"
-    path.write_text(yaml.safe_dump(small))
+    path.write_text(yaml.safe_dump(small, sort_keys=False))
     load_plan(path)
     monkeypatch.setattr("protocols.plan.MAX_ID", 30)
     with pytest.raises(InputError, match="30 at most"):
@@ -292,3 +374,126 @@ def test_ids_that_no_folder_can_have_are_refused(
 def test_a_number_is_shown_as_it_was_written() -> None:
     error = InputError("rig.yaml", "mock.scene.friction.kinetik", Decimal("0.9"), "unknown key")
     assert str(error) == "rig.yaml: mock.scene.friction.kinetik = 0.9: unknown key"
+
+
+INFINITE = float("inf")
+NUMBERS: dict[tuple[Any, ...], list[Any]] = {
+    (COLLECTION, "repetitions"): [True, INFINITE, 10**12],
+    (COLLECTION, "seed"): [True, INFINITE, -1, 2**63],
+    (COLLECTION, "references"): [
+        {"every": each, "condition": {"depth": 2.8, "speed": 1, "direction": 0}}
+        for each in (True, 10**12)
+    ],
+    (COLLECTION, "gates", "frames_lost"): [False, INFINITE, 10**12],
+    (COLLECTION, "gates", "event_burst"): [True, INFINITE, 10**12],
+    (COLLECTION, "gates", "retakes"): [True, 10**12],
+    (COLLECTION, "gates", "event_gap"): [True, "inf s", "1e9 s"],
+    (COLLECTION, "gates", "path_deviation"): ["nan mm", "1e9 mm"],
+    (COLLECTION, "gates", "sync_uncertainty"): [{"host_time": "1e9 min"}],
+    (COLLECTION, "maintenance", "rezero", "every"): [True, INFINITE, 10**12],
+    (COLLECTION, "maintenance", "warm_up", "presses"): [True, 10**12],
+    (COLLECTION, "maintenance", "clean"): [{"every": 10**12, "prompt": "clean"}],
+    (COLLECTION, "limits", "duration"): ["1e9 min"],
+    (COLLECTION, "limits", "workspace", "x", "low"): ["-1e9 m"],
+    ("analysis", "labelling", "threshold_px"): [True, INFINITE, 10**12],
+    ("analysis", "labelling", "reference_ms"): [True, INFINITE, 10**12],
+    ("analysis", "windows", "length_ms"): [True, INFINITE, 10**12],
+    ("analysis", "windows", "pool_px"): [True],
+    ("analysis", "samples", "per_class"): [True, 10**12],
+    ("analysis", "split", "train"): [True, INFINITE, float("nan")],
+    ("analysis", "network"): [
+        {"conv1_kernel": True},
+        {"weight_scale": [4, 3, 4, True]},
+        {"weight_scale": [4, 3, 4, INFINITE]},
+        {"weight_scale": [4, 3, 4, -1]},
+        {"outputs_per_class": 10**12},
+    ],
+    ("analysis", "training", "epochs"): [True, INFINITE, 10**12],
+    ("analysis", "training", "learning_rate"): [True, float("nan"), 10**12],
+    ("analysis", "training", "gain"): [True, INFINITE],
+    ("analysis", "training", "patience"): [True, 10**12],
+    ("analysis", "training", "seeds"): [[10**30], [True]],
+    ("analysis", "detection", "smoothing"): [True, INFINITE, 10**12],
+    ("analysis", "detection", "margin"): [True, INFINITE, float("nan"), "inf", 1e12],
+    ("analysis", "detection", "false_early_ms"): [True, INFINITE, 1e12],
+    ("analysis", "detection", "smoothing_grid"): [[1, 10**12], [True, 2]],
+    ("analysis", "detection", "margin_grid"): [[1, INFINITE], [1, 1e12], [False, 2]],
+    ("analysis", "detection", "false_early_rate"): [True, INFINITE, float("nan")],
+    ("analysis", "detection", "compare"): [
+        {"train_trials": 10**12}, {"rates": [float("nan")]}, {"rates": [False]}
+    ],
+    ("protocol",): [True],
+    (COLLECTION, "recording", "sync_rate"): [True, INFINITE],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("path", NUMBERS, ids=lambda path: ".".join(map(str, path)))
+def test_numbers_are_numbers_finite_and_bounded(
+    path: tuple[Any, ...], small: dict[str, Any], tmp_path: Path
+) -> None:
+    """No switch (yes is not 1), no infinity, no NaN, nothing out of the world."""
+    key = ".".join(map(str, path))
+    file = tmp_path / "wrong.yaml"
+    for value in NUMBERS[path]:
+        data = copy.deepcopy(small)
+        _set(*path, to=value)(data)
+        file.write_text(yaml.safe_dump(data))
+        with pytest.raises(InputError) as caught:
+            load_plan(file)
+        assert caught.value.key.startswith(key), caught.value.message
+        assert caught.value.value is not None
+        assert "Decimal(" not in caught.value.message
+
+
+def gravity() -> dict[str, Any]:
+    """The gravity pilot as data."""
+    data: dict[str, Any] = yaml.safe_load((ROOT / "protocols" / "pilot_gravity.yaml").read_text())
+    return data
+
+
+def _without(action: str) -> dict[str, Any]:
+    data = gravity()
+    motion = data[COLLECTION]["motion"]
+    motion[:] = [phase for phase in motion if phase.get("action") != action]
+    return data
+
+
+def _caught_first() -> dict[str, Any]:
+    data = gravity()
+    motion = data[COLLECTION]["motion"]
+    motion[-2], motion[4] = motion[4], motion[-2]
+    return data
+
+
+@pytest.mark.parametrize(
+    ("made", "key", "says"),
+    [
+        (_without("catch"), "collection.motion", "is never caught: add"),
+        (_without("release"), "collection.motion", "must release the plate"),
+        (_without("raise"), "collection.motion", "must raise the plate"),
+        (_caught_first(), "collection.motion[4].action", "must come after"),
+    ],
+)
+def test_a_plate_that_falls_is_caught(
+    made: dict[str, Any], key: str, says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(yaml.safe_dump(made))
+    with pytest.raises(InputError) as caught:
+        load_plan(path)
+    assert caught.value.key == key, caught.value.message
+    assert says in caught.value.message
+
+
+def test_protocols_in_stores_are_held_to_the_rules_of_their_day(
+    small: dict[str, Any], tmp_path: Path
+) -> None:
+    """A campaign that was collected under rules without some of today's can still be used."""
+    path = tmp_path / "protocol.yaml"
+    small["analysis"]["split"]["strata"] = ["depht", "speed"]
+    small[COLLECTION]["factors"]["direction"]["values"] = [0, 360]
+    for data in (small, _without("catch")):
+        path.write_text(yaml.safe_dump(data))
+        assert len(load_plan(path, stored=True)) > 0
+        with pytest.raises(InputError):
+            load_plan(path)

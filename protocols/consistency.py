@@ -1,0 +1,115 @@
+"""Rules over several keys that came after the first campaigns.
+
+They refuse what is allowed key by key and surely not meant: a name of no factor, one direction
+twice, a plate that nobody catches. Copies of protocols in stores are not held to them, for their
+trials were taken and stay usable (docs/decisions/0069).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from decimal import Decimal
+from itertools import pairwise
+
+from protocols.factors import Factor, unknown_factor
+from protocols.model import Collection, Protocol
+from protocols.phases import PlateMotion, Retract, Slide
+from protocols.quantity import canonical
+from protocols.settings import Split
+from protocols.yaml_file import KeyedError
+
+FULL_TURN = 360
+
+
+def check_consistency(protocol: Protocol) -> None:
+    """Hold a protocol that a person gives against the rules over several keys.
+
+    Raises:
+        KeyedError: the first rule that is broken.
+    """
+    _check_strata(protocol.analysis.split, protocol.collection.factors)
+    _check_held_out(protocol.analysis.split)
+    _check_directions(protocol.collection)
+    _check_plate(protocol.collection)
+
+
+def _check_strata(split: Split, factors: Mapping[str, Factor]) -> None:
+    if "strata" not in split.model_fields_set:  # the default is of the kinematic grid
+        return
+    for index, name in enumerate(split.strata):
+        key = f"analysis.split.strata[{index}]"
+        if name not in factors:
+            raise KeyedError(key, name, unknown_factor(name, factors))
+        if name in split.strata[:index]:
+            raise KeyedError(key, name, "stands twice")
+
+
+def _check_held_out(split: Split) -> None:
+    if split.method != "leave_conditions_out":
+        return
+    for part in ("validation_levels", "test_levels"):
+        for name, levels in getattr(split, part).items():
+            key = f"analysis.split.{part}.{name}"
+            if not levels:
+                raise KeyedError(key, "[]", "must name at least one level")
+            if part == "validation_levels":
+                for level in levels:
+                    if level in split.test_levels.get(name, ()):
+                        raise KeyedError(key, level, "is held out for the test already")
+
+
+def _check_directions(collection: Collection) -> None:
+    """Two directions that differ by full turns are one condition under two names."""
+    for name, factor in collection.factors.items():
+        if factor.unit != "deg":
+            continue
+        seen: dict[Decimal, Decimal] = {}
+        for level in (*factor.levels(), *factor.optional):
+            assert not isinstance(level, str)  # a factor with a unit has no words
+            known = seen.setdefault((level % FULL_TURN + FULL_TURN) % FULL_TURN, level)
+            if known is not level:
+                raise KeyedError(
+                    f"collection.factors.{name}.{factor.place(level)}",
+                    level,
+                    f"{canonical(level)} deg is the same direction as {canonical(known)} deg",
+                )
+
+
+def _check_plate(collection: Collection) -> None:
+    """A plate is raised, released and caught, in this order; it must not fall on what is below."""
+    motion = collection.motion
+    places: dict[str, int] = {}
+    for index, phase in enumerate(motion):
+        if isinstance(phase, PlateMotion):
+            if phase.action in places:
+                raise KeyedError(
+                    f"collection.motion[{index}].action", phase.action, "stands twice in the motion"
+                )
+            places[phase.action] = index
+    falls = collection.experiment != "kinematic"
+    acting = next(i for i, phase in enumerate(motion) if isinstance(phase, Slide | Retract))
+
+    def wanted(action: str, text: str) -> None:
+        if action not in places:
+            names = " -> ".join(phase.phase for phase in motion)
+            raise KeyedError(
+                "collection.motion", names, f"{text}: add {{phase: plate, action: {action}}}"
+            )
+
+    if falls:
+        wanted("release", f"a {collection.experiment} protocol must release the plate")
+    if "release" in places:
+        wanted("raise", "must raise the plate before its release")
+        wanted("catch", "the plate is released and is never caught")
+    order = [name for name in ("raise", "release", "catch") if name in places]
+    for before, after in pairwise(order):
+        if places[after] < places[before]:
+            key = f"collection.motion[{places[after]}].action"
+            raise KeyedError(key, after, f"must come after '{before}'")
+    for name, late in (("release", False), ("catch", True)):
+        if name in places and (places[name] > acting) != late:
+            raise KeyedError(
+                f"collection.motion[{places[name]}].action",
+                name,
+                f"must come {'after' if late else 'before'} '{motion[acting].phase}'",
+            )
