@@ -15,13 +15,10 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import os
-import socket
-import subprocess
-import sys
-import tempfile
-import threading
 from multiprocessing.connection import Connection
 from typing import Any
+
+from rigs.library_process import LibraryError, LibraryProcess
 
 START_S = 10.0
 """How long the child may take to connect, upload the control script and see it run, s."""
@@ -37,17 +34,15 @@ _IDLE_KICK_S = 1.0
 """The same once the controller's program has ended and there is nothing to keep alive."""
 _SELF_END_S = 2.0
 """How much later than its parent's bound the child ends itself, s."""
-_KILL_S = 2.0
-"""How long a killed child may take to be gone, s."""
 _PARENT_GONE_STOP_S = 2.0
 _STOP_DECELERATION_M_S2 = 1.0
 
 
-class ControlError(RuntimeError):
+class ControlError(LibraryError):
     """The control client refused, failed or did not answer in time; the text says which."""
 
 
-class ControlProcess:
+class ControlProcess(LibraryProcess):
     """The parent's side: calls of `RTDEControlInterface` by name, each with a bound.
 
     Args:
@@ -59,82 +54,13 @@ class ControlProcess:
     """
 
     def __init__(self, host: str, frequency_hz: float) -> None:
-        start_s = START_S
-        ours, theirs = socket.socketpair()
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
-        self._lock = threading.Lock()
-        code = (
-            f"import sys; sys.path[:] = {sys.path!r}; from rigs.arms.ur_control import serve; "
-            f"serve({theirs.fileno()}, {host!r}, {frequency_hz!r}, {start_s!r})"
+        super().__init__(
+            "control client",
+            "rigs.arms.ur_control:serve",
+            (host, frequency_hz, START_S),
+            START_S,
+            ControlError,
         )
-        with theirs:
-            self._child = subprocess.Popen(
-                [sys.executable, "-c", code],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=self._log,
-                start_new_session=True,  # Ctrl-C is the parent's to handle: it stops the arm first
-            )
-        self._pipe = Connection(ours.detach())
-        try:
-            self._answer("connect", start_s)
-        except ControlError:
-            self.close()
-            raise
-
-    def call(self, name: str, *arguments: Any, within_s: float) -> Any:
-        """The result of one call. Thread-safe: a second caller waits for the first.
-
-        Raises:
-            ControlError: the client raised, died, or did not answer within `within_s`. In the
-                last two cases the child is gone and every later call fails at once.
-        """
-        if not self._lock.acquire(timeout=within_s):
-            raise ControlError(f"{name}: the call before it has not ended")
-        try:
-            if self._child.poll() is not None:
-                raise ControlError(f"{name}: the control client is gone")
-            try:
-                self._pipe.send((name, arguments, within_s))
-            except OSError:
-                raise ControlError(f"{name}: the control client is gone") from None
-            return self._answer(name, within_s)
-        finally:
-            self._lock.release()
-
-    def kill(self) -> None:
-        """End the child now, whatever it is doing; safe to call more than once."""
-        if self._child.poll() is None:
-            self._child.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._child.wait(_KILL_S)
-
-    def close(self) -> None:
-        """End the child and forget it."""
-        self.kill()
-        self._pipe.close()
-        self._log.close()
-
-    def _answer(self, name: str, within_s: float) -> Any:
-        try:
-            if not self._pipe.poll(within_s):
-                self.kill()
-                raise ControlError(f"{name}: no answer within {within_s:g} s{self._said()}")
-            fine, result = self._pipe.recv()
-        except (OSError, EOFError):
-            self.kill()
-            raise ControlError(f"{name}: the control client died{self._said()}") from None
-        if not fine:
-            raise ControlError(f"{name}: {result}")
-        return result
-
-    def _said(self) -> str:
-        """The last line that the client wrote, for a person to read."""
-        size = os.fstat(self._log.fileno()).st_size
-        end = os.pread(self._log.fileno(), 2000, max(0, size - 2000))  # the child's offset stays
-        lines = end.decode(errors="replace").strip().splitlines()
-        return f" (it said: {lines[-1]})" if lines else ""
 
 
 def serve(fd: int, host: str, frequency_hz: float, start_s: float) -> None:

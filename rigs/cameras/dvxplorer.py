@@ -12,14 +12,13 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import asdict
-from datetime import timedelta
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
 from rigs.cameras.counts import EventCounts
-from rigs.cameras.event_source import DEVICE, EventSource, open_source
-from rigs.cameras.health import dvxplorer_health
+from rigs.cameras.event_process import EventProcess
+from rigs.cameras.event_source import DEVICE, Look
 from rigs.cameras.patience import Patience
 from rigs.cameras.settings import DvxplorerSettings
 from rigs.capabilities import DeviceHealth, RigError
@@ -29,13 +28,35 @@ POLL_S = 0.001
 """The pause after a look that found nothing, s."""
 SETTLE_S = 1.0
 """The longest that `start` and `stop` wait until all is taken that came before, s."""
-HANG_S = 5.0
-"""The library, which answers at once, must have answered by then, s."""
+HANG_S = 10.0
+"""The thread must have come back from a look by then, s; longer than `event_process.ANSWER_S`."""
 CLOSE_S = 3.0
 """The longest that `close` waits for the thread, s."""
+RISING_EDGE, TIMESTAMP_RESET = 1, 0
+"""`EXTERNAL_SIGNAL_RISING_EDGE` and `TIMESTAMP_RESET` of `dv.TriggerType`."""
 _EVENT_BYTES = 13
 _LOOK_NS = 10_000_000
 """The most that one look which found nothing counts as silence, ns."""
+
+
+class Source(Protocol):
+    """Opened inputs: an `EventSource`, or an `EventProcess` that has one."""
+
+    name: str
+    resolution: tuple[int, int]
+    in_force: Json
+
+    def run(self, on: bool, noise_filter_us: int | None = None) -> None:
+        """Switch events and triggers. Raises RigError."""
+
+    def look(self) -> Look:
+        """Take all that has come."""
+
+    def health(self, settings: DvxplorerSettings) -> DeviceHealth:
+        """What the camera says of itself. Raises RigError."""
+
+    def close(self) -> None:
+        """Give it back; any number of times."""
 
 
 class DvxplorerCamera:
@@ -48,13 +69,10 @@ class DvxplorerCamera:
         RigError: nothing there, or nothing that sends events and triggers.
     """
 
-    def __init__(self, settings: DvxplorerSettings, source: EventSource | None = None) -> None:
+    def __init__(self, settings: DvxplorerSettings, source: Source | None = None) -> None:
         self.settings = settings
-        self._source = source if source is not None else open_source(settings.source)
+        self._source: Source = source if source is not None else EventProcess(settings)
         self.width, self.height = self._source.resolution
-        self._filter: Any = None
-        self._rising: Any = None
-        self._reset: Any = None
         self._lock = threading.Lock()
         self._wanted = self._keep = False
         self._settled, self._closing = threading.Event(), threading.Event()
@@ -87,6 +105,7 @@ class DvxplorerCamera:
             "camera": self._source.name,
             "resolution_px": [self.width, self.height],
             "settings": self.settings.model_dump(mode="json"),
+            "in_force": self._source.in_force,
             "counts": asdict(self.counts),
         }
 
@@ -98,7 +117,7 @@ class DvxplorerCamera:
         """
         if self._closed:
             raise RigError(DEVICE, "it is closed; open it again")
-        return dvxplorer_health(self._source, self.settings)
+        return self._source.health(self.settings)
 
     def start(self) -> None:
         """Begin to stream; what came before is dropped. Returns within `SETTLE_S`.
@@ -110,8 +129,7 @@ class DvxplorerCamera:
             raise self._fault or RigError(DEVICE, "it is closed; open it again")
         with self._lock:
             self._forget()
-            self._filter = self._new_filter()
-        self._source.run(True)
+        self._source.run(True, self.settings.noise_filter_us)
         self._want(True)
         with self._lock:
             self._silent_ns = 0
@@ -166,10 +184,10 @@ class DvxplorerCamera:
         self.stop()
         self._closing.set()
         self._thread.join(CLOSE_S)
+        self._source.close()
         if self._thread.is_alive():
             raise RigError(DEVICE, f"reading has not ended within {CLOSE_S:g} s")
         self._closed = True
-        del self._source  # the library closes what nobody holds any more
 
     def _check(self) -> None:
         if self._fault is not None:
@@ -193,35 +211,31 @@ class DvxplorerCamera:
             self._keep = wanted
 
     def _run(self) -> None:
-        import dv_processing as dv
-
-        self._rising = dv.TriggerType.EXTERNAL_SIGNAL_RISING_EDGE
-        self._reset = dv.TriggerType.TIMESTAMP_RESET
         source = self._source
         while not self._closing.is_set():
             try:
                 wanted = self._wanted
-                events = source.events.getNextEventBatch()
-                triggers = source.triggers.getNextTriggerBatch()
-                if events is not None:
-                    self._take_events(events)
-                if triggers is not None:
-                    self._take_triggers(triggers)
+                look = source.look()
+                if look.events is not None:
+                    self._take_events(look.events, look.filtered)
+                if len(look.trigger_us):
+                    self._take_triggers(look)
                 now_ns = time.monotonic_ns()
-                if events is None and triggers is None:
+                if look.empty:
                     with self._lock:
                         self._keep = wanted
                         # silence is what was listened to: a computer that stood still heard nothing
                         self._silent_ns += min(now_ns - self._asked_ns, _LOOK_NS)
                     if wanted == self._wanted:
                         self._settled.set()
-                    if not (source.events.isRunning() and source.triggers.isRunning()):
+                    if not look.running:
                         self._fail("the connection is gone; look at its cable and open it again")
                         break
                     self._closing.wait(POLL_S)
                 self._asked_ns = now_ns
             except Exception as error:
-                self._fail(f"reading failed: {error}")
+                why = str(error).removeprefix(f"{DEVICE}: ")
+                self._fail(f"reading failed: {why}; look at what sends, and open it again")
                 break
         self._settled.set()
 
@@ -230,24 +244,11 @@ class DvxplorerCamera:
             if self._fault is None:
                 self._fault = RigError(DEVICE, what)
 
-    def _take_events(self, batch: Any) -> None:
-        came = batch.size()
+    def _take_events(self, chunk: EventChunk, filtered: int) -> None:
         if not self._keep:
             with self._lock:
-                self._counts.before += came
+                self._counts.before += len(chunk) + filtered
             return
-        filtered = 0
-        if self._filter is not None:
-            self._filter.accept(batch)
-            batch = self._filter.generateEvents()
-            filtered = came - batch.size()
-        rows = batch.numpy()
-        chunk = EventChunk(
-            rows["x"].astype(np.uint16),
-            rows["y"].astype(np.uint16),
-            rows["polarity"].astype(np.uint8),
-            np.ascontiguousarray(rows["timestamp"], np.int64),
-        )
         with self._lock:
             counts, self._silent_ns = self._counts, 0
             counts.filtered += filtered
@@ -281,16 +282,15 @@ class DvxplorerCamera:
         counts.longest_gap_us = max(counts.longest_gap_us, int(steps.max()))
         return True
 
-    def _take_triggers(self, batch: Any) -> None:
+    def _take_triggers(self, look: Look) -> None:
         if not self._keep:
             return
         with self._lock:
             self._silent_ns = 0
-            for trigger in batch:
-                at, kind = int(trigger.timestamp), trigger.type
-                if kind == self._reset:
+            for at, kind in zip(look.trigger_us.tolist(), look.trigger_kind.tolist(), strict=True):
+                if kind == TIMESTAMP_RESET:
                     self._fault = RigError(DEVICE, f"its clock began anew at {at} us")
-                elif kind != self._rising:
+                elif kind != RISING_EDGE:
                     self._counts.other_triggers += 1
                 elif self._last_pulse_us is not None and at < self._last_pulse_us:
                     self._fault = RigError(
@@ -300,12 +300,3 @@ class DvxplorerCamera:
                     self._last_pulse_us = at
                     self._counts.pulses += 1
                     self._pulses.append(at)
-
-    def _new_filter(self) -> Any:
-        if self.settings.noise_filter_us is None:
-            return None
-        import dv_processing as dv
-
-        return dv.noise.BackgroundActivityNoiseFilter(
-            (self.width, self.height), timedelta(microseconds=self.settings.noise_filter_us)
-        )

@@ -1,4 +1,4 @@
-"""What open cameras say of themselves, for a look at the rig before a campaign.
+"""What an open frame camera says of itself, for a look at the rig before a campaign.
 
 Names of Basler's nodes are those of its ace 2 USB family, and older ones after them. None of this
 was read from a real camera yet: what a camera does not have is left out or `unknown`.
@@ -8,11 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from rigs.cameras.event_source import DEVICE as EVENT_CAMERA
-from rigs.cameras.event_source import EventSource
 from rigs.cameras.nodes import DEVICE as FRAME_CAMERA
 from rigs.cameras.nodes import Nodes
-from rigs.cameras.settings import DvxplorerSettings
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import DeviceHealth, RigError
 
@@ -58,42 +55,3 @@ def basler_health(
         else f"{stamping.means}, grade {stamping.grade}",
         notes=tuple(notes),
     )
-
-
-def dvxplorer_health(source: EventSource, settings: DvxplorerSettings) -> DeviceHealth:
-    """Of an open event camera, or of the streams that stand for one.
-
-    Its only thermometer is the IMU's, and the IMU is off.
-
-    Raises:
-        RigError: the camera is gone.
-    """
-    if not (source.events.isRunning() and source.triggers.isRunning()):
-        raise RigError(EVENT_CAMERA, "the connection is gone; look at its cable")
-    width, height = source.resolution
-    notes = [f"{width} x {height} px", f"{settings.buffer_mb:g} MB for events nobody has read"]
-    serial = firmware = UNKNOWN
-    camera = source.camera
-    if camera is not None:
-        try:
-            serial = str(camera.getSerialNumber())
-            firmware = f"{camera.getFirmwareVersion()}, logic {camera.getLogicVersion()}"
-            notes.append(f"link {_said(camera.getConnectionSpeed()).removeprefix('libusb speed ')}")
-            notes.append(f"read-out {_said(camera.getReadoutFPS())}")
-        except RuntimeError as error:
-            raise RigError(EVENT_CAMERA, f"it does not answer: {error}") from None
-    else:
-        notes.append("from the network")
-    return DeviceHealth(
-        device=EVENT_CAMERA,
-        model=source.name,
-        serial=serial,
-        firmware=firmware,
-        temperature_c=None,
-        clock="the camera's, 1 us",
-        notes=tuple(notes),
-    )
-
-
-def _said(choice: Any) -> str:
-    return str(choice.name).lower().replace("_", " ")

@@ -273,7 +273,8 @@ def test_a_camera_is_set_by_names_that_the_library_has() -> None:
     done: dict[str, Any] = {}
 
     class Recorder:
-        ReadoutFPS = dv.io.camera.DVXplorer.ReadoutFPS
+        def getEventResolution(self) -> tuple[int, int]:
+            return 640, 480
 
         def __getattr__(self, name: str) -> Callable[[Any], None]:
             assert hasattr(dv.io.camera.DVXplorer, name)

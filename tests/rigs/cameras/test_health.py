@@ -14,7 +14,6 @@ import pytest
 
 from rigs.cameras import build_event_camera, build_frame_camera
 from rigs.cameras.event_source import EventSource
-from rigs.cameras.health import dvxplorer_health
 from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
 from rigs.capabilities import DeviceHealth, EventCamera, FrameCamera, RigError
 from rigs.wire.basler import unplug
@@ -89,12 +88,12 @@ class Usb:
 def test_a_camera_on_usb_is_asked_by_names_that_the_library_has() -> None:
     usb = Usb()
     source = EventSource(usb, usb, usb, (640, 480), "DVXplorer_DXA00001")
-    health = dvxplorer_health(source, DvxplorerSettings())
+    health = source.health(DvxplorerSettings())
     assert (health.serial, health.firmware) == ("DXA00001", "7, logic 9")
     assert {"link super", "read-out constant 1000"} <= set(health.notes)
     usb.answers["isRunning"] = False
     with pytest.raises(RigError, match="connection is gone"):
-        dvxplorer_health(source, DvxplorerSettings())
+        source.health(DvxplorerSettings())
 
 
 @pytest.mark.usefixtures("pylon_emulation")
