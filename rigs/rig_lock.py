@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rigs.capabilities import RigError
 from rigs.rig_file import RigFile
-from storage.lock import exclusive
+from storage.lock import NoLocks, exclusive
 
 ENVIRONMENT = "SLIPLAB_RUNTIME"
 _FOLDER = Path("/tmp/sliplab-rigs")
@@ -57,7 +57,7 @@ def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
                 folder = _folder(locks)
                 for name, what in names.items():
                     locks.enter_context(exclusive(folder / name, what, mode=0o666, about=about))
-            except OSError as error:
+            except (OSError, NoLocks) as error:
                 raise RigError(
                     "rig",
                     f"cannot be locked against other programs: {error}; name a folder that all "

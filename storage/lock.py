@@ -1,7 +1,9 @@
 """One holder at a time: an OS lock that dies with its holder, and names it to whoever is refused.
 
 The kernel frees the lock when the holder ends, however it ends. What stands in the file only says
-who holds it; it is believed only while the lock is held.
+who holds it; it is believed only while the lock is held. Where locks do not reach other machines,
+the note of another machine's holder is believed until a person deletes it. A file system without
+locks, or with locks that keep nobody out, is refused (docs/decisions/0070).
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from storage.errors import StoreError
+from storage.files import disk_fault
 from storage.process import named, this_process
 from storage.streams import Json
 
@@ -23,6 +27,15 @@ PATIENCE_S = 3.0
 """How long a holder that is done at once (`brief`) is waited for."""
 _LOOK_S = 0.05
 _HOLDER_BYTES = 4000
+MOUNTS = Path("/proc/self/mountinfo")
+_ALONE = {"9p", "vboxsf", "prl_fs", "virtiofs", "fuse"}
+"""Types of file systems whose locks are kept by each machine for itself; also all of `fuse.*`."""
+_ALONE_OPTIONS = {"nobrl", "nolock", "local_lock=flock", "local_lock=all"}
+"""Of NFS and SMB mounts: locks are not sent to the server."""
+
+
+class NoLocks(StoreError):
+    """The file system of a lock keeps no file locks; the message says what to do."""
 
 
 class Locked(RuntimeError):
@@ -51,13 +64,15 @@ def exclusive(
 
     Raises:
         Locked: it is held. Only a brief holder is waited for, `PATIENCE_S` at most.
+        NoLocks: the file system keeps no locks.
         OSError: the file cannot be made or opened.
     """
     handle = _open(path, mode)
     try:
-        _acquire(handle, what)
+        _acquire(handle, path, what)
         if os.fstat(handle).st_nlink == 0:  # somebody cleaned the folder up in between
             raise Locked(f"{what}: the lock file {path} was deleted meanwhile; try again")
+        _check(handle, path, what)
         told = {**this_process(), "brief": brief, **(about or {})}
         os.ftruncate(handle, 0)
         os.pwrite(handle, json.dumps(told).encode(), 0)
@@ -85,18 +100,85 @@ def _open(path: Path, mode: int) -> int:
     return handle
 
 
-def _acquire(handle: int, what: str) -> None:
+def _acquire(handle: int, path: Path, what: str) -> None:
     waited = threading.Event()
     for _ in range(round(PATIENCE_S / _LOOK_S)):
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if _locks(handle, path):
             return
-        except BlockingIOError:
-            holder = _holder(handle)
+        holder = _holder(handle)
         if holder and not holder.get("brief"):
             break
         waited.wait(_LOOK_S)
     raise Locked(f"{what} is in use by another program ({named(holder)})", holder)
+
+
+def _locks(handle: int, path: Path) -> bool:
+    """Lock an open file, or return False because another has it.
+
+    Raises:
+        NoLocks: the file system cannot.
+    """
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if disk_fault(error):
+            raise
+        raise _no_locks(path, os.strerror(error.errno or 0)) from error
+    return True
+
+
+def _no_locks(path: Path, why: str) -> NoLocks:
+    return NoLocks(
+        f"{path.parent}: its file system keeps no file locks ({why}), and two programs would write "
+        "at once: put the store on one that does, such as a local disk; `sliplab push` brings its "
+        "trials to a shared folder"
+    )
+
+
+def _check(handle: int, path: Path, what: str) -> None:
+    """See that the lock that was just taken keeps others out, on this machine and elsewhere.
+
+    Raises:
+        NoLocks: a second open file is not kept out.
+        Locked: a program on another machine, which the lock does not reach, has not let go.
+    """
+    second = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        if os.path.sameopenfile(handle, second) and _locks(second, path):
+            raise _no_locks(path, "what is locked can be locked again")
+    finally:
+        os.close(second)
+    left, ours = _holder(handle), this_process()
+    elsewhere = left.get("host") not in {None, ours["host"]} and left.get("boot") != ours["boot"]
+    if elsewhere and (kind := _alone(handle)):
+        raise Locked(
+            f"{what} was last held by another machine ({named(left)}) and not let go; locks on "
+            f"{kind} do not reach other machines, so it may be in use there: see that it is not, "
+            f"then delete {path}",
+            left,
+        )
+
+
+def _alone(handle: int) -> str | None:
+    """Return the type of an open file's file system if other machines do not see its locks."""
+    device = os.fstat(handle).st_dev
+    number = f"{os.major(device)}:{os.minor(device)}"
+    try:
+        mounts = MOUNTS.read_text().splitlines()
+    except OSError:
+        return None
+    for mount in mounts:
+        place, _, system = mount.partition(" - ")
+        kind, _, options = system.partition(" ")
+        if place.split()[2] == number and (
+            kind in _ALONE
+            or kind.startswith("fuse.")
+            or (kind.startswith(("nfs", "cifs", "smb")) and _ALONE_OPTIONS & {*options.split(",")})
+        ):
+            return kind
+    return None
 
 
 def _holder(handle: int) -> Json:
