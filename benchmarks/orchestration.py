@@ -16,11 +16,9 @@ a task, than after 1,000 (`server_growth_mb`: the server).
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import time
-import urllib.request
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -188,16 +186,14 @@ def _drained(run_id: str, count: int) -> None:
         "flow_runs": {"id": {"any_": [run_id]}},
         "task_runs": {"state": {"type": {"any_": ["COMPLETED"]}}},
     }
-    question = urllib.request.Request(
-        f"{embedded().url}/task_runs/count",
-        json.dumps(wanted).encode(),
-        {"Content-Type": "application/json"},
-    )
+    from prefect.client.orchestration import get_client
+    from prefect.settings import temporary_settings
+
     end = time.monotonic() + DRAIN_LIMIT_S
     kept = 0
-    while time.monotonic() < end:
-        with urllib.request.urlopen(question, timeout=DRAIN_LIMIT_S) as answer:
-            kept = json.load(answer)
-        if kept >= count:
-            return
+    with temporary_settings(embedded().settings()), get_client(sync_client=True) as client:
+        while time.monotonic() < end:
+            kept = client.request("POST", "/task_runs/count", json=wanted).json()
+            if kept >= count:
+                return
     raise RuntimeError(f"the server keeps {kept} of {count} task runs")

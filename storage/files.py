@@ -92,20 +92,28 @@ def make_folder(folder: Path) -> None:
         sync_folder(path.parent)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write `path` atomically; its folder must exist."""
-    write_blocks(path, (data,))
+def write_bytes(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Write `path` atomically; its folder must exist.
+
+    Args:
+        mode: of the file from its first moment on, less what the user's mask takes away.
+    """
+    write_blocks(path, (data,), mode)
 
 
-def write_blocks(path: Path, blocks: Iterable[bytes]) -> None:
-    """Write what `blocks` hands over to `path` atomically; its folder must exist.
+def write_blocks(path: Path, blocks: Iterable[bytes], mode: int = 0o666) -> None:
+    """Write the `blocks` to `path` atomically; its folder must exist.
 
     An error of `blocks` leaves `path` as it was.
+
+    Args:
+        mode: as `write_bytes`.
     """
     name = os.fsencode(path.name)[:_NAME_BYTES].decode(errors="ignore")
     temporary = path.with_name(f".{name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("wb") as handle:
+        temporary.unlink(missing_ok=True)  # of another mode, or a link
+        with open(temporary, "xb", opener=lambda name, how: os.open(name, how, mode)) as handle:
             for block in blocks:
                 handle.write(block)
             handle.flush()

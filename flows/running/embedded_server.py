@@ -7,6 +7,8 @@ parent. This one leads a session of its own, and the kernel ends it when its par
 It starts while its parent does other things: only asking for its `url` waits for it. What it leaves
 out, so that it keeps up with short trials, stands in `LEAN` (docs/decisions/0039).
 
+It asks every client for a password, and answers no page but its own (docs/decisions/0071).
+
 Run as a module it is the server; imported it starts one.
 """
 
@@ -15,6 +17,7 @@ from __future__ import annotations
 import atexit
 import ctypes
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -23,8 +26,10 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 from flows.running import garbage
+from flows.running.same_origin import SameOrigin
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -53,12 +58,16 @@ class EmbeddedServer:
     Args:
         port: where; 0 for a free one.
         page: whether it has Prefect's page, and all of its services with it.
+        password: that its clients must know (PREFECT_API_AUTH_STRING); one of its own by default.
 
     Raises:
         ServerError: the port is taken, or it did not start.
     """
 
-    def __init__(self, home: Path, port: int = 0, *, page: bool = False) -> None:
+    def __init__(
+        self, home: Path, port: int = 0, *, page: bool = False, password: str | None = None
+    ) -> None:
+        self.password = password or new_password()
         self._log = home / "server.log"
         kind = {"PREFECT_UI_ENABLED": "1"} if page else {**LEAN, **_HEADLESS}
         kept = {name: value for name, value in os.environ.items() if name not in _HEADLESS}
@@ -81,7 +90,7 @@ class EmbeddedServer:
                 stderr=log,
                 start_new_session=True,
                 pass_fds=[handle],
-                env={**kind, **kept},
+                env={**kind, **kept, **_closed(self.port, self.password)},
             )
         self._answers = False
         atexit.register(self.stop)
@@ -102,6 +111,16 @@ class EmbeddedServer:
             self._wait_until_healthy()
             self._answers = True
         return f"http://127.0.0.1:{self.port}/api"
+
+    def settings(self) -> dict[Any, str]:
+        """Prefect's settings of its clients: `url` and password.
+
+        Raises:
+            ServerError: it did not start.
+        """
+        from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL
+
+        return {PREFECT_API_URL: self.url, PREFECT_API_AUTH_STRING: self.password}
 
     def _wait_until_healthy(self) -> None:
         end = time.monotonic() + START_LIMIT_S
@@ -134,6 +153,22 @@ class EmbeddedServer:
             self._process.wait(timeout=STOP_LIMIT_S)
 
 
+def new_password() -> str:
+    """A password that nobody can guess, in the form that Prefect asks for (``user:password``)."""
+    return f"sliplab:{secrets.token_urlsafe(32)}"
+
+
+def _closed(port: int, password: str) -> dict[str, str]:
+    """Prefect's settings of a server for those who have its password, whatever else is set."""
+    own = f"http://127.0.0.1:{port}"
+    return {
+        "PREFECT_SERVER_API_AUTH_STRING": password,
+        "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": f"{own},http://localhost:{port}",
+        "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
+        "PREFECT_SERVER_UI_API_URL": f"{own}/api",
+    }
+
+
 def die_with(parent: int) -> bool:
     """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
 
@@ -155,9 +190,9 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     from flows.running.embedded_database import ready
 
     ready(home)
-    server = uvicorn.Server(uvicorn.Config(create_app(), log_level="error"))
     with socket.socket(fileno=handle) as listener:
-        server.run(sockets=[listener])
+        app = SameOrigin(create_app(), listener.getsockname()[1])
+        uvicorn.Server(uvicorn.Config(app, log_level="error")).run(sockets=[listener])
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     server = run_records.server_name(PREFECT_API_URL.value())
     if server == run_records.EMBEDDED:
-        updates[PREFECT_API_URL] = embedded().url
+        updates |= embedded().settings()
     with temporary_settings(updates=updates):
         run_events.install()
         if _store is not None:

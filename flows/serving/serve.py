@@ -9,34 +9,44 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
+import stat
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from flows.running import console, run_records
-from flows.running.embedded_server import EmbeddedServer
+from flows.running.embedded_server import EmbeddedServer, new_password
 from flows.serving.serve_control import answer_page
 from flows.serving.serve_file import Scheduled
 from flows.serving.service import Service
 from protocols import InputError
+from storage.files import write_bytes
 from storage.lock import exclusive
 from storage.store import Store
 
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
+PASSWORD = "page-password"
+"""The file in Prefect's home that has the password of the service's own page."""
+_PASSWORD = r"[!-~]{30,200}"
 CONTROL_POLL_S = 1.0
 """How often the page is asked for pause, resume and stop."""
 
 
 @contextmanager
-def page_server(store: Store, port: int) -> Iterator[str]:
+def page_server(port: int) -> Iterator[str]:
     """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
+
+    Ours asks for a password, which the processes of the runs find in their environment and people
+    in a file of Prefect's home that only this user can read.
 
     Raises:
         ServerError: ours did not start; its port may be taken.
+        InputError: the password cannot be kept where only this user can read it.
     """
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
@@ -44,14 +54,51 @@ def page_server(store: Store, port: int) -> Iterator[str]:
     if url is not None:
         yield url
         return
-    server = EmbeddedServer(Path(os.environ["PREFECT_HOME"]), port, page=True)
+    home = Path(os.environ["PREFECT_HOME"])
+    server = EmbeddedServer(home, port, page=True, password=page_password(home))
+    before = dict(os.environ)
     try:
-        os.environ["PREFECT_API_URL"] = server.url  # the processes of the runs read it
-        with temporary_settings(updates={PREFECT_API_URL: server.url}):
+        settings = server.settings()
+        os.environ.update({setting.name: value for setting, value in settings.items()})
+        with temporary_settings(updates=settings):
+            console.say(f"the page's password is in {home / PASSWORD}, which you alone can read")
             yield server.url
     finally:
-        del os.environ["PREFECT_API_URL"]
+        for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
+            os.environ.pop(name, None)
+            os.environ.update({name: before[name]} if name in before else {})
         server.stop()
+
+
+def page_password(home: Path) -> str:
+    """The password of a service's page, kept from one start to the next.
+
+    Raises:
+        InputError: it cannot be kept where only this user can read it.
+    """
+    path = home / PASSWORD
+    with suppress(OSError, UnicodeDecodeError):
+        if _private(path) and re.fullmatch(_PASSWORD, kept := path.read_text().strip()):
+            return kept
+    password = new_password()
+    try:
+        write_bytes(path, f"{password}\n".encode(), mode=0o600)
+        private = _private(path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be written: {error.strerror}") from None
+    if not private:
+        path.unlink()
+        raise InputError(
+            path, "", None,
+            "can be read by other users on this file system; name another folder in PREFECT_HOME",
+        )  # fmt: skip
+    return password
+
+
+def _private(path: Path) -> bool:
+    found = path.lstat()
+    alone = stat.S_ISREG(found.st_mode) and not found.st_mode & 0o077
+    return alone and found.st_uid == os.getuid()
 
 
 def serve(
@@ -81,7 +128,7 @@ def serve(
     ours = PREFECT_API_URL.value() is None
     with ExitStack() as stack:
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
-        url = stack.enter_context(page_server(store, port))
+        url = stack.enter_context(page_server(port))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         Service(str(store.folder.resolve()), rig, name, server, os.getpid()).tell()
         for item in run_records.close_dead(store.folder, server):
@@ -129,6 +176,8 @@ async def _serve(
     stopped.set()
     if rig_runner.started:
         await rig_runner.astop()
+    else:
+        running.cancel()  # one that is still starting cannot be stopped otherwise
     for outcome in await asyncio.gather(running, answering, ending, return_exceptions=True):
         if isinstance(outcome, Exception):
             raise outcome

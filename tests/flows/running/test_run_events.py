@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
-import urllib.request
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,9 @@ from typing import Any
 import pytest
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
+from prefect.client.orchestration import get_client
 from prefect.runtime import flow_run
+from prefect.settings import temporary_settings
 
 from benchmarks.orchestration import _drained
 from flows.running import embedded_database
@@ -45,13 +45,8 @@ def test_every_quick_task_run_is_kept_with_its_end() -> None:
     found: list[dict[str, Any]] = []
     for offset in (0, 100):
         wanted = {"flow_runs": {"id": {"any_": told}}, "limit": 100, "offset": offset}
-        question = urllib.request.Request(
-            f"{embedded().url}/task_runs/filter",
-            json.dumps(wanted).encode(),
-            {"Content-Type": "application/json"},
-        )
-        with urllib.request.urlopen(question, timeout=60) as answer:
-            found += json.load(answer)
+        with temporary_settings(embedded().settings()), get_client(sync_client=True) as client:
+            found += client.request("POST", "/task_runs/filter", json=wanted).json()
     assert len(found) == COUNT
     assert {each["run_count"] for each in found} == {1}
     assert all(each["start_time"] <= each["end_time"] for each in found)

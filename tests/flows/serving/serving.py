@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,17 +35,30 @@ def until(what: str, found: Callable[[], Any], limit_s: float = LIMIT_S) -> Any:
     return answer
 
 
+def access(url: str, password: str) -> dict[str, str]:
+    """The headers of a client that has the password, with a token for changes."""
+    known = {"Authorization": f"Basic {base64.b64encode(password.encode()).decode()}"}
+    client = str(uuid.uuid4())
+    request = urllib.request.Request(f"{url}/csrf-token?client={client}", headers=known)
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        token = json.loads(answer.read())["token"]
+    return {**known, "Prefect-Csrf-Client": client, "Prefect-Csrf-Token": token}
+
+
 class Page:
     """What a person does on Prefect's page."""
 
-    def __init__(self, url: str, name: str) -> None:
-        self._url, self._name = url, name
+    def __init__(self, url: str, password: str, name: str, log: Path = Path()) -> None:
+        self.url, self.password, self._name, self.log = url, password, name, log
+        self._headers: dict[str, str] = {}
 
     def call(self, path: str, data: Any = None) -> Any:
         """The server's answer, or ``{"status": ..., "detail": ...}`` of its refusal."""
+        if not self._headers:
+            self._headers = access(self.url, self.password)
         body = None if data is None else json.dumps(data).encode()
-        headers = {"content-type": "application/json"}
-        request = urllib.request.Request(f"{self._url}{path}", body, headers)
+        headers = {"content-type": "application/json", **self._headers}
+        request = urllib.request.Request(f"{self.url}{path}", body, headers)
         try:
             with urllib.request.urlopen(request, timeout=30) as answer:
                 return json.loads(answer.read() or b"null")
@@ -79,11 +95,20 @@ class Page:
 
 
 @contextmanager
-def serving(store: Path, rig: Path, name: str, url: str, log: Path) -> Iterator[Page]:
-    """`sliplab serve` as a process of its own on the Prefect server at `url`."""
+def serving(
+    store: Path, rig: Path, name: str, server: tuple[str, str] | None, log: Path
+) -> Iterator[Page]:
+    """`sliplab serve` as a process of its own.
+
+    Args:
+        server: address and password of a Prefect server; None for the service's own.
+    """
     command = [sys.executable, "-m", "flows", "serve", "--store", str(store), "--rig", str(rig)]
-    environment = {**os.environ, "PREFECT_API_URL": url}
-    environment.pop("PREFECT_HOME", None)
+    environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
+    if server is None:
+        command += ["--port", "0"]
+    else:
+        environment |= {"PREFECT_API_URL": server[0], "PREFECT_API_AUTH_STRING": server[1]}
     with log.open("w") as output:
         process = subprocess.Popen(
             [*command, "--name", name, "--poll", "0.3"],
@@ -92,10 +117,14 @@ def serving(store: Path, rig: Path, name: str, url: str, log: Path) -> Iterator[
     try:
         until(
             "the service",
-            lambda: process.poll() is not None or "\nPrefect's page:" in log.read_text(),
+            lambda: process.poll() is not None or "; Ctrl-C ends" in log.read_text(),
         )
         assert process.poll() is None, log.read_text()
-        yield Page(url, name)
+        if server is None:
+            found = re.search(r"Prefect's page: (http://[\d.]+:\d+)", log.read_text())
+            assert found is not None, log.read_text()
+            server = f"{found[1]}/api", (store / ".prefect" / "page-password").read_text().strip()
+        yield Page(*server, name, log)
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0, log.read_text()
     finally:

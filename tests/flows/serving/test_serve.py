@@ -20,6 +20,7 @@ from flows.collecting import showing
 from flows.collecting.stops import WindowOver
 from flows.planning.orders import make_order
 from flows.running import orchestration, run_records
+from flows.running.embedded_server import EmbeddedServer
 from flows.serving import serve, serve_runs
 from flows.serving.serve_file import Scheduled
 from flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
@@ -38,17 +39,17 @@ RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[str]:
+def server() -> Iterator[EmbeddedServer]:
     """The embedded server of the tests; the settings point at it."""
-    from prefect.settings import PREFECT_API_URL, temporary_settings
+    from prefect.settings import temporary_settings
 
-    url = orchestration.embedded().url
-    with temporary_settings(updates={PREFECT_API_URL: url}):
-        yield url
+    server = orchestration.embedded()
+    with temporary_settings(updates=server.settings()):
+        yield server
 
 
 @pytest.fixture
-def service(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
+def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
     """This process as the one that serves a store that is not there yet."""
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
     monkeypatch.setattr(orchestration, "private", lambda: False)  # as if somebody could look
@@ -71,7 +72,7 @@ def ends(service: Service) -> list[dict[str, Any]]:
 
 
 def test_a_collection_ends_with_a_record_and_shows_itself(
-    service: Service, server: str, protocol: Path
+    service: Service, server: EmbeddedServer, protocol: Path
 ) -> None:
     from prefect.client.orchestration import get_client
 
@@ -85,7 +86,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     assert "3 of 4 committed, 1 missing" in state.message
     (end,) = ends(service)
     assert (end["state"], end["by"], end["message"]) == ("COMPLETED", "flow", state.message)
-    made = Page(server, "here").artifacts(str(state.state_details.flow_run_id))
+    made = Page(server.url, server.password, "here").artifacts(str(state.state_details.flow_run_id))
     assert made["progress"]["data"] == 100
     table = {row["outcome"]: row for row in yaml.safe_load(made["table"]["data"])}
     assert (table["committed"]["this run"], table["committed"]["campaign"]) == (3, 3)
@@ -161,7 +162,7 @@ def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -
 
 
 def test_runs_of_killed_processes_are_closed_at_the_next_start(
-    service: Service, server: str, tmp_path: Path
+    service: Service, server: EmbeddedServer, tmp_path: Path
 ) -> None:
     from prefect.client.orchestration import get_client
     from prefect.states import Completed, Running
@@ -200,7 +201,7 @@ def test_a_servers_name_has_no_secrets() -> None:
 
 
 def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
-    service: Service, server: str, tmp_path: Path
+    service: Service, server: EmbeddedServer, tmp_path: Path
 ) -> None:
     from flows.serving.serve_flows import collect
 
@@ -219,7 +220,7 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
         await made.aapply()
 
     asyncio.run(register())
-    page = Page(server, "here")
+    page = Page(server.url, server.password, "here")
     for wanted, said in (
         ({}, "'protocol' is a required property"),
         ({"protocol": "p.yaml", "protcol": "x"}, "'protcol' was unexpected"),
@@ -248,7 +249,9 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
         asyncio.run(serve._refuse_another("collect", "here", Store.create(tmp_path / "other")))
 
 
-def test_what_a_killed_service_had_taken_is_closed(service: Service, server: str) -> None:
+def test_what_a_killed_service_had_taken_is_closed(
+    service: Service, server: EmbeddedServer
+) -> None:
     from prefect.client.orchestration import get_client
     from prefect.states import Pending
 
@@ -258,7 +261,7 @@ def test_what_a_killed_service_had_taken_is_closed(service: Service, server: str
         await (await label.ato_deployment("stranded")).aapply()
 
     asyncio.run(register())
-    page, store = Page(server, "stranded"), Store.open(service.folder)
+    page, store = Page(server.url, server.password, "stranded"), Store.open(service.folder)
     taken, ours, waiting = (page.run("label")["id"] for _ in range(3))
     with get_client(sync_client=True) as client:
         for run in (taken, ours):

@@ -78,21 +78,21 @@ def database(password: str) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of a Prefect server on that database."""
+def server(database: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """Address and password of a Prefect server on that database."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PREFECT_SERVER_DATABASE_CONNECTION_URL", database)
         running = EmbeddedServer(tmp_path_factory.mktemp("server"))
         patch.delenv("PREFECT_SERVER_DATABASE_CONNECTION_URL")  # nobody else needs to know
         try:
-            yield running.url
+            yield running.url, running.password
         finally:
             running.stop()
 
 
 @pytest.mark.realtime
 def test_a_campaign_is_paused_and_cancelled_and_goes_on(
-    server: str, password: str, tmp_path: Path
+    server: tuple[str, str], password: str, tmp_path: Path
 ) -> None:
     protocol = campaign.protocol(TRIALS)
     protocol["collection"]["motion"][3]["distance"] = "8 mm"  # long enough to be paused in

@@ -1,0 +1,205 @@
+"""Who may reach the server of `sliplab serve`: no foreign web page, nobody without the password."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from storage.store import Store
+from tests.conftest import ROOT
+from tests.flows.serving.serving import Page, serving
+
+EVIL = "http://evil.example"
+RUN = {"parameters": {"wanted": {"protocol": "pilot.yaml"}}, "state": {"type": "SCHEDULED"}}
+
+
+class Service:
+    """A service of its own process with its own server, as a stranger reaches it: raw HTTP."""
+
+    def __init__(self, page: Page, store: Path) -> None:
+        self.page, self.store = page, store
+        self.port = urlsplit(page.url).port or 0
+        self.host = f"127.0.0.1:{self.port}"
+
+    def ask(
+        self, method: str, path: str, body: str | None = None, **headers: str
+    ) -> tuple[int, dict[str, str], str]:
+        """Status, headers in lower case, and text of one answer; names with `_` for `-`."""
+        line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        try:
+            sent = {"Host": self.host, **{k.replace("_", "-"): v for k, v in headers.items()}}
+            line.request(method, path, body, sent)
+            answer = line.getresponse()
+            text = answer.read().decode(errors="replace")
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, text
+        finally:
+            line.close()
+
+    def handshake(self, path: str, **headers: str) -> int:
+        """The status that answers a websocket's first request."""
+        return self.ask(
+            "GET", path, Upgrade="websocket", Connection="Upgrade", Sec_WebSocket_Version="13",
+            Sec_WebSocket_Key=base64.b64encode(b"0" * 16).decode(),
+            Sec_WebSocket_Protocol="prefect", **headers,
+        )[0]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """`sliplab serve` with its own server."""
+    folder = tmp_path_factory.mktemp("access")
+    rig = ROOT / "rigs" / "rehearsal.yaml"
+    with serving(folder / "store", rig, "access", None, folder / "serve.log") as page:
+        yield Service(page, folder / "store")
+
+
+def basic(password: str) -> str:
+    """The header of a client that knows it."""
+    return f"Basic {base64.b64encode(password.encode()).decode()}"
+
+
+def test_a_foreign_page_gets_no_leave_to_ask(service: Service) -> None:
+    status, headers, _ = service.ask(
+        "OPTIONS", "/api/deployments/filter", Origin=EVIL,
+        Access_Control_Request_Method="POST", Access_Control_Request_Headers="content-type",
+    )  # fmt: skip
+    assert (status, headers.get("access-control-allow-origin")) == (403, None)
+
+
+@pytest.mark.parametrize("kind", ["application/json", "text/plain"])
+@pytest.mark.parametrize("origin", [EVIL, "null", "http://127.0.0.1:1", "https://localhost"])
+def test_a_foreign_page_is_answered_nothing(service: Service, origin: str, kind: str) -> None:
+    known = basic(service.page.password)  # even with the password
+    deployment = service.page.deployment("collect")["id"]
+    run = f"/api/deployments/{deployment}/create_flow_run"
+    for path, body in (("/api/deployments/filter", "{}"), (run, json.dumps(RUN))):
+        status, headers, text = service.ask(
+            "POST", path, body, Origin=origin, Content_Type=kind, Authorization=known
+        )
+        assert (status, headers.get("access-control-allow-origin")) == (403, None), text
+    for method in ("GET", "PATCH", "DELETE"):
+        found = service.ask(
+            method, f"/api/deployments/{deployment}", Origin=origin, Authorization=known
+        )
+        assert found[0] == 403
+    assert service.page.call("/flow_runs/filter", {}) == []  # nothing was started
+    assert service.page.deployment("collect")["id"] == deployment
+
+
+def test_a_foreign_host_name_is_no_way_in(service: Service) -> None:
+    known = basic(service.page.password)
+    for host in ("evil.example", f"evil.example:{service.port}", "127.0.0.1:1", "localhost", ""):
+        for path in ("/", "/ui-settings", "/api/health", "/api/admin/version"):
+            assert service.ask("GET", path, Host=host, Authorization=known)[0] == 421, (host, path)
+    for name in ("127.0.0.1", "localhost", "LOCALHOST", "[::1]"):
+        host = f"{name}:{service.port}"
+        own = {"Host": host, "Origin": f"http://{host.lower()}", "Authorization": known}
+        assert service.ask("GET", "/api/admin/version", **own)[0] == 200, name
+    with socket.create_connection(("127.0.0.1", service.port), timeout=30) as line:
+        line.sendall(
+            f"GET /api/health HTTP/1.1\r\nHost: {service.host}\r\nHost: x\r\n\r\n".encode()
+        )
+        assert line.recv(100).split()[1] in {b"400", b"421"}
+
+
+def test_nobody_without_the_password(service: Service) -> None:
+    deployment = service.page.deployment("collect")["id"]
+    for given in ({}, {"Authorization": basic("sliplab:guess")}, {"Authorization": "Basic \xff"}):
+        for method, path, body in (
+            ("POST", "/api/deployments/filter", "{}"),
+            ("POST", f"/api/deployments/{deployment}/create_flow_run", json.dumps(RUN)),
+            ("GET", f"/api/deployments/{deployment}", None),
+            ("GET", "/api/csrf-token?client=1", None),
+            ("GET", "/api/openapi.json", None),
+        ):
+            kind = {"Content_Type": "application/json"} if body else {}
+            assert service.ask(method, path, body, **kind, **given)[0] in {401, 403}, path
+    assert service.page.call("/flow_runs/filter", {}) == []
+
+
+def test_a_change_needs_a_token_of_its_own(service: Service) -> None:
+    known = {"Authorization": basic(service.page.password), "Content_Type": "application/json"}
+    status, _, text = service.ask("POST", "/api/deployments/filter", "{}", **known)
+    assert (status, "Missing CSRF token" in text) == (403, True)
+
+
+SOCKETS = (
+    "/api/events/in", "/api/events/out", "/api/logs/out", "/api/task_runs/subscriptions/scheduled",
+    "/api/work_pools/pool/workers/connect",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("path", SOCKETS)
+def test_websockets_are_as_closed(service: Service, path: str) -> None:
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    path = path if service.handshake(path) == 101 else path.replace("pools", "pool")
+    assert service.handshake(path, Origin=EVIL) == 403
+    assert service.handshake(path, Host=f"evil.example:{service.port}") == 403
+    for message in ({"type": "auth", "token": "sliplab:guess"}, {"type": "auth"}, {"type": "x"}):
+        with connect(f"ws://{service.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+            line.send(json.dumps(message))
+            with pytest.raises(ConnectionClosed):
+                line.recv(timeout=30)
+    with connect(f"ws://{service.host}{path}", subprotocols=["prefect"]) as line:  # type: ignore[list-item]
+        line.send(json.dumps({"type": "auth", "token": service.page.password}))
+        assert json.loads(line.recv(timeout=30))["type"] == "auth_success"
+
+
+def test_the_password_is_its_users_alone(service: Service) -> None:
+    file = service.store / ".prefect" / "page-password"
+    found = file.stat()
+    assert (stat.S_IMODE(found.st_mode), found.st_uid) == (0o600, os.getuid())
+    password = file.read_text().strip()
+    assert password == service.page.password
+    told = service.page.log.read_text()
+    assert str(file) in told
+    secret = password.partition(":")[2]
+    assert len(secret) > 40
+    assert secret not in told
+    for path in (path for path in service.store.rglob("*") if path.is_file() and path != file):
+        assert secret.encode() not in path.read_bytes(), path
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        assert secret.encode() not in _bytes(line), line
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:  # a process that ended meanwhile
+        return b""
+
+
+def test_its_page_is_framed_by_nobody(service: Service) -> None:
+    status, headers, text = service.ask("GET", "/v2/", Accept="text/html")
+    assert (status, "<html" in text.lower()) == (200, True)
+    assert headers["x-frame-options"] == "DENY"
+    status, _, text = service.ask("GET", "/ui-settings")
+    settings: dict[str, Any] = json.loads(text)
+    assert (status, settings["auth"], settings["csrf_enabled"]) == (200, "BASIC", True)
+    assert settings["api_url"] == f"http://{service.host}/api"
+
+
+def test_every_run_knows_the_password_by_itself(service: Service) -> None:
+    run = service.page.run("label")
+    ended = service.page.ended(run["id"])
+    assert ended["type"] == "FAILED", ended  # the store has no campaign, and the run could say so
+    assert "holds no campaign" in ended["message"] or "no campaign" in ended["message"]
+    assert Store.open(service.store).campaigns() == []
+
+
+def test_a_service_that_is_ended_at_once_ends(tmp_path: Path) -> None:
+    rig = ROOT / "rigs" / "rehearsal.yaml"
+    with serving(tmp_path / "store", rig, "short", None, tmp_path / "serve.log") as page:
+        assert page.password
