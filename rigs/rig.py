@@ -135,7 +135,8 @@ class Rig:
     def describe(self) -> dict[str, Json]:
         """What drivers tell of the trial that just ran, by device: settings, counts, losses."""
         told = {}
-        for name, device in (("event_camera", self.events), ("frame_camera", self.frames)):
+        cameras = ("event_camera", self.events), ("frame_camera", self.frames)
+        for name, device in (("arm", self.arm), *cameras):
             if hasattr(device, "describe"):
                 told[name] = device.describe()
         losses = getattr(self.sync, "losses", None)

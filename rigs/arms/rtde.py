@@ -11,6 +11,7 @@ Protocol (the maker's RTDE guide, version 2): big-endian `u16 size, u8 command`,
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import struct
 import time
@@ -24,6 +25,9 @@ TYPES = {"DOUBLE": "d", "UINT32": "I", "INT32": "i", "UINT64": "Q", "VECTOR6D": 
 _LAST_LOOK_S = 0.01
 REQUEST_PROTOCOL_VERSION, SETUP_OUTPUTS, SETUP_INPUTS = 86, 79, 73
 GET_VERSION, START, PAUSE, DATA, TEXT = 118, 83, 80, 85, 77
+_COMMANDS = {
+    REQUEST_PROTOCOL_VERSION, SETUP_OUTPUTS, SETUP_INPUTS, GET_VERSION, START, PAUSE, DATA, TEXT,
+}  # fmt: skip
 
 
 class RtdeError(RuntimeError):
@@ -53,7 +57,8 @@ class RtdeReader:
         self._host, self._answer_s, self._silence_s = host, answer_s, silence_s
         self._socket: socket.socket | None = None
         self._rest = bytearray()
-        self._layout = struct.Struct(">")
+        self._layout, self._recipe = struct.Struct(">"), 0
+        self._late = False
         self.version = (0, 0, 0, 0)
 
     def open(self, names: Sequence[str], frequency_hz: float) -> None:
@@ -71,14 +76,15 @@ class RtdeReader:
                 raise RtdeError("the controller does not speak version 2 of RTDE")
             self.version = struct.unpack(">4I", self._ask(GET_VERSION, b"", deadline)[:16])
             recipe = struct.pack(">d", frequency_hz) + ",".join(names).encode()
-            kinds = self._ask(SETUP_OUTPUTS, recipe, deadline)[1:].decode().split(",")
+            answer = self._ask(SETUP_OUTPUTS, recipe, deadline)
+            self._recipe, kinds = answer[0], answer[1:].decode().split(",")
             unknown = [name for name, kind in zip(names, kinds, strict=True) if kind not in TYPES]
             if unknown:
                 raise RtdeError(f"the controller does not know {', '.join(unknown)}")
             self._layout = struct.Struct(">" + "".join(TYPES[kind] for kind in kinds))
             if self._ask(START, b"", deadline) != b"\x01":
                 raise RtdeError("the controller did not start the stream")
-        except (OSError, struct.error, ValueError) as error:
+        except (OSError, struct.error, ValueError, IndexError) as error:
             self.close()
             raise RtdeError(f"cannot read from {self._host}:{PORT}: {error}") from None
         except RtdeError:
@@ -89,17 +95,16 @@ class RtdeReader:
         """Every packet that has come, at least one.
 
         Raises:
-            RtdeError: nothing came for `silence_s`, or the connection has ended.
+            RtdeError: no packet came for `silence_s`, whatever else did; the connection has ended;
+                or what came is not the stream that was asked for.
         """
         deadline = time.monotonic() + self._silence_s
         packets: list[Packet] = []
         try:
             while not packets:
                 while (message := self._message()) is not None:
-                    command, body = message
-                    if command == DATA and len(body) == 1 + self._layout.size:
-                        values = self._layout.unpack_from(body, 1)
-                        packets.append(Packet(time.monotonic_ns(), values))
+                    if message[0] == DATA:
+                        packets.append(Packet(time.monotonic_ns(), self._values(message[1])))
                 if not packets:
                     self._more(deadline)
         except OSError as error:
@@ -122,12 +127,24 @@ class RtdeReader:
                     return message[1]
             self._more(deadline)
 
+    def _values(self, body: bytes) -> tuple[float, ...]:
+        """The numbers of one packet: of the recipe that was agreed on, whole, and finite."""
+        if len(body) != 1 + self._layout.size or body[0] != self._recipe:
+            raise ConnectionError(
+                f"a packet of {len(body)} bytes of recipe {body[0] if body else 'none'} came; "
+                f"recipe {self._recipe} with {1 + self._layout.size} bytes was agreed on"
+            )
+        values: tuple[float, ...] = self._layout.unpack_from(body, 1)
+        if not all(map(math.isfinite, values)):
+            raise ConnectionError("a packet holds a number that is not finite")
+        return values
+
     def _message(self) -> tuple[int, bytes] | None:
         if len(self._rest) < HEADER.size:
             return None
         size, command = HEADER.unpack_from(self._rest)
-        if size < HEADER.size:
-            raise ConnectionError("not an RTDE packet")
+        if size < HEADER.size or command not in _COMMANDS:
+            raise ConnectionError(f"not an RTDE packet: size {size}, command {command}")
         if len(self._rest) < size:
             return None
         body = bytes(self._rest[HEADER.size : size])
@@ -139,6 +156,9 @@ class RtdeReader:
         if self._socket is None:
             raise ConnectionError("closed")
         # A thread that was kept waiting itself still looks once at what has come meanwhile.
+        if left <= 0 and self._late:
+            raise TimeoutError("timed out; what came was no answer and no packet")
+        self._late = left <= 0
         self._socket.settimeout(max(left, _LAST_LOOK_S))
         data = self._socket.recv(65536)
         if not data:

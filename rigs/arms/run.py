@@ -27,8 +27,9 @@ class Run:
         """How far it has come.
 
         Raises:
-            ArmFault: it was given up while the arm is healthy.
+            ArmFault: it was given up for a reason that `state` does not say: the arm is healthy, or
+                its program was ended because of that reason.
         """
-        if self.error is not None and state.healthy:
+        if self.error is not None and (state.healthy or state is ArmState.NOT_RUNNING):
             raise self.error
         return Progress(state, tuple(self.finished), self.done)

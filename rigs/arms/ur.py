@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,7 +30,7 @@ from rigs.arms.stream import PoseStream, Sample
 from rigs.arms.ur_control import WATCHDOG_HZ, ControlError, ControlProcess
 from rigs.arms.ur_state import OUTPUTS, UrStatus, status_of
 from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
-from storage.streams import PoseChunk, PulseChunk
+from storage.streams import Json, PoseChunk, PulseChunk
 
 ANSWER_S = 3.0
 """Connecting the pose stream, with every answer of its set-up, s."""
@@ -51,8 +52,14 @@ ARRIVED_MM = 0.1
 """A move that ends further than this from its target was stopped by somebody."""
 STILL_MM_S = 0.01
 """Below this commanded speed the arm stands still."""
+JUMP_S = 1.0
+"""A controller clock that moves on by more than this from one packet to the next has jumped, s."""
 _NEWS_S = 0.1
 """How long a packet with news of the state may be on its way, s."""
+_UNKNOWN_NS = 1 << 62
+"""A move is being handed over: nobody knows yet when the controller took it."""
+_FULL_SPEED = 0.999
+"""The speed slider is up when it stands at least here."""
 
 
 class UrArm:
@@ -70,6 +77,9 @@ class UrArm:
         self._remote = True
         self._closing = False
         self._run = Run((), done=True)
+        self._moved_ns: int | None = None
+        """Host's time when the last move was handed over; None once the arm was seen at rest."""
+        self._missing = 0
         self._rose_ns: int | None = None
         self._fell_ns: int | None = None
         self._starting = threading.Lock()
@@ -79,8 +89,8 @@ class UrArm:
     def connect(self) -> None:
         """Open the pose stream, take control, set tool, payload and watchdog.
 
-        Takes at most `ANSWER_S` + 3 `SILENCE_S` + 3 `PORT_S` + `ur_control.START_S` +
-        3 `COMMAND_S`.
+        Takes at most `ANSWER_S` + 3 `SILENCE_S` + 3 `PORT_S` + 2 `STILL_S` +
+        `ur_control.START_S` + 3 `COMMAND_S`.
 
         Raises:
             ArmFault: no connection, somebody else has control, or the arm may not move now.
@@ -90,11 +100,7 @@ class UrArm:
         try:
             self._open_stream()
             self._check_remote()
-            state = self.state()
-            if state is ArmState.READY:  # the client would end that program without a word
-                raise ArmFault("arm", "runs somebody's program; end it at the pendant first")
-            if state is not ArmState.NOT_RUNNING:
-                raise self._fault(state, "cannot connect")
+            self._check_free()
             self._take_control()
         except BaseException:
             self.close()
@@ -152,6 +158,10 @@ class UrArm:
         except ur_ports.PortError as error:
             raise ArmFault("arm", f"{error}; check its power and network") from None
 
+    def describe(self) -> Json:
+        """Poses that the controller did not send since connecting, by the gaps in its clock."""
+        return {"poses_missing": self._missing}
+
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path`: checked against all limits, first move taken by the controller.
 
@@ -201,37 +211,52 @@ class UrArm:
     def stop(self) -> None:
         """Stop the arm by every way that is left; never unlocks anything.
 
-        Takes at most 2 `COMMAND_S` + 2 `PORT_S` + 3 `STILL_S`.
+        Takes at most 2 `COMMAND_S` + 4 `PORT_S` + 3 `STILL_S`.
 
         Raises:
-            ArmFault: it was moving and could not be seen to stand still. Its own watchdog ends the
-                move after 1 / `ur_control.WATCHDOG_HZ` s if the network is gone.
+            ArmFault: a move was handed over, and the arm could not be seen to stand still since,
+                neither in its stream nor on a new connection. Its own watchdog ends the move after
+                1 / `ur_control.WATCHDOG_HZ` s if the network is gone.
         """
         run = self._run
         run.cancelled = True
         self._stream.wake()
-        if self._status is None or (run.done and self._is_still()):
+        resting = self._status is None or self._is_still()
+        if run.done and resting and self._moved_ns is None:
             return
         if not (self._ask_control_to_stop() and self._wait_still()):
             reached = self._end_program()
-            if self._lost is not None and not reached:
+            if not (self._wait_still() if self._lost is None else self._is_still_anew()):
+                if self._lost is None:
+                    raise ArmFault("arm", "does not stop: press its emergency stop")
+                if reached:
+                    raise ArmFault(
+                        "arm",
+                        f"took a stop and cannot be seen to stand still ({self._lost}): look at "
+                        "the arm before you go near it",
+                    )
                 raise ArmFault(
                     "arm",
                     f"cannot be reached to be stopped ({self._lost}); its own watchdog ends a "
                     f"move after {1 / WATCHDOG_HZ:g} s: look at the arm before you go near it",
                 )
-            if self._lost is None and not self._wait_still():
-                raise ArmFault("arm", "does not stop: press its emergency stop")
+        self._moved_ns = None
         if run.thread is not None and run.thread is not threading.current_thread():
             run.thread.join(STILL_S)
         run.done = True
 
     def close(self) -> None:
-        """Stop, end the control program and give every connection back."""
+        """Stop, end the control program and give every connection back.
+
+        Raises nothing: `stop` before it, or after it, says whether the arm stands still.
+        """
         self._closing = True
         control, self._control = self._control, None
         if control is not None:
-            if self._lost is None:
+            if self._lost is not None:
+                if self._moved_ns is not None:
+                    self._end_program()
+            else:
                 try:
                     control.call("stopL", STOP_DECELERATION_MM_S2 / MM_PER_M, True, within_s=PORT_S)
                     control.call("stopScript", within_s=PORT_S)
@@ -258,11 +283,40 @@ class UrArm:
                 "arm", f"{error}; check its power, its network and its address"
             ) from None
         self._reader, self._status, self._lost, self._closing = reader, None, None, False
+        self._missing = 0
         self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
         self._listener.start()
         first = self._stream.wait_for(lambda: bool(self._status or self._lost), SILENCE_S + 0.5)
         if not first or self._lost is not None:
             raise ArmFault("arm", f"no pose came: {self._lost}")
+
+    def _check_free(self) -> None:
+        """The arm stands still, may move, and nobody's program is on it.
+
+        Raises:
+            ArmFault: not so. The control client would end a program, even a paused one, and
+                would wait in vain for an arm without power.
+        """
+
+        def ending() -> bool:  # a program that was just told to end takes a cycle or two
+            return self._status is not None and self._status.program
+
+        state = self.state()
+        if state not in {ArmState.READY, ArmState.NOT_RUNNING}:
+            raise self._fault(state, "cannot connect")
+        self._stream.wait_for(lambda: not ending(), _NEWS_S)
+        status = self._status
+        assert status is not None
+        if status.program:
+            what = (
+                "runs somebody's program" if status.playing else "holds somebody's paused program"
+            )
+            raise ArmFault("arm", f"{what}; end it at the pendant first")
+        if status.off:
+            raise ArmFault("arm", f"is not switched on ({status.off}); {self.state().advice}")
+        if not self._stream.wait_for(self._is_still, STILL_S):
+            raise ArmFault("arm", "moves though no program runs on it; look at the arm")
+        self._moved_ns = None
 
     def _take_control(self) -> None:
         settings, tool = self._settings, self._settings.tool
@@ -271,7 +325,9 @@ class UrArm:
         except ControlError as error:
             if "already in use" in str(error):
                 raise ArmFault(
-                    "arm", "another program has control of it; end that program first"
+                    "arm",
+                    "another program has control of it, or a fieldbus holds its registers; end "
+                    f"that program first, or switch the fieldbus off. Its client says: {error}",
                 ) from None
             self._end_program()  # its script may have come through
             raise ArmFault("arm", f"gave no control: {error}") from None
@@ -285,15 +341,15 @@ class UrArm:
             raise self._fault(self.state(), "cannot connect")
 
     def _listen(self, reader: RtdeReader) -> None:
-        """The reader's thread: every packet, until the stream ends."""
+        """The reader's thread: every packet, until the stream ends or cannot be believed."""
         try:
             while not self._closing:
                 for packet in reader.read():
                     self._take(packet)
-        except RtdeError as error:
+        except Exception as error:  # a thread that dies must not look like an arm that stands
             if self._closing:
                 return
-            self._lost = str(error)
+            self._lost = str(error) if isinstance(error, RtdeError) else f"its stream: {error!r}"
             if self._control is not None:
                 self._control.kill()  # or it would connect again and send the move again
             self._stream.wake()
@@ -301,28 +357,42 @@ class UrArm:
     def _take(self, packet: Packet) -> None:
         status = status_of(packet.values, self._settings.sync_input)
         before = self._status
+        if before is not None and not 0 <= status.t_ns - before.t_ns <= JUMP_S * 1e9:
+            seconds = (status.t_ns - before.t_ns) / 1e9
+            how = f"fell back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
+            raise RtdeError(f"its clock {how}: it began anew, or its packets are not its own")
+        if before is not None:
+            cycles = (status.t_ns - before.t_ns) * self._settings.frequency_hz / 1e9
+            self._missing += max(round(cycles) - 1, 0)
         if before is not None and status.move_runs != before.move_runs:
             if status.move_runs:
                 self._rose_ns, self._fell_ns = status.t_ns, None
             else:
                 self._fell_ns = status.t_ns
         self._status = status
+        moved_ns = self._moved_ns
+        if moved_ns is not None and packet.host_ns > moved_ns + _NEWS_S * 1e9 and _rests(status):
+            self._rested(moved_ns)
         x, y, z, a, b, c = packet.values[1:7]
         xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
         rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
         self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
+
+    def _rested(self, moved_ns: int) -> None:
+        """The arm was seen at rest after the move of `moved_ns`, if that is still the last one."""
+        if self._commanding.acquire(blocking=False):  # held: another move is being handed over
+            try:
+                if self._moved_ns == moved_ns:
+                    self._moved_ns = None
+            finally:
+                self._commanding.release()
 
     def _check(self, path: Sequence[Segment]) -> None:
         """Every limit known here, then the controller's own."""
         assert self._status is not None
         self._guard.check(self.pose(), path)
         self._guard.check_joints(self._status.joints_deg)
-        if self._status.speed_fraction < 0.999:
-            raise ArmFault(
-                "arm",
-                f"its speed slider stands at {self._status.speed_fraction:.0%}, so every move "
-                "would be too slow: set it to 100 % at the pendant",
-            )
+        self._check_slider("every move would be too slow")
         for segment in path:
             if not self._call("isPoseWithinSafetyLimits", to_ur(segment.to)):
                 # The client says no as well when the program has ended under it.
@@ -334,6 +404,16 @@ class UrArm:
                     f"its controller holds ({x:.1f}, {y:.1f}, {z:.1f}) mm to be outside its "
                     "safety limits or its reach",
                 )
+
+    def _check_slider(self, so: str) -> None:
+        """Raises ArmFault, which ends with `so`, if the pendant slows the arm down."""
+        status = self._status
+        if status is not None and status.speed_fraction < _FULL_SPEED:
+            raise ArmFault(
+                "arm",
+                f"its speed slider stands at {status.speed_fraction:.0%}, so {so}: set it to "
+                "100 % at the pendant",
+            )
 
     def _send(self, run: Run, segment: Segment) -> bool:
         """Hand one move to the controller; False if a stop came first.
@@ -348,7 +428,9 @@ class UrArm:
             if run.cancelled:
                 return False
             self._rose_ns = self._fell_ns = None
+            self._moved_ns = _UNKNOWN_NS
             taken = self._call("moveL", to_ur(segment.to), speed, acceleration, True)
+            self._moved_ns = time.monotonic_ns()
         if not taken:
             raise self._fault(self.state(), "did not take a move")
         return True
@@ -365,7 +447,8 @@ class UrArm:
                 run.finished.append(times)
         except ArmFault as error:
             run.error = error
-            self._end_program()
+            if not (self._ask_control_to_stop() and self._wait_still()):
+                self._end_program()
         finally:
             run.done = True
             self._stream.wake()
@@ -373,8 +456,12 @@ class UrArm:
     def _await_segment(self, run: Run, segment: Segment) -> tuple[int, int] | None:
         """Start and end of the move that was just sent; None if it was stopped."""
 
+        def slowed() -> bool:
+            return self._status is not None and self._status.speed_fraction < _FULL_SPEED
+
         def ended() -> bool:
-            return self._fell_ns is not None or run.cancelled or not self.state().healthy
+            over = self._fell_ns is not None or run.cancelled or not self.state().healthy
+            return over or slowed()
 
         begun = self._stream.wait_for(lambda: self._rose_ns is not None or ended(), BEGIN_S)
         if not begun and not self._is_at(segment.to):
@@ -388,6 +475,8 @@ class UrArm:
         if not self.state().healthy:
             self._end_program()  # so that nothing goes on when a person unlocks the stop
             return None
+        if not run.cancelled:
+            self._check_slider("the move was too slow and was given up")
         if run.cancelled or self._rose_ns is None or self._fell_ns is None:
             return None
         return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
@@ -413,13 +502,32 @@ class UrArm:
         return ur_ports.end_program(self._settings.host, deceleration, PORT_S)
 
     def _wait_still(self) -> bool:
-        return self._stream.wait_for(self._is_still, STILL_S)
+        """Whether a packet that was read from now on shows the arm at rest, in time."""
+        now_ns = time.monotonic_ns()
+
+        def still() -> bool:
+            last = self._stream.last
+            return last is not None and last.host_ns > now_ns and self._is_still()
+
+        return self._stream.wait_for(still, STILL_S)
 
     def _is_still(self) -> bool:
-        status = self._status
-        if status is None or status.speed_mm_s >= STILL_MM_S:
-            return False
-        return not (status.move_runs and status.running)  # a program that was ended clears nothing
+        return self._status is not None and _rests(self._status)
+
+    def _is_still_anew(self) -> bool:
+        """Whether a connection made for this question alone shows the arm at rest, in time."""
+        reader = RtdeReader(self._settings.host, PORT_S, PORT_S)
+        end = time.monotonic() + PORT_S + STILL_S
+        with contextlib.suppress(RtdeError):
+            try:
+                reader.open(OUTPUTS, self._settings.frequency_hz)
+                while time.monotonic() < end:
+                    newest = reader.read()[-1]
+                    if _rests(status_of(newest.values, self._settings.sync_input)):
+                        return True
+            finally:
+                reader.close()
+        return False
 
     def _moves(self) -> bool:
         return self._status is not None and self._status.move_runs
@@ -441,7 +549,9 @@ class UrArm:
             return self._control.call(name, *arguments, within_s=COMMAND_S)
         except ControlError as error:
             self._end_program()
-            raise ArmFault("arm", f"lost its control client; it was stopped: {error}") from None
+            stopped = self._lost is None and self._wait_still()
+            how = "it was stopped" if stopped else "it cannot be seen to stand still"
+            raise ArmFault("arm", f"lost its control client; {how}: {error}") from None
 
     def _last(self) -> Sample:
         last = self._stream.last
@@ -452,3 +562,8 @@ class UrArm:
     def _fault(self, state: ArmState, what: str) -> ArmFault:
         reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
         return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")
+
+
+def _rests(status: UrStatus) -> bool:
+    """Whether a packet says that the arm is at rest; a program that was ended clears nothing."""
+    return status.speed_mm_s < STILL_MM_S and not (status.move_runs and status.running)

@@ -30,8 +30,21 @@ _EMERGENCY = 0b1110_0000
 """System, robot and any emergency stop."""
 _PROTECTIVE = 0b111_0001_1100
 """Protective stop, recovery mode, safeguard stop, violation, fault, stopped due to safety."""
-_PLAYING = 2
+_STOPPED, _PLAYING = 1, 2
+"""Values of runtime_state; 0 stopping, 3 pausing, 4 paused and 5 resuming hold a program too."""
 _MODE_RUNNING = 7
+_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety to be confirmed",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle, brakes on",
+    6: "backdrive",
+    8: "updating firmware",
+}
+"""Values of robot_mode in which no program can move the arm."""
 _POWERED, _PROGRAM = 1, 2
 _MOVE_RUNS = 1 << 15
 
@@ -50,6 +63,12 @@ class UrStatus:
     """The safety stop that the arm is in."""
     running: bool
     """Powered, brakes released, and the control program runs."""
+    program: bool
+    """The controller holds a program that has not ended: it plays, is paused, or is about to."""
+    playing: bool
+    """A program plays, ours or another."""
+    off: str
+    """Why the arm is not switched on, in the words of its robot mode; empty if it is."""
     speed_fraction: float
     """Where the pendant's speed slider stands, 0 to 1."""
     move_runs: bool
@@ -73,6 +92,9 @@ def status_of(values: Sequence[float], sync_input: int) -> UrStatus:
         running=bool(robot & _POWERED and robot & _PROGRAM)
         and runtime == _PLAYING
         and mode == _MODE_RUNNING,
+        program=runtime != _STOPPED,
+        playing=runtime == _PLAYING,
+        off="" if mode == _MODE_RUNNING else _MODES.get(mode, f"robot mode {mode}"),
         speed_fraction=values[24],
         move_runs=bool(int(values[25]) & _MOVE_RUNS),
     )

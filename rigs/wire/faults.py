@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+CLOCK_BACK_S = 5.0
+PACKETS_LOST = 25
+
 
 class Kind(Enum):
     """What happens."""
@@ -18,6 +21,16 @@ class Kind(Enum):
     REMOTE_OFF = "remote control off"
     PROGRAM_END = "program end"
     """Somebody presses stop at the pendant."""
+    PROGRAM_PAUSED = "program paused"
+    """Somebody presses pause at the pendant."""
+    SAFEGUARD_STOP = "safeguard stop"
+    """A light curtain or a door stops the arm; a program that runs is paused."""
+    POWER_OFF = "power off"
+    """Somebody switches the arm off, not its controller."""
+    CLOCK_BACK = "clock back"
+    """The controller's clock falls back by `CLOCK_BACK_S`."""
+    PACKETS_LOST = "packets lost"
+    """The next `PACKETS_LOST` packets of poses are not sent."""
 
 
 class Stage(Enum):

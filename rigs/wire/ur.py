@@ -28,7 +28,7 @@ from rigs.arms.rtde import (
 )
 from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.capabilities import Pose
-from rigs.wire.faults import Fault, Kind, Stage
+from rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
 from rigs.wire.loop import Connections, LoopThread
 from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
 from rigs.wire.ur_client import Client, send
@@ -82,6 +82,7 @@ class UrStandIn:
         self._clients: list[Client] = []
         self._connections = Connections()
         self._silent = self._cut_off = False
+        self._unsent = 0
         self._thread: LoopThread | None = None
 
     def __enter__(self) -> UrStandIn:
@@ -124,7 +125,8 @@ class UrStandIn:
         self._thread.call(self._listen)
 
     def restore(self) -> None:
-        """A person has put everything right: safety, remote control and link."""
+        """A person has put everything right: power, safety, remote control and link."""
+        self._inside(lambda: setattr(self.program, "powered", True))
         self.unlock()
         self.set_remote(True)
         if self._silent or self._cut_off:
@@ -134,12 +136,16 @@ class UrStandIn:
         """A person turns remote control on (or off, without ending the program)."""
         self._inside(lambda: setattr(self.program, "remote", on))
 
+    def set_slider(self, fraction: float) -> None:
+        """A person moves the pendant's speed slider to `fraction`, above 0 and up to 1."""
+        self._inside(lambda: setattr(self.program, "speed_fraction", fraction))
+
     def hang_program(self, hung: bool) -> None:
         """The control program says that it runs, and takes no command any more."""
         self._inside(lambda: setattr(self.program, "hung", hung))
 
     def unlock(self) -> None:
-        """A person unlocks a protective stop, or releases an emergency stop."""
+        """A person unlocks a protective stop, or releases an emergency or safeguard stop."""
         self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))
 
     def pose(self) -> Pose:
@@ -157,9 +163,13 @@ class UrStandIn:
     def _cut(self, kind: Kind) -> None:
         if kind is Kind.SILENCE:
             self._silent = True
-        else:
+        elif kind is Kind.PACKETS_LOST:
+            self._unsent += PACKETS_LOST
+        elif kind is Kind.LINK_CUT:
             self._cut_off = True
             self._connections.cut()
+        else:
+            raise ValueError(f"{kind.value} is not simulated by this stand-in")
 
     def _listen(self) -> None:
         for port, talk in (
@@ -185,7 +195,8 @@ class UrStandIn:
             self._cycle += 1
             t_s = self._cycle / self._cycle_hz
             self.program.cycle(t_s)
-            if self._silent:
+            if self._silent or self._unsent:
+                self._unsent = max(self._unsent - 1, 0)
                 continue
             for client in self._clients:
                 if client.streaming and self._cycle % client.every == 0:
@@ -221,7 +232,8 @@ class UrStandIn:
             return client.ask_inputs(body, others)
         if command in {START, PAUSE}:
             client.streaming = command == START
-        return b"\x01"
+            return b"\x01"
+        raise ConnectionError(f"RTDE command {command} is not simulated")  # ends the connection
 
     async def _dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await self._may_answer()
@@ -238,15 +250,18 @@ class UrStandIn:
             program.end_program()
             return "Stopped"
         if request == "unlock protective stop":
-            program.unlock()
-            return "Protective stop releasing"
+            return (
+                "Protective stop releasing" if program.unlock() else f"Failed to execute: {request}"
+            )
+        if request in {"play", "pause", "power on", "power off", "brake release", "shutdown"}:
+            return f"Failed to execute: {request}"  # known there, and not simulated here
         answers = {
             "get robot model": "UR5",
             "get serial number": "20205500000",
             "PolyscopeVersion": "URSoftware " + ".".join(map(str, VERSION)) + " (Jan 01 2021)",
             "is in remote control": str(program.remote).lower(),
             "running": f"Program running: {str(program.program_running).lower()}",
-            "robotmode": "Robotmode: RUNNING",
+            "robotmode": f"Robotmode: {'RUNNING' if program.powered else 'POWER_OFF'}",
             "safetystatus": f"Safetystatus: {program.safety.name}",
         }
         return answers.get(request, f'could not understand: "{request}"')

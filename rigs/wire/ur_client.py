@@ -21,7 +21,23 @@ _SCALARS = {
     "actual_momentum", "actual_main_voltage", "actual_robot_voltage", "actual_robot_current",
     "payload",
 }  # fmt: skip
-_VECTORS = {"joint_mode": "VECTOR6INT32", "payload_cog": "VECTOR3D", "payload_inertia": "VECTOR6D"}
+_VECTORS = {
+    "joint_mode": "VECTOR6INT32",
+    "payload_cog": "VECTOR3D",
+    "actual_tool_accelerometer": "VECTOR3D",
+    **dict.fromkeys(
+        (
+            "actual_TCP_force", "actual_TCP_pose", "actual_TCP_speed", "actual_current",
+            "actual_joint_voltage", "actual_q", "actual_qd", "ft_raw_wrench",
+            "joint_control_output", "joint_temperatures", "payload_inertia", "target_TCP_pose",
+            "target_TCP_speed", "target_current", "target_moment", "target_q", "target_qd",
+            "target_qdd", "external_force_torque",
+        ),
+        "VECTOR6D",
+    ),
+}  # fmt: skip
+_UNKNOWN, _IN_USE = "NOT_FOUND", "IN_USE"
+"""The controller's answers, in place of a type."""
 _LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}
 _COUNT = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
 
@@ -41,10 +57,13 @@ class Client:
     _recipes: dict[int, list[str]] = field(default_factory=dict)
 
     def ask_outputs(self, body: bytes, cycle_hz: int) -> bytes:
-        """The answer to a request for outputs: recipe 1 and the type of each."""
+        """The answer to a request for outputs: recipe 1, or 0 if one is unknown, and types."""
         (hz,) = struct.unpack_from(">d", body)
         self._names = [name for name in body[8:].decode().split(",") if name]
         self._kinds, self._readers = [_kind(name) for name in self._names], []
+        if _UNKNOWN in self._kinds:
+            kinds, self._names, self._kinds = self._kinds, [], []
+            return b"\x00" + ",".join(kinds).encode()
         self.every = max(1, round(cycle_hz / hz))
         self._layout = struct.Struct(">" + "".join(_LAYOUT[kind] for kind in self._kinds))
         return b"\x01" + ",".join(self._kinds).encode()
@@ -56,12 +75,12 @@ class Client:
         """
         names = [name for name in body.decode().split(",") if name]
         taken = {name for other in others for recipe in other._recipes.values() for name in recipe}
-        if any(name in taken for name in names):
-            kinds = ["IN_USE" if name in taken else _kind(name) for name in names]
+        kinds = [_IN_USE if name in taken else _kind(name) for name in names]
+        if {_IN_USE, _UNKNOWN} & set(kinds):
             return b"\x00" + ",".join(kinds).encode()
         recipe = len(self._recipes) + 1
         self._recipes[recipe] = names
-        return bytes([recipe]) + ",".join(_kind(name) for name in names).encode()
+        return bytes([recipe]) + ",".join(kinds).encode()
 
     def take(self, program: UrProgram, body: bytes) -> None:
         """Write one packet's inputs into the program."""
@@ -103,10 +122,8 @@ def _kind(name: str) -> str:
         return "INT32"
     if "_double_register_" in name or name in _SCALARS or name.startswith("standard_analog"):
         return "DOUBLE"
-    if name == "actual_tool_accelerometer":
-        return "VECTOR3D"
     if name in _UINT32:
         return "UINT32"
     if name in _UINT64:
         return "UINT64"
-    return _VECTORS.get(name, "VECTOR6D")
+    return _VECTORS.get(name, _UNKNOWN)

@@ -15,14 +15,13 @@ from enum import IntEnum
 
 from rigs.arms.pose import MM_PER_M, distance_mm, from_ur, to_ur
 from rigs.capabilities import Pose
-from rigs.wire.faults import Fault, Kind, Stage
+from rigs.wire.faults import CLOCK_BACK_S, Fault, Kind, Stage
 from rigs.wire.motion import Motion
 
 READY, DONE = 1, 2
 RUNNING_BIT = 1 << 15
 PROTECTIVE_DECELERATION_MM_S2 = 5000.0
 _CONTROL_MARK = "RTDE Control Script"
-_REALTIME = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)}
 _NUMBER = r"([0-9.eE+-]+)"
 
 
@@ -31,6 +30,7 @@ class Safety(IntEnum):
 
     NORMAL = 1 << 0
     PROTECTIVE_STOP = 1 << 2
+    SAFEGUARD_STOP = 1 << 4
     EMERGENCY_STOP = 1 << 7
 
 
@@ -86,14 +86,23 @@ class UrProgram:
         self._here = motion.pose(0.0).xyz_mm
         self._tcp_at: tuple[float, list[float]] = (math.nan, [])
         self._speed_mm_s = [0.0, 0.0, 0.0]
+        self.foreign = False
+        """The program that runs is somebody else's: it reads no register and moves nothing."""
         self.hung = False
         """The program says that it runs and takes no command."""
         self.speed_fraction = 1.0
-        """Where the pendant's speed slider stands."""
+        """Where the pendant's speed slider stands; moves are slower by it."""
+        self.powered = True
+        self.clock_shift_s = 0.0
+        """What its packets say of the time, off what it is."""
+        self.refused: list[str] = []
+        """What it was asked for and does not simulate."""
+        self._leg: tuple[Pose, float, float, float] | None = None
+        """Target, speed and acceleration of the last move, and the slider's place."""
 
     @property
     def program_running(self) -> bool:
-        """Whether the control program runs, a paused one included."""
+        """Whether a program is on the controller, a paused one included."""
         return self.runtime is not Runtime.STOPPED
 
     def cycle(self, t_s: float) -> None:
@@ -107,8 +116,9 @@ class UrProgram:
         self._idle_faults()
         if self._watchdog_s is not None and t_s - self._written_s > self._watchdog_s:
             self.end_program()  # rtde_set_watchdog(..., "stop")
-        if self.runtime is not Runtime.PLAYING:
+        if self.runtime is not Runtime.PLAYING or self.foreign:
             return
+        self._follow_slider()
         if self._asynchronous and not self.motion.moving(t_s):
             self._signal_async(False)
         if self._blocking:
@@ -138,33 +148,46 @@ class UrProgram:
         if not self.remote:
             return
         self.end_program()
+        able = self.safety is Safety.NORMAL and self.powered
         if _CONTROL_MARK in text:
             self.uploads += 1
-            if self.safety is Safety.NORMAL:
+            if able:
                 self.runtime = Runtime.PLAYING
                 self.ints_out[0] = READY
                 self.ints_out[2] = 0
             return
+        if text.startswith("def "):
+            if able:
+                self.runtime, self.foreign = Runtime.PLAYING, True
+            return
         if found := re.search(rf"stopl\({_NUMBER}\)", text):
             self.motion.stop(float(found[1]) * MM_PER_M, self._t)
+        else:
+            self.refused.append(f"script {text.strip()[:60]!r}")
 
     def end_program(self) -> None:
         """The program ends; the arm slows down and stays."""
-        self.runtime = Runtime.STOPPED
-        self._watchdog_s = None
+        self.runtime, self.foreign = Runtime.STOPPED, False
+        self._watchdog_s = self._leg = None
         self._executing = self._blocking = self._asynchronous = False
         self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
 
     def happen(self, kind: Kind) -> None:
         """One thing goes wrong now."""
-        if kind in {Kind.PROTECTIVE_STOP, Kind.EMERGENCY_STOP}:
-            self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
+        if kind is Kind.EMERGENCY_STOP:
+            self.safety = Safety.EMERGENCY_STOP
+            self.end_program()
+        elif kind in {Kind.PROTECTIVE_STOP, Kind.SAFEGUARD_STOP}:
             protective = kind is Kind.PROTECTIVE_STOP
-            self.safety = Safety.PROTECTIVE_STOP if protective else Safety.EMERGENCY_STOP
-            if not protective:
-                self.end_program()
-            elif self.program_running:
-                self.runtime = Runtime.PAUSED
+            self.safety = Safety.PROTECTIVE_STOP if protective else Safety.SAFEGUARD_STOP
+            self._pause()
+        elif kind is Kind.PROGRAM_PAUSED:
+            self._pause()
+        elif kind is Kind.POWER_OFF:
+            self.powered = False
+            self.end_program()
+        elif kind is Kind.CLOCK_BACK:
+            self.clock_shift_s -= CLOCK_BACK_S
         elif kind is Kind.REMOTE_OFF:
             self.remote = False
             self.end_program()
@@ -173,16 +196,24 @@ class UrProgram:
         else:
             self._cut(kind)
 
+    def _pause(self) -> None:
+        """The arm slows down; a program waits to be resumed, which is not simulated."""
+        self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
+        if self.program_running:
+            self.runtime = Runtime.PAUSED
+
     def reach(self, stage: Stage) -> None:
         """A client came to a stage; what waits for it happens."""
         for fault in [fault for fault in self.faults if fault.stage is stage]:
             self.faults.remove(fault)
             self.happen(fault.kind)
 
-    def unlock(self) -> None:
-        """A person unlocked the protective stop; a paused program stays paused."""
-        if self.safety is Safety.PROTECTIVE_STOP:
+    def unlock(self) -> bool:
+        """Unlock a protective stop, if there is one; a paused program stays paused."""
+        was = self.safety is Safety.PROTECTIVE_STOP
+        if was:
             self.safety = Safety.NORMAL
+        return was
 
     def value(self, name: str, t_s: float) -> int | float | list[float]:
         """The value of an RTDE output at `t_s`; what is not modelled is 0."""
@@ -196,7 +227,7 @@ class UrProgram:
         if kind == "output_double_register":
             return lambda t_s, k=int(index): self.doubles_out[k]  # type: ignore[misc]
         known: dict[str, Callable[[float], int | float | list[float]]] = {
-            "timestamp": lambda t_s: t_s,
+            "timestamp": lambda t_s: t_s + self.clock_shift_s,
             "actual_TCP_pose": self._tcp,
             "target_TCP_pose": self._tcp,
             "target_TCP_speed": lambda _: [
@@ -208,10 +239,10 @@ class UrProgram:
             "target_speed_fraction": lambda _: self.speed_fraction,
             "actual_q": lambda _: [angle * 0.017453292519943295 for angle in self.joints_deg],
             "actual_digital_input_bits": self.digital_inputs,
-            "robot_status_bits": lambda _: 1 | (2 if self.program_running else 0),
+            "robot_status_bits": lambda _: self.powered | (2 if self.program_running else 0),
             "safety_status_bits": lambda _: int(self.safety),
             "runtime_state": lambda _: int(self.runtime),
-            "robot_mode": lambda _: 7,
+            "robot_mode": lambda _: 7 if self.powered else 3,
             "payload": lambda _: self.payload_kg,
         }
         return known.get(name, lambda _: 0)
@@ -230,12 +261,10 @@ class UrProgram:
         if command == 0:
             self._executing = False
             self.ints_out[0] = READY
-        elif command in _REALTIME:
-            self.ints_out[0] = READY
         elif not self._executing:
             self._executing = True
             self._execute(command)
-            if not self._blocking and command != 255:
+            if not self._blocking and self.program_running:
                 self.ints_out[0] = DONE
 
     def _execute(self, command: int) -> None:
@@ -243,10 +272,12 @@ class UrProgram:
         if command == 3:
             self._left_from = self.motion.pose(self._t)
             to, speed = from_ur(values[:6]), values[6] * MM_PER_M
-            self.motion.move(to, speed, values[7] * MM_PER_M, self._t)
+            self._leg = to, speed, values[7] * MM_PER_M, self.speed_fraction
+            self.motion.move(to, speed * self.speed_fraction, self._leg[2], self._t)
             self._begin(bool(self.ints_in[1]))
         elif command in {33, 34}:
             self._signal_async(False)
+            self._leg = None
             # stopJ is given in rad/s^2; without joints it is taken for m/s^2
             self.motion.stop(values[0] * MM_PER_M, self._t)
             self._begin(bool(self.ints_in[1]))
@@ -261,8 +292,19 @@ class UrProgram:
         elif command == 36:
             far = distance_mm(from_ur(values[:6]), Pose((0, 0, 0), (0, 0, 0)))
             self.ints_out[1] = int(far <= self._reach_mm)
-        elif command == 255:
+        else:  # 255 is the command to end; any other one is not simulated: its program fails
+            if command != 255:
+                self.refused.append(f"command {command}")
             self.end_program()
+
+    def _follow_slider(self) -> None:
+        """A move goes on at another speed once the slider has been moved."""
+        if self._leg is None or self._leg[3] == self.speed_fraction:
+            return
+        to, speed, acceleration, _ = self._leg
+        self._leg = to, speed, acceleration, self.speed_fraction
+        if self.motion.moving(self._t):
+            self.motion.move(to, max(speed * self.speed_fraction, 1e-6), acceleration, self._t)
 
     def _begin(self, asynchronous: bool) -> None:
         if asynchronous:

@@ -6,21 +6,25 @@ measured. The client is the real ur_rtde throughout.
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 
 import pytest
 
 from rigs.arms import ur as driver
-from rigs.arms import ur_control
+from rigs.arms import ur_control, ur_ports
 from rigs.arms.pose import distance_mm
 from rigs.arms.rtde import HEADER, SETUP_INPUTS
 from rigs.arms.rtde import PORT as RTDE_PORT
 from rigs.arms.ur import UrArm
 from rigs.arms.ur_control import ControlError, ControlProcess
 from rigs.capabilities import ArmFault, ArmState, Pose, Segment
-from rigs.wire.faults import Fault, Kind, Stage
+from rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
 from rigs.wire.ur import HOME
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import until
@@ -222,7 +226,7 @@ def test_registers_that_are_taken_are_told(robot_of: MakeRobot) -> None:
         taker.sendall(HEADER.pack(HEADER.size + len(body), SETUP_INPUTS) + body)
         assert taker.recv(100)
         arm = UrArm(ur_settings(robot.host))
-        fails(arm.connect, ur_control.START_S, "another program has control of it")
+        fails(arm.connect, ur_control.START_S, "another program has control of it.*EtherNet/IP")
 
 
 def test_a_bad_call_is_an_error_and_the_client_lives_on(
@@ -239,3 +243,153 @@ def test_a_bad_call_is_an_error_and_the_client_lives_on(
         control.close()
     with pytest.raises(ControlError):
         control.call("isConnected", within_s=2.0)
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_somebody_elses_program_is_not_taken_over(
+    robot_of: MakeRobot, arm_on: MakeArm, paused: bool
+) -> None:
+    """A paused one waits to be resumed; the control client would end it without a word."""
+    robot = robot_of()
+    ur_ports.send_script(robot.host, "def palletise():\n  sleep(1000)\nend\n", 1.0)
+    until(lambda: robot.program.foreign, 2.0)
+    if paused:
+        robot.happen(Kind.PROGRAM_PAUSED)
+    arm = arm_on(robot, connected=False)
+    what = "holds somebody's paused program" if paused else "runs somebody's program"
+    fails(arm.connect, driver.ANSWER_S, f"{what}; end it at the pendant first")
+    assert robot.program.foreign
+    assert robot.program.program_running
+    assert robot.program.uploads == 0
+
+
+def test_an_arm_without_power_is_said_to_have_none(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    robot = robot_of()
+    robot.happen(Kind.POWER_OFF)
+    arm = arm_on(robot, connected=False)
+    fails(arm.connect, driver.ANSWER_S, r"not switched on \(power off\)")
+    robot.restore()
+    arm.connect()
+    assert arm.state() is ArmState.READY
+
+
+def test_a_slider_that_is_moved_while_sliding_ends_the_path(
+    robot_of: MakeRobot, arm_on: MakeArm
+) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+    arm.start(SLIDE)
+    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+    robot.set_slider(0.5)
+    until(lambda: arm._run.done, 2.0)
+    fails(arm.progress, 0.0, "slider stands at 50%, so the move was too slow")
+    arm.stop()
+    assert not robot.moving()
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_controller_clock_that_falls_back_ends_the_stream(
+    robot_of: MakeRobot, arm_on: MakeArm, moving: bool
+) -> None:
+    """A segment that began before and ended after would have a negative length."""
+    robot = robot_of()
+    arm = arm_on(robot)
+    if moving:
+        arm.start(SLIDE)
+        until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+    robot.happen(Kind.CLOCK_BACK)
+    until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
+    until(lambda: arm.progress().done, 2.0)
+    assert arm.progress().finished == ()
+    arm.stop()  # by its dashboard, and seen on a new connection
+    assert not robot.moving()
+    fails(lambda: arm.start(SLIDE), driver.PORT_S, "clock fell back by 4.9")
+    arm.recover()
+    assert arm.state() is ArmState.READY
+
+
+def test_a_stream_of_nonsense_is_a_lost_one(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+    arm.start(SLIDE)
+    until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
+    robot.program.joints_deg[2] = float("nan")
+    until(lambda: arm.state() is ArmState.DISCONNECTED, 1.0)
+    fails(arm.stop, 2 * driver.PORT_S + 2 * driver.STILL_S, "took a stop and cannot be seen")
+    assert not robot.moving()
+
+
+def test_packets_that_are_missing_are_counted(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+    assert arm.describe()["poses_missing"] == 0
+    robot.happen(Kind.PACKETS_LOST)
+    until(lambda: arm.describe()["poses_missing"] > 0, 2.0)
+    assert arm.describe()["poses_missing"] == PACKETS_LOST
+    assert arm.state() is ArmState.READY
+
+
+def test_a_link_lost_as_the_move_begins_is_no_arm_at_rest(
+    robot_of: MakeRobot, arm_on: MakeArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last packet still shows the arm at rest, and yet it moves."""
+    robot = robot_of()
+    arm = arm_on(robot)
+    monkeypatch.setattr(arm, "_take", lambda packet: None)  # none of those after the start comes
+    arm.start(SLIDE)
+    robot.happen(Kind.LINK_CUT)
+    until(lambda: arm.progress().done, 2 * driver.PORT_S + BUSY_S)
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    arm.close()
+    fails(arm.stop, 2 * driver.PORT_S, "cannot be reached to be stopped")
+    robot.restore_link()
+    arm.stop()  # now it is seen to stand still
+    assert not robot.moving()
+
+
+def test_a_stop_after_close_still_stops(robot_of: MakeRobot, arm_on: MakeArm) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+    arm.start(SLIDE)
+    until(lambda: robot.pose().xyz_mm[1] > 0.3, 5.0)
+    arm.close()
+    arm.stop()
+    assert not robot.moving()
+
+
+DRIVES = """
+import sys
+from rigs.arms.settings import UrSettings
+from rigs.arms.ur import UrArm
+from rigs.capabilities import Pose, Segment
+arm = UrArm(UrSettings.model_validate_json(sys.argv[1]))
+arm.connect()
+arm.start([Segment(Pose((400.0, 95.0, 300.0), (180.0, 0.0, 0.0)), 20.0)])
+print(arm._control._child.pid, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_arm_of_a_killed_program_stops(robot_of: MakeRobot, whole: bool) -> None:
+    """The control client stops it when its program dies; the watchdog when both die."""
+    robot = robot_of()
+    settings = ur_settings(robot.host).model_dump_json()
+    program = subprocess.Popen(
+        [sys.executable, "-c", DRIVES, settings], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert program.stdout is not None
+    assert program.stdin is not None
+    with program.stdout, program.stdin:
+        client = int(program.stdout.readline())
+        until(lambda: robot.pose().xyz_mm[1] > 2.0, 5.0)
+        for pid in (client, program.pid)[not whole :]:
+            os.kill(pid, signal.SIGKILL)
+        killed_mm = robot.pose().xyz_mm[1]
+        program.wait(5.0)
+    until(lambda: not robot.moving(), BUSY_S)
+    way_mm = robot.pose().xyz_mm[1] - killed_mm
+    guaranteed_s = 1 / ur_control.WATCHDOG_HZ if whole else 0.5
+    assert way_mm < 20.0 * (guaranteed_s + 1.0)
+    print(f"{'both' if whole else 'program'} killed at 20 mm/s: {way_mm:.2f} mm")

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import pytest
 
 from rigs.arms import ur_ports
+from rigs.arms.rtde import RtdeError, RtdeReader
 from rigs.capabilities import Pose
 from rigs.wire.faults import Kind
 from rigs.wire.ur import HOME, UrStandIn
@@ -166,3 +167,48 @@ def _answers(host: str) -> bool:
         return ur_ports.dashboard(host, "robotmode", 1.0) == "Robotmode: RUNNING"
     except ur_ports.PortError:
         return False
+
+
+@pytest.mark.parametrize("call", ["speedL([0.01, 0, 0, 0, 0, 0], 0.1, 0.1)", "zeroFtSensor()"])
+def test_a_command_that_is_not_simulated_fails(robot: UrStandIn, call: str) -> None:
+    found = client(
+        robot,
+        f"""
+control = RTDEControlInterface(host)
+control.{call}
+late = time.monotonic() + 5.0
+while control.isProgramRunning() and time.monotonic() < late:
+    pass
+said["runs"] = control.isProgramRunning()
+""",
+    )
+    assert found["runs"] is False
+    assert robot.program.refused
+    assert robot.pose() == HOME
+
+
+@pytest.mark.parametrize("request_", ["play", "pause", "power on", "unlock protective stop"])
+def test_a_request_that_cannot_be_done_says_so(robot: UrStandIn, request_: str) -> None:
+    assert ur_ports.dashboard(robot.host, request_, 1.0) == f"Failed to execute: {request_}"
+
+
+def test_outputs_that_it_does_not_know_are_not_found(robot: UrStandIn) -> None:
+    reader = RtdeReader(robot.host, 1.0, 1.0)
+    with pytest.raises(RtdeError, match="does not know actual_mood"):
+        reader.open(["timestamp", "actual_mood"], 125)
+
+
+@pytest.mark.parametrize(
+    ("kind", "safety", "mode"),
+    [
+        (Kind.SAFEGUARD_STOP, "SAFEGUARD_STOP", "RUNNING"),
+        (Kind.EMERGENCY_STOP, "EMERGENCY_STOP", "RUNNING"),
+        (Kind.POWER_OFF, "NORMAL", "POWER_OFF"),
+    ],
+)
+def test_it_says_what_state_it_is_in(robot: UrStandIn, kind: Kind, safety: str, mode: str) -> None:
+    robot.happen(kind)
+    assert ur_ports.dashboard(robot.host, "safetystatus", 1.0) == f"Safetystatus: {safety}"
+    assert ur_ports.dashboard(robot.host, "robotmode", 1.0) == f"Robotmode: {mode}"
+    ur_ports.send_script(robot.host, "def other():\nend\n", 1.0)
+    assert ur_ports.dashboard(robot.host, "running", 1.0) == "Program running: false"
