@@ -7,8 +7,9 @@ protective stop.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
@@ -36,6 +37,8 @@ RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """How long cameras are read after the last pulse, unless a rig says otherwise."""
 _MOVE_GRACE_S = 10.0
+_INTERRUPTIONS = 10
+"""How often a stop that was interrupted is begun again."""
 
 
 class StopRequested(Exception):
@@ -104,6 +107,8 @@ class Rig:
     simulation: Simulation | None = None
     should_stop: Callable[[], bool] = field(default=lambda: False)
     ending: tuple[Callable[[], None], ...] = ()
+    _reported: str = field(default="", init=False)
+    """Why the arm could not be stopped, as somebody has been told already."""
 
     def connect(self) -> None:
         """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
@@ -111,17 +116,27 @@ class Rig:
         self.arm.connect()
 
     def close(self) -> None:
-        """Give every device back, the arm first; safe to call more than once.
+        """Give every device back, the arm stopped first; safe to call more than once.
 
         A device that does not answer has nothing to give back, and must not keep the others.
+
+        Raises:
+            ArmFault: everything was given back, but the arm could not be seen to stand still.
+                Not raised again where `safely` has said the same.
         """
-        with suppress(RigError):
-            self.arm.stop()
-        for device in (self.arm, self.events, self.frames, self.sync):
-            with suppress(RigError):
-                device.close()
-        for end in self.ending:
-            end()
+        fault: RigError | None = None
+        try:
+            fault = self._stop_arm()
+        finally:
+            for device in (self.arm, self.events, self.frames, self.sync):
+                with suppress(Exception):
+                    device.close()
+            for end in self.ending:
+                end()
+        before = sys.exception()
+        if fault is not None and str(fault) not in {self._reported, str(before)}:
+            text = f" (before that: {before})" if isinstance(before, RigError) else ""
+            raise ArmFault("arm", f"{_text(fault)}{text}")
 
     def health(self) -> list[DeviceHealth]:
         """What the connected devices say of themselves; simulated ones have nothing to say.
@@ -226,13 +241,12 @@ class Rig:
         """Let events, poses and pulses flow into `sink` without moving anything."""
         if self.simulation is not None:
             self.simulation.begin_trial(0)
-        try:
+        with ExitStack() as stopping:
+            stopping.callback(self.events.stop)
+            stopping.callback(self.sync.stop)
             self.start_streams(0, rate_hz, False)
             self.wait(seconds, sink)
             self.stop_streams(sink, False)
-        finally:
-            self.sync.stop()
-            self.events.stop()
 
     def _creep(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
@@ -384,35 +398,64 @@ class Rig:
         except BaseException as error:
             fault: RigError | None = None
             try:
-                self.arm.stop()
-                self._retract(clear)
-            except RigError as second:
-                fault = second
+                fault = self._stop_arm() or self._retract(clear)
             finally:
                 for device in (self.events, self.frames, self.sync):
-                    with suppress(RigError):
+                    with suppress(Exception):
                         device.stop()
+            self._reported = str(fault or "")
             if fault is None or str(fault) == str(error):
                 raise
             if isinstance(error, RigError) and error.device == "arm":
                 raise ArmFault("arm", f"{_text(error)}. It {_text(fault)}") from error
             raise fault from error
 
-    def _retract(self, clear: Position) -> None:
-        """Straight out along the plate's normal, only with a healthy arm, bounded in time."""
-        if not self.arm.state().healthy:
-            return
-        at = self.position()
-        out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
-        if at.distance_mm(out) == 0:
-            return
-        self.arm.start([Segment(self.frame.pose(out), RETRACT_SPEED_MM_S)])
-        polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
-        for _ in range(polls):
-            if self.arm.progress().done:
-                return
-            self.clock.wait(self.poll_s)
-        self.arm.stop()
+    def _stop_arm(self) -> RigError | None:
+        """Stop the arm; why that could not be done or seen, None if it stands still.
+
+        Whoever asks again meanwhile, with another Ctrl-C, must not keep it from being stopped.
+        """
+        for _ in range(_INTERRUPTIONS):
+            try:
+                self.arm.stop()
+            except KeyboardInterrupt:
+                continue
+            except RigError as fault:
+                return fault
+            except Exception as error:
+                return ArmFault("arm", f"could not be stopped: {error!r}; look at the arm")
+            return None
+        return ArmFault("arm", "was not seen to stand still: its stop was interrupted")
+
+    def _retract(self, clear: Position) -> RigError | None:
+        """Straight out along the plate's normal, only with a healthy arm, bounded in time.
+
+        Returns:
+            Why a healthy arm did not come clear; it has been stopped then.
+        """
+        try:
+            if not self.arm.state().healthy:
+                return None
+            at = self.position()
+            out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
+            if at.distance_mm(out) == 0:
+                return None
+            self.arm.start([Segment(self.frame.pose(out), RETRACT_SPEED_MM_S)])
+            polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
+            for _ in range(polls):
+                if (progress := self.arm.progress()).done:
+                    if progress.finished:
+                        return None
+                    raise ArmFault(
+                        "arm", f"did not come clear of the plate: {progress.state.value}"
+                    )
+                self.clock.wait(self.poll_s)
+            raise ArmFault("arm", "did not come clear of the plate in time")
+        except RigError as fault:
+            return self._stop_arm() or fault
+        except BaseException:
+            self._stop_arm()
+            raise
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -16,7 +15,6 @@ from flows.running import console, stopping
 from protocols.errors import InputError
 from protocols.program import Position
 from rigs import build
-from rigs.capabilities import RigError
 from rigs.plate_frame import PlateFrame
 from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
 from rigs.rig_edit import writable_target, write_entries
@@ -122,8 +120,7 @@ class Measurement:
                 console.say("stopped: the arm stands still, nothing was written")
                 raise KeyboardInterrupt from None
             finally:
-                with suppress(RigError):  # it would hide what went wrong before
-                    rig.close()
+                rig.close()
         written = write_entries(
             self.path, target, finding.changes, today=today, remove=finding.remove,
             expected=self.text,

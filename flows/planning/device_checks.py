@@ -62,7 +62,12 @@ def _check_held(order: Order) -> list[Check]:
     except RigError as error:
         found.append(Check(error.device, False, _told(error)))
     finally:
-        rig.close()
+        try:
+            rig.close()
+        except RigError as error:  # beside what was found, not in its place
+            failed = Check(error.device, False, _told(error))
+            if failed not in found:
+                found.append(failed)
     return found
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.capabilities import ArmFault, RigError
+from rigs.capabilities import ArmFault, ArmState, RigError
 from tests.rigs.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
 
 STOPS = ["arm.stop", "events.stop", "frames.stop", "sync.stop"]
@@ -72,3 +72,143 @@ def test_a_clock_that_begins_again_does_not_stop_a_trial(device: str) -> None:
     for name, stream in stamps.items():
         assert np.any(np.diff(sink.all(stream)) < 0) == (name == device)
         assert len(sink.all(stream)) == len(plain.all(stream))
+
+
+class Unstoppable:
+    """An arm that takes a stop and is never seen to stand still."""
+
+    TEXT = "does not stop: press its emergency stop"
+
+    def __init__(self, arm: Any) -> None:
+        self._arm = arm
+        self.asked = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def stop(self) -> None:
+        self.asked += 1
+        raise ArmFault("arm", self.TEXT)
+
+
+def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all() -> None:
+    rig = make_rig()
+    notes = watched(rig)
+    rig.arm = Unstoppable(rig.arm)
+    ended: list[bool] = []
+    rig.ending = (lambda: ended.append(True),)
+    with pytest.raises(ArmFault, match=Unstoppable.TEXT):
+        rig.close()
+    closed = [call for call in notes if call.endswith("close")]
+    assert closed == ["arm.close", "events.close", "frames.close", "sync.close"]
+    assert ended == [True]
+
+
+def closed_while(error: BaseException, rig: Any) -> None:
+    """What a command does: something fails, and the rig is closed on the way out."""
+    try:
+        raise error
+    finally:
+        rig.close()
+
+
+def test_closing_after_a_failure_says_both() -> None:
+    rig = make_rig()
+    rig.arm = Unstoppable(rig.arm)
+    with pytest.raises(ArmFault, match=rf"{Unstoppable.TEXT} \(before that: sync box: is gone\)"):
+        closed_while(RigError("sync box", "is gone"), rig)
+
+
+def test_closing_says_nothing_twice() -> None:
+    rig = make_rig()
+    rig.arm = Unstoppable(rig.arm)
+    with pytest.raises(ArmFault, match=Unstoppable.TEXT) as caught:
+        run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
+    assert isinstance(caught.value.__cause__, OSError)
+    asked = rig.arm.asked
+    with pytest.raises(ArmFault) as again:
+        closed_while(caught.value, rig)
+    assert again.value is caught.value
+    assert rig.arm.asked > asked  # it was tried again
+
+
+def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped() -> None:
+    rig = make_rig()
+    stop, pressed = rig.arm.stop, iter([True, True])
+
+    def interrupted() -> None:
+        if next(pressed, False):
+            raise KeyboardInterrupt
+        stop()
+
+    rig.arm.stop = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        run(rig, short_plan(), Memory(fail_after=3, error=KeyboardInterrupt()))
+    assert rig.arm.state() is ArmState.READY
+    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
+
+
+def test_ctrl_c_while_the_arm_moves_clear_stops_it() -> None:
+    rig = make_rig()
+    start, wait, clearing = rig.arm.start, rig.clock.wait, [False]
+
+    def noted(path: Any) -> None:
+        start(path)
+        clearing[0] = failed[0]
+
+    def interrupted(seconds: float) -> None:
+        wait(seconds)
+        if clearing[0]:
+            clearing[0] = False
+            raise KeyboardInterrupt
+
+    failed = [False]
+    sink = Memory(fail_after=3, error=OSError("disk full"))
+    keep = sink.add_events
+
+    def full(chunk: Any) -> None:
+        failed[0] = sink.calls >= 3
+        keep(chunk)
+
+    sink.add_events = full  # type: ignore[method-assign]
+    rig.arm.start, rig.clock.wait = noted, interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        run(rig, short_plan(), sink)
+    assert rig.arm.state() is ArmState.READY  # it stands, half-way clear
+
+
+def test_an_arm_that_does_not_come_clear_is_told_of() -> None:
+    """It is stopped by somebody on its way out: healthy, and still in contact."""
+    rig = make_rig()
+    start, failed = rig.arm.start, [False]
+
+    def hindered(path: Any) -> None:
+        start(path)
+        if failed[0]:
+            rig.arm.stop()
+
+    def full(chunk: Any) -> None:
+        failed[0] = True
+        raise OSError("disk full")
+
+    sink = Memory()
+    sink.add_events = full  # type: ignore[method-assign]
+    rig.arm.start = hindered  # type: ignore[method-assign]
+    with pytest.raises(ArmFault, match="did not come clear of the plate"):
+        run(rig, short_plan(), sink)
+
+
+def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others() -> None:
+    """Not every driver's library raises what the rig's interface allows."""
+    rig = make_rig()
+
+    def broken() -> None:
+        raise ValueError("a library's own")
+
+    rig.events.stop = broken  # type: ignore[method-assign]
+    notes: list[str] = []
+    stop = rig.sync.stop
+    rig.sync.stop = lambda: (notes.append("sync.stop"), stop())[1]  # type: ignore[method-assign, func-returns-value]
+    with pytest.raises(OSError, match="disk full"):
+        run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
+    assert notes == ["sync.stop"]
