@@ -65,7 +65,9 @@ def trials(
     elif output is None:
         shown = [name for name in SHOWN if name in table.columns]
         rows = [list(row) for row in table[shown].itertuples(index=False)]
-        console.print_table(f"trials of {store}", shown, rows, limit=40)
+        simulated = " (simulated)" if len(table) and table["simulated"].all() else ""
+        spare = len(shown) - 2  # a row is its campaign and its trial
+        console.print_table(f"trials of {store}{simulated}", shown, rows, limit=40, spare=spare)
         show_aside(aside)
         console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
 

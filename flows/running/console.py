@@ -7,6 +7,7 @@ standard error. Without it, results are tables for people.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.box import SIMPLE, SIMPLE_HEAD
+from rich.cells import cell_len
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -24,6 +27,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from flows.running import stopping
 from storage.secrets import masked
@@ -37,8 +41,21 @@ SPEED_OVER_S = 900.0
 """What is left is told by the speed of the last so many seconds. Over rich's own 30, steps of other
 kinds, which the same bar counts, made an hour of ten minutes and back."""
 
+_LINE = 10_000
+"""Characters of a line where there is no terminal: nothing is folded in a file or a pipe."""
+
+_FOLDED = 30
+"""Width to which columns are folded in a table that is too wide all the same."""
+
+
+def results_width() -> int | None:
+    """Return how wide results may be; None where the terminal says so."""
+    terminal = sys.stdout is not None and sys.stdout.isatty()
+    return None if terminal or "COLUMNS" in os.environ else _LINE
+
+
 messages = Console(stderr=True, highlight=False, soft_wrap=True)
-results = Console(highlight=False)
+results = Console(highlight=False, width=results_width())
 
 
 def say(text: str) -> None:
@@ -76,29 +93,78 @@ def print_json(data: Any) -> None:
 
 
 def print_table(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, limit: int = 0
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    *,
+    limit: int = 0,
+    spare: int = 0,
 ) -> None:
-    """A table; with a `limit`, the middle of a long one is left out and counted."""
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
-    for column in columns:
-        table.add_column(column, overflow="fold")
-    left_out = len(rows) - limit if limit and len(rows) > limit else 0
-    head = limit // 2 if left_out else len(rows)
-    for row in rows[:head]:
-        table.add_row(*(_cell(item) for item in row))
-    if left_out:
-        table.add_row(f"... {left_out} more", *("" for _ in columns[1:]))
-        for row in rows[len(rows) - (limit - head) :]:
-            table.add_row(*(_cell(item) for item in row))
-    results.print(table)
+    """Print a table. No word is broken: an id or a path can be copied and searched for.
+
+    Cells are folded between words where the terminal is too narrow; where that is not enough lines
+    are longer than the terminal. Without a terminal each row is one line.
+
+    Args:
+        limit: rows; the middle of a longer table is left out and counted.
+        spare: how many of the last columns may be left out where the terminal is too narrow.
+    """
+    cells = [[_cell(item) for item in row] for row in rows]
+    if limit and len(cells) > limit:
+        more = [f"... {len(cells) - limit} more", *("" for _ in columns[1:])]
+        cells[limit // 2 : limit // 2 - limit] = [more]
+    _print(Table(title=escape(title), box=SIMPLE_HEAD), columns, cells, spare)
+
+
+def _print(
+    table: Table, columns: Sequence[str], cells: Sequence[Sequence[str]], spare: int = 0
+) -> None:
+    by_column = list(zip(columns, *cells, strict=True))
+    widths, gap = _layout(by_column, results.width, spare)
+    table.title_justify, table.padding = "left", (0, 1 if gap == 3 else 0, 0, 1)
+    table.width = _table_width(widths, gap)
+    for column, width in zip(columns, widths, strict=False):
+        table.add_column(escape(column), width=width)
+    for row in cells:
+        table.add_row(*map(Text, row[: len(widths)]))
+    results.print(table, crop=False)
+
+
+def _layout(by_column: Sequence[Sequence[str]], room: int, spare: int) -> tuple[list[int], int]:
+    """Choose the width of each column that is shown, and of the gap between two.
+
+    Args:
+        room: of the whole table; a table whose words do not fit is wider.
+        spare: how many of the last columns may be left out to make it fit.
+    """
+    widths, gap = [max(map(cell_len, cells)) for cells in by_column], 3
+    words = [
+        max(cell_len(word) for cell in cells for word in cell.split() or [""])
+        for cells in by_column
+    ]
+    while spare and _table_width(words, gap) > room:
+        del widths[-1], words[-1]
+        spare -= 1
+    if _table_width(words, gap) > room:
+        gap = 2
+    if _table_width(words, gap) > room:
+        return [
+            min(pair) for pair in zip(widths, (max(_FOLDED, w) for w in words), strict=True)
+        ], gap
+    while _table_width(widths, gap) > room:
+        foldable = [number for number, width in enumerate(widths) if width > words[number]]
+        widths[max(foldable, key=widths.__getitem__)] -= 1
+    return widths, gap
+
+
+def _table_width(widths: Sequence[int], gap: int) -> int:
+    return sum(widths) + gap * len(widths) + 1
 
 
 def print_pairs(title: str, pairs: Mapping[str, object]) -> None:
     """Names and values, one pair a line."""
-    table = Table(title=title, title_justify="left", show_header=False, box=SIMPLE)
-    for name, value in pairs.items():
-        table.add_row(name, _cell(value))
-    results.print(table)
+    cells = [[name, _cell(value)] for name, value in pairs.items()]
+    _print(Table(title=escape(title), show_header=False, box=SIMPLE), ["", ""], cells)
 
 
 def _cell(value: object) -> str:

@@ -48,3 +48,49 @@ def test_the_time_that_is_left_is_the_bars_own_guess(monkeypatch: pytest.MonkeyP
 
 def test_a_terminal_has_the_bar_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(line.startswith("grid: ") for line in lines(monkeypatch, terminal=True, left=""))
+
+
+ID = "depth=3.4mm,direction=180deg,speed=0.6mmps,r=1"
+COLUMNS = ["campaign", "trial", "recorded_s", "events", "cause"]
+ROW = ["pilot", ID, 17.0, 216982, "gate: [/b] sync_uncertainty_arm_s is 68 us"]
+
+
+def table(monkeypatch: pytest.MonkeyPatch, width: int | None, *, spare: int = 0) -> list[str]:
+    """Print one row on so many columns."""
+    out = io.StringIO()
+    monkeypatch.setattr(console, "results", Console(file=out, width=width, color_system=None))
+    console.print_table("trials", COLUMNS, [ROW], spare=spare)
+    return [line.rstrip() for line in out.getvalue().splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 200])
+def test_no_id_is_broken_at_any_width(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    for spare in (0, 3):
+        lines = table(monkeypatch, width, spare=spare)
+        assert sum(ID in line for line in lines) == 1
+        words = {word for line in lines for word in line.split()}
+        assert spare or set(COLUMNS) | set(str(ROW[4]).split()) <= words
+
+
+@pytest.mark.parametrize(("width", "shown"), [(200, 5), (110, 5), (85, 4), (75, 3), (62, 2)])
+def test_columns_are_left_out_so_that_rows_fit(
+    monkeypatch: pytest.MonkeyPatch, width: int, shown: int
+) -> None:
+    lines = table(monkeypatch, width, spare=3)
+    assert lines[1].split() == COLUMNS[:shown]
+    assert all(len(line) <= width for line in lines)
+
+
+def test_without_a_terminal_a_row_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr("sys.stdout", io.StringIO())
+    *_, row = table(monkeypatch, console.results_width(), spare=3)
+    assert row.split() == " ".join(map(str, [*ROW[:2], 17, *ROW[3:]])).split()
+
+
+def test_no_path_of_a_result_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = "/data/" + "campaign/" * 12 + "page.html"
+    out = io.StringIO()
+    monkeypatch.setattr(console, "results", Console(file=out, width=80, color_system=None))
+    console.print_pairs("report", {"page": path, "trials": 3})
+    assert path in out.getvalue()
