@@ -19,6 +19,7 @@ from storage.columns import Array
 from storage.streams import I64
 
 _BLOCK = 1 << 15
+_FEW = 16
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
 """Of unpacked chunks, a column. A chunk of events fits; more than the processor's own cache holds
 would make every chunk go through main memory."""
@@ -56,6 +57,17 @@ class RowFile:
         value = np.empty((), np.int64)
         h5py.h5a.open(self._file, name.encode()).read(value)
         return int(value)
+
+    def integers(self, name: str) -> list[int] | None:
+        """A small attribute of the file with integers in a row; None where there is no such one."""
+        if not h5py.h5a.exists(self._file, name.encode()):
+            return None
+        found = h5py.h5a.open(self._file, name.encode())
+        if found.dtype.kind not in "iu" or len(found.shape) != 1 or found.shape[0] > _FEW:
+            return None
+        values = np.empty(found.shape, found.dtype)
+        found.read(values)
+        return [int(value) for value in values]
 
     def has(self, name: str) -> bool:
         """Whether there is a column of this name."""

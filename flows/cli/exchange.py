@@ -26,7 +26,7 @@ def import_(
 ) -> None:
     """Take trials of other programs into a campaign of their own, what is unknown marked so.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; without it, names of files tell.
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; without it, the files' content tells.
     """
     from dataclasses import replace
 

@@ -75,8 +75,8 @@ class Aedat4File:
         self._handle = path.open("rb")
         try:
             self._bytes = path.stat().st_size
-            if self._handle.read(len(LINE)) != LINE:
-                raise Wrong("is no AEDAT4 file")
+            if (line := self._handle.read(len(LINE))) != LINE:
+                raise Wrong(f"is no AEDAT4 file: it begins with {line!r}, not with {LINE!r}")
             header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
             table = Table.root(memoryview(_prefixed(header)), b"IOHE")
             self._codec = _CODECS.get(table.number(0, "<i"), "")
@@ -114,7 +114,7 @@ class Aedat4File:
             rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], EVENT)
             chunk = event_chunk(rows["x"], rows["y"], rows["p"] & 1, rows["t"])
             if last is not None and len(chunk) and chunk.t_us[0] < last:
-                raise Wrong("events whose times run backwards")
+                raise Wrong("holds events whose times run backwards")
             last = int(chunk.t_us[-1]) if len(chunk) else last
             yield chunk
 
@@ -127,7 +127,7 @@ class Aedat4File:
         ]
         times = np.array([t for t, _ in found], np.int64)
         if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
-            raise Wrong("triggers whose times run backwards or are none")
+            raise Wrong("holds triggers whose times run backwards or are none")
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
 
     def pictures(self, number: int) -> Iterator[Picture]:
@@ -140,9 +140,12 @@ class Aedat4File:
             channels = 1 if form == GREY else _COLOUR.get(form, 0)
             count, pixels = table.vector(10, 1)
             if not channels or width <= 0 or height <= 0 or count != width * height * channels:
-                raise Wrong(f"a frame of {width} x {height} with {count} bytes of kind {form}")
+                raise Wrong(
+                    f"holds a frame of {width} x {height} with {count} bytes of kind {form}; read "
+                    "are 8-bit frames with 1, 3 or 4 channels (kinds 0, 16 and 24)"
+                )
             if not last <= t_ns < LATEST_US * 1000:
-                raise Wrong("frames whose times run backwards or are none")
+                raise Wrong("holds frames whose times run backwards or are none")
             last = t_ns
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
@@ -152,14 +155,16 @@ class Aedat4File:
         while (at := self._handle.tell()) < self._end:
             stream, size = struct.unpack("<ii", self._exactly(8))
             if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
-                raise Wrong(f"a packet of {size} bytes in stream {stream}, at byte {at}")
+                raise Wrong(f"holds a packet of {size} bytes in stream {stream}, at byte {at}")
             if stream != number:
                 self._handle.seek(size, 1)
                 continue
             try:
                 yield memoryview(_unpacked(self._exactly(size), self._codec))
             except (pa.ArrowException, OSError) as error:
-                raise Wrong(f"a packet that cannot be unpacked, at byte {at}: {error}") from None
+                raise Wrong(
+                    f"holds a packet that cannot be unpacked, at byte {at}: {error}"
+                ) from None
 
     def _exactly(self, count: int) -> bytes:
         found = self._handle.read(count)
@@ -178,7 +183,7 @@ def _middle_ns(frame: Table) -> int:
     if start <= 0 or end <= 0:
         return frame.number(0, "<q") * 1000
     if end < start:
-        raise Wrong(f"a frame whose exposure starts at {start} us and ends at {end} us")
+        raise Wrong(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
     return (start + end) * 500
 
 
@@ -203,7 +208,7 @@ def _unpacked(data: bytes, codec: Any) -> bytes:
             parts.append(part)
             left -= len(part)
             if left < 0:
-                raise Wrong("a packet that unpacks to too much")
+                raise Wrong("holds a packet that unpacks to too much")
     return b"".join(parts)
 
 
@@ -217,7 +222,7 @@ def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
 
 def _streams(text: bytes) -> dict[int, Stream]:
     if b"<!" in text:
-        raise Wrong("a header that defines words of its own")
+        raise Wrong("has a header that defines words of its own")
     try:
         root = ElementTree.fromstring(text.rstrip(b"\0").decode("utf-8"))
         found = {}
@@ -230,7 +235,7 @@ def _streams(text: bytes) -> dict[int, Stream]:
             name = values.get("originalOutputName", kind)
             found[int(node.get("name", ""))] = Stream(kind, name, size, values.get("source", ""))
     except (ElementTree.ParseError, ValueError) as error:
-        raise Wrong(f"a header that cannot be read: {error}") from None
+        raise Wrong(f"has a header that cannot be read: {error}") from None
     return found
 
 

@@ -29,6 +29,7 @@ PIECE = 1 << 20
 _MOST_PACKED = 2000
 """Rows a byte of the file: what columns of equal values are packed to."""
 _MOST_UNSORTED = 1 << 28
+_LAYOUTS = "dsec has events/x, y, p and t, lab-hdf5 has events/xs, ys, ps and ts"
 _FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError, AttributeError)
 
 
@@ -40,10 +41,10 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
     """
     with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in "xypt"}
-        _same_length(path, columns)
+        _same_length(columns)
         offset = int(_whole(file.rows("t_offset").read())) if file.has("t_offset") else 0
         if not 0 <= offset < LATEST_US:
-            raise Wrong(f"{path.name}: t_offset = {offset}: is no time")
+            raise Wrong(f"t_offset = {offset}: is no time")
         triggers = None
         if file.has("triggers/t"):
             kinds = _whole(rows("triggers/kind").read()).astype(np.uint8)
@@ -71,11 +72,12 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     Raises:
         Wrong: it is damaged, or has another layout.
     """
-    with _opened(path) as (_, rows):
+    with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in ("xs", "ys", "ps", "ts")}
-        _same_length(path, columns)
+        _same_length(columns)
         if len(columns["ts"]) > _MOST_UNSORTED:
-            raise Wrong(f"{path.name}: {len(columns['ts'])} events, too many to sort")
+            raise Wrong(f"holds {len(columns['ts'])} events, too many to sort")
+        size = _resolution(file.integers("sensor_resolution"), columns["xs"], columns["ys"])
 
     def all_events() -> Iterator[EventChunk]:
         with _opened(path) as (_, again):
@@ -83,23 +85,53 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         t_us = rounded_us(ts, 1e6)
         low = int(t_us.min()) if len(t_us) else 0
         if low < 0:
-            raise Wrong("an event before its own clock began")
+            raise Wrong("holds an event before its own clock began")
         order = np.argsort(t_us, kind="stable")
         polarity = np.asarray(ps) > 0  # the lab's are 0 and 1, or -1 and 1
         yield event_chunk(_pixels(xs)[order], _pixels(ys)[order], polarity[order], t_us[order])
 
     return ForeignTrial(
         name, path.name, all_events, "unknown; seconds as the file has them, rounded to us",
+        lambda: size,
         unknown=("epoch", "sync grade", "poses", "motion", "condition", "frames", "polarity map"),
     )  # fmt: skip
 
 
-def _same_length(path: Path, columns: Mapping[str, Sized]) -> None:
+def _resolution(told: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] | None:
+    """Columns and rows of the camera, by the attribute `sensor_resolution`.
+
+    The lab writes columns first, other programs that share its layout rows first. Sensors are wider
+    than high, so the larger number is the columns, unless the events fit only the other way.
+
+    Raises:
+        Wrong: the events fit neither way.
+    """
+    if told is None or len(told) < 2 or min(told[:2]) <= 0:
+        return None
+    long, short = max(told[:2]), min(told[:2])
+    columns, rows = (_end(column) for column in (xs, ys))
+    for size in ((long, short), (short, long)):
+        if columns <= size[0] and rows <= size[1]:
+            return size
+    raise Wrong(
+        f"holds events up to column {columns - 1} and row {rows - 1}, outside of its "
+        f"sensor_resolution {told[0]} x {told[1]}"
+    )
+
+
+def _end(column: Rows) -> int:
+    """One more than the largest pixel of a column."""
+    starts = range(0, len(column), PIECE)
+    pieces = (_pixels(column.read(start, start + PIECE)) for start in starts)
+    return max((int(piece.max()) + 1 for piece in pieces), default=0)
+
+
+def _same_length(columns: Mapping[str, Sized]) -> None:
     """Refuse columns of which one is cut short: nobody knows which events it has lost."""
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{key} {count}" for key, count in lengths.items())
-        raise Wrong(f"{path.name}: its events' columns have different lengths: {told}")
+        raise Wrong(f"its events' columns have different lengths: {told}")
 
 
 def is_lab_hdf5(path: Path) -> bool:
@@ -155,7 +187,7 @@ class _opened:
         try:
             self._file = RowFile(self._path)
         except _FAULTS as error:
-            raise Wrong(f"{self._path.name}: is no HDF5 file, or a damaged one: {error}") from None
+            raise Wrong(f"is no HDF5 file, or a damaged one: {error}") from None
         self._most = self._path.stat().st_size * _MOST_PACKED
         return self._file, self._rows
 
@@ -164,21 +196,21 @@ class _opened:
         if isinstance(error, Wrong):
             return
         if isinstance(error, _FAULTS):
-            raise Wrong(f"{self._path.name}: cannot be read: {error}") from None
+            raise Wrong(f"cannot be read: {error}") from None
 
     def _rows(self, name: str) -> Rows:
         if not self._file.has(name):
-            raise Wrong(f"{self._path.name}: has no column {name}")
+            raise Wrong(f"has no column {name}; {_LAYOUTS}")
         found = self._file.rows(name)
         if len(found.shape) != 1 or found.shape[0] > self._most:
-            raise Wrong(f"{self._path.name}: {name} has the shape {found.shape}")
+            raise Wrong(f"{name} has the shape {found.shape}")
         return found
 
 
 def _whole(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
-        raise Wrong("times that are no whole numbers")
+        raise Wrong("holds times that are no whole numbers")
     return found.astype(np.int64)
 
 
@@ -186,13 +218,13 @@ def _rising(found: Triggers) -> None:
     t = found.t_us
     wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
     if len(t) != len(found.kind) or wrong:
-        raise Wrong("triggers whose times run backwards or are none")
+        raise Wrong("holds triggers whose times run backwards or are none")
 
 
 def _pixels(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind == "f":
         if not np.isfinite(found).all() or np.any(found != np.rint(found)):
-            raise Wrong("places that are no pixels")
+            raise Wrong("holds places that are no pixels")
         found = np.clip(found, -1, 1 << 20)
     return found.astype(np.int64)

@@ -1,4 +1,8 @@
-"""Which trials are in a file or folder of others, by format."""
+"""Trials in a file or folder of others, by format.
+
+Formats are recognised by how a file begins. Where that says nothing the name's ending does, so that
+a damaged file is refused instead of left out.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from protocols.errors import InputError
-from storage.exchange.by_faery import read_by_faery
+from storage.exchange.aedat4 import LINE
+from storage.exchange.by_faery import faery_type, read_by_faery
 from storage.exchange.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
-from storage.exchange.foreign import ForeignTrial, Wrong
+from storage.exchange.foreign import ForeignTrial, Wrong, read_head
 from storage.exchange.lab_pickles import pairs, read_pair
 from storage.exchange.manifest import as_it_was, read_manifest
 from storage.exchange.read_aedat4 import read_aedat4
@@ -24,18 +29,20 @@ READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
 }
 LAB_PICKLES = "lab-pickles"
 KINDS = (*READERS, LAB_PICKLES)
-_PICKLES = (".pickle", ".pkl")
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 
 
 def kind_of(path: Path) -> str:
-    """The format of a file, or of the files in a folder, by their names.
+    """The format of a file, or of the files in a folder.
 
     Raises:
         InputError: none of them is known, or they are of several.
     """
     files = _files(path)
     found = {_kind(file) for file in files} - {None}
+    if pairs(files):
+        found.add(LAB_PICKLES)
     if len(found) == 1:
         return str(found.pop())
     what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
@@ -49,14 +56,13 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
     """The trials of a file or folder, in the order of their names.
 
     Raises:
-        InputError: there is none.
-        Wrong: a file is damaged.
+        InputError: there is none, or a file is damaged.
     """
     files = _files(path)
     if kind == LAB_PICKLES:
         found = pairs(files)
         if not found:
-            raise InputError(path, "", None, "holds no NAME_events_on.pickle or ..._off.pickle")
+            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
         for pair in found:
             yield read_pair(pair, name_of(pair.stem))
         return
@@ -66,14 +72,29 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
         for item in told["trials"]:
             file = path / item["file"]
             if file.is_symlink() or not file.is_file():
-                raise Wrong(f"{file}: is missing, or no plain file")
-            yield as_it_was(reader(file, item["trial"]), item, told["simulated"])
+                raise InputError(file, "", None, "is missing, or no plain file")
+            yield as_it_was(_read(reader, file, item["trial"]), item, told["simulated"])
         return
-    wanted = [file for file in files if file.suffix.lower() in suffixes]
+    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
     if not wanted:
-        raise InputError(path, "", None, f"holds no file that ends in {' or '.join(suffixes)}")
+        raise InputError(
+            path, "", None, f"holds no {kind} file; such files end in {' or '.join(suffixes)}"
+        )
     for file in wanted:
-        yield reader(file, name_of(file.stem))
+        yield _read(reader, file, name_of(_stem(file)))
+
+
+def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
+    try:
+        return reader(file, name)
+    except Wrong as error:
+        raise InputError(file, "", None, str(error)) from None
+
+
+def _stem(file: Path) -> str:
+    """A file's name without its ending; a name without one may have dots in it."""
+    known = {ending for endings, _ in READERS.values() for ending in endings}
+    return file.stem if file.suffix.lower() in known else file.name
 
 
 def name_of(stem: str) -> str:
@@ -93,13 +114,24 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _kind(file: Path) -> str | None:
+def _possible(file: Path) -> tuple[str, ...]:
+    """Formats that a file may have: by how it begins, else by its name's ending."""
+    head = read_head(file)
+    if head.startswith(LINE):
+        return ("aedat4",)
+    if head.startswith(_HDF5):
+        return ("dsec", "lab-hdf5")
+    if form := faery_type(head):
+        return ("es",) if form == "es" else ("raw",)
     suffix = file.suffix.lower()
-    if suffix in _PICKLES:
-        return LAB_PICKLES if pairs([file]) else None
-    if suffix in READERS["dsec"][0]:
+    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
+
+
+def _kind(file: Path) -> str | None:
+    kinds = _possible(file)
+    if "dsec" in kinds:
         try:
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
         except Wrong as error:
             raise InputError(file, "", None, str(error)) from None
-    return next((kind for kind, (ends, _) in READERS.items() if suffix in ends), None)
+    return kinds[0] if kinds else None

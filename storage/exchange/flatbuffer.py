@@ -44,7 +44,7 @@ class Table:
         at += _number(self._data, "<I", at)
         count = _number(self._data, "<I", at)
         if count * size > len(self._data) - at - 4:
-            raise Wrong(f"{count} things in too few bytes")
+            raise Wrong(f"is damaged: {count} things in too few bytes")
         return count, self._data[at + 4 : at + 4 + count * size]
 
     def tables(self, field: int) -> list[Table]:
@@ -66,6 +66,6 @@ class Table:
 
 def _number(data: memoryview, form: str, at: int) -> int:
     if not 0 <= at <= len(data) - struct.calcsize(form):
-        raise Wrong("leads out of its own bytes")
+        raise Wrong("is damaged: a packet leads out of its own bytes")
     found: Any = struct.unpack_from(form, data, at)[0]
     return int(found)

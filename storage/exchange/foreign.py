@@ -4,19 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from protocols.errors import InputError
 from storage.streams import I64, U8, EventChunk, FrameChunk, Json
 
+_HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
 LATEST_US = 1 << 53
 """285 years; what comes later is no time, and would not fit 64 bits of nanoseconds."""
 
 
 class Wrong(ValueError):
-    """What a foreign file holds cannot be right; the message says what."""
+    """A foreign file cannot be right.
+
+    Attributes:
+        file: the file, where a trial has several.
+    """
+
+    def __init__(self, message: str, file: Path | None = None) -> None:
+        """Make one whose `message` goes on after the file's name, such as "is cut short"."""
+        self.file = file
+        super().__init__(message)
+
+
+def read_head(path: Path) -> bytes:
+    """The first 16 KiB of a file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True)
@@ -35,6 +60,7 @@ class ForeignTrial:
     Attributes:
         name: its id in the store.
         events: its events in order of time; read anew by each call.
+        event_px: columns and rows of its camera, None if unknown; called once `events` were read.
         epoch: what the times count from, in words.
         about: what else the file tells of itself, to be kept in the record.
         unknown: what nobody knows of it any more.
@@ -44,7 +70,7 @@ class ForeignTrial:
     source: str
     events: Callable[[], Iterator[EventChunk]]
     epoch: str
-    event_px: tuple[int, int] | None = None
+    event_px: Callable[[], tuple[int, int] | None] = lambda: None
     triggers: Triggers | None = None
     frames: Callable[[], Iterator[FrameChunk]] | None = None
     frame_px: tuple[int, int] | None = None
@@ -63,16 +89,16 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
     """
     columns = [np.asarray(column) for column in (x, y, p, t_us)]
     if any(c.ndim != 1 or len(c) != len(columns[3]) for c in columns):
-        raise Wrong("columns of events that differ in length")
+        raise Wrong("holds columns of events that differ in length")
     if any(c.dtype.kind not in "iub" for c in columns):
-        raise Wrong("events that are no integers")
+        raise Wrong("holds events that are no integers")
     limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
     for column, (what, most) in zip(columns, limits, strict=True):
         if len(column) and (int(column.min()) < 0 or int(column.max()) >= most):
-            raise Wrong(f"an event whose {what} is {int(column.min())} or {int(column.max())}")
+            raise Wrong(f"holds an event whose {what} is {column.min()} or {column.max()}")
     times = columns[3].astype(np.int64)
     if np.any(times[1:] < times[:-1]):
-        raise Wrong("events whose times run backwards")
+        raise Wrong("holds events whose times run backwards")
     return EventChunk(
         columns[0].astype(np.uint16),
         columns[1].astype(np.uint16),
@@ -93,5 +119,5 @@ def rounded_us(times: Any, per_unit: float) -> I64:
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
         found = np.asarray(times, np.float64) * per_unit
     if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
-        raise Wrong("a time that is no number, or beyond any time")
+        raise Wrong("holds a time that is no number, or beyond any time")
     return np.rint(found).astype(np.int64)

@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from protocols.errors import InputError
 from storage.errors import StoreError
-from storage.exchange.foreign import ForeignTrial, Wrong
+from storage.exchange.foreign import ForeignTrial
 from storage.files import read_json
 from storage.store import safe_name
 from storage.streams import Json
@@ -20,7 +21,7 @@ def read_manifest(folder: Path) -> Json | None:
     """The description of an exported campaign, checked; None where there is none.
 
     Raises:
-        Wrong: it is damaged, or names a file outside of its folder.
+        InputError: it is damaged, or names a file outside of its folder.
     """
     path = folder / MANIFEST
     if not path.is_file() or path.is_symlink():
@@ -36,9 +37,10 @@ def read_manifest(folder: Path) -> Json | None:
             safe_name(item["file"])
             _check(item, path)
     except OSError as error:
-        raise Wrong(f"{path}: cannot be read: {error.strerror}") from None
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, StoreError) as error:
-        raise Wrong(f"{path}: is damaged: {error}") from None
+        text = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, "", None, f"is damaged: {text}") from None
     return found
 
 

@@ -55,7 +55,9 @@ class Machine:
                 return self._value(stack[0])
             step = steps.get(code)
             if step is None:
-                raise Refused(f"the instruction {_NAMES.get(code, hex(code))}")
+                if code not in _NAMES:
+                    raise ValueError(f"it has the byte {code:#04x} where an instruction belongs")
+                raise Refused(f"the instruction {_NAMES[code]}")
             step(self)
 
     def _list_of_floats(self) -> bool:

@@ -24,7 +24,7 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
     with Aedat4File(path) as file:
         events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
         if events is None:
-            raise Wrong(f"{path.name}: holds no events")
+            raise Wrong("holds no stream of events")
         streams = file.streams
         found = None if triggers is None else file.triggers(triggers)
         frame_px = None
@@ -50,7 +50,7 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
         path.name,
         all_events,
         "as the file has it: Unix time, us, where a camera wrote it",
-        streams[events].size,
+        lambda: streams[events].size,
         found,
         None if frame_px is None else all_frames,
         frame_px,

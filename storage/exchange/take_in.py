@@ -20,7 +20,7 @@ from storage.files import json_text
 from storage.process import now
 from storage.recording import RECORD_FORMAT
 from storage.store import IMPORTED, Campaign, Store, safe_name
-from storage.streams import Json, PulseChunk
+from storage.streams import EventChunk, Json, PulseChunk
 from storage.writer import TrialWriter
 
 RISING = 1
@@ -69,15 +69,20 @@ def take_in(
                 found.append(trial.name)
                 continue
             if trial.name in made:
-                raise Wrong(f"two files for the trial {trial.name}")
+                raise InputError(
+                    origin, "", None,
+                    f"holds two files for the trial {trial.name}; import them one by one",
+                )  # fmt: skip
             if not campaign.begun:
                 _describe(campaign, trial, origin, kind)
-            taken, warned = _take(campaign, trial, kind)
+            try:
+                taken, warned = _take(campaign, trial, kind)
+            except Wrong as error:
+                file = error.file or (origin if origin.is_file() else origin / trial.source)
+                raise InputError(file, "", None, str(error)) from None
             made.append(trial.name)
             warnings += [f"{trial.source}: {text}" for text in warned]
             counts = {key: counts[key] + taken[key] for key in counts}
-    except Wrong as error:
-        raise InputError(origin, "", None, str(error)) from None
     finally:
         if fresh and not made and campaign.folder.exists():
             shutil.rmtree(campaign.folder)
@@ -108,9 +113,6 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str,
         if warnings:
             record[IMPORTED]["warnings"] = warnings
         writer.commit(record, {"imported": now(), "from": trial.source})
-    except Wrong as error:
-        writer.discard()
-        raise Wrong(f"{trial.source}: holds {error}") from None
     except BaseException:
         writer.discard()
         raise
@@ -118,21 +120,28 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str,
 
 
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
-    """All streams into the trial; the times of the first and the last event, us, and warnings."""
+    """All streams into the trial; the times of the first and the last event, us, and warnings.
+
+    Raises:
+        Wrong: there is no event, one lies outside of the camera's pixels, or times run backwards.
+    """
     first_us = last_us = None
     gap_us = gap_end_us = 0
     for chunk in trial.events():
         if not len(chunk):
             continue
         if last_us is not None and int(chunk.t_us[0]) < last_us:
-            raise Wrong("events whose times run backwards")
+            raise Wrong("holds events whose times run backwards")
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
         steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
         widest = int(steps.argmax())
         if int(steps[widest]) > gap_us:
             gap_us, gap_end_us = int(steps[widest]), int(chunk.t_us[widest])
         last_us = int(chunk.t_us[-1])
+        _check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
+    if first_us is None or last_us is None:
+        raise Wrong("holds no events, so there is nothing to import; leave it out")
     if trial.triggers is not None:
         t_ns = trial.triggers.t_us * 1000
         writer.add_triggers(t_ns, trial.triggers.kind)
@@ -140,9 +149,20 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
     for frames in trial.frames() if trial.frames is not None else ():
         height, width = frames.images.shape[1:]
         if (width, height) != trial.frame_px:
-            raise Wrong(f"a frame of {width} x {height} among others of {trial.frame_px}")
+            raise Wrong(f"holds a frame of {width} x {height} among others of {trial.frame_px}")
         writer.add_frames(frames)
-    return (first_us or 0, last_us or 0), _gap_warnings(gap_us, gap_end_us)
+    return (first_us, last_us), _gap_warnings(gap_us, gap_end_us)
+
+
+def _check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
+    if size is None:
+        return
+    x, y = int(chunk.x.max()), int(chunk.y.max())
+    if x >= size[0] or y >= size[1]:
+        raise Wrong(
+            f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
+            "pixels that it gives its camera"
+        )
 
 
 def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
@@ -158,6 +178,7 @@ def _record(
     campaign: Campaign, trial: ForeignTrial, kind: str, counts: Json, seconds: float
 ) -> Json:
     clock = {"grade": "unknown", "map": IDENTITY.to_json(), "uncertainty_ns": None}
+    event_px = trial.event_px()
     clocks: Json = {"reference": "event camera", "events": clock}
     if trial.frames is not None:
         clocks["frames"] = clock
@@ -178,7 +199,7 @@ def _record(
         "quality": {"passed": True, "gates": {}},
         "steps": [],
         "geometry": {
-            "event_px": list(trial.event_px) if trial.event_px else None,
+            "event_px": list(event_px) if event_px else None,
             "frame_px": list(trial.frame_px) if trial.frame_px else None,
         },
         IMPORTED: {

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from tests.conftest import ROOT
@@ -195,11 +196,19 @@ def make_foreign(folder: Path) -> dict[str, bytes]:
     """One small file of each kind, by name."""
     from storage.exchange.hand_out import hand_out
     from storage.store import Store
-    from tests.storage.exchange.files import lab_hdf5
+    from tests.storage.exchange.files import lab_cells, lab_hdf5
 
     recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
     lab_hdf5(folder / "lab.h5")
     found = {"lab.h5": (folder / "lab.h5").read_bytes()}
+    with h5py.File(folder / "lab.h5", "r+") as file:
+        file.attrs["sensor_resolution"] = np.array([640, 480])
+    found["d2_s1.0_stream"] = (folder / "lab.h5").read_bytes()
+    cells = lab_cells((128, 128), {(3, 5): [10.5, 11.0], (100, 7): [12.0]})
+    np.save(folder / "a_events_on.npy", cells, allow_pickle=True)
+    found["a_events_on.npy"] = (folder / "a_events_on.npy").read_bytes()
+    np.save(folder / "a_events_on.npy", np.arange(128 * 128.0).reshape(128, 128, 1))
+    found["b_off.npy"] = (folder / "a_events_on.npy").read_bytes()
     for kind in ("dsec", "aedat4"):  # whose manifest stays
         out = folder / f"box-made-{kind}"
         hand_out([recording], out, kind, "c")

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from storage.streams import EventChunk
+
+SMALL = (6, 8)
+"""Rows and columns of a camera of few pixels."""
 
 
 def lab_hdf5(path: Path) -> EventChunk:
@@ -22,6 +26,14 @@ def lab_hdf5(path: Path) -> EventChunk:
     return EventChunk(x.astype(np.uint16), y.astype(np.uint16), p.astype(np.uint8), t_us)
 
 
+def lab_cells(size: tuple[int, int], places: dict[tuple[int, int], list[float]]) -> Any:
+    """An array of columns x rows with a list in every cell, with times, ms, in some."""
+    cells = np.frompyfunc(lambda _: [], 1, 1)(np.zeros(size))
+    for place, times in places.items():
+        cells[place] = times
+    return cells
+
+
 def lab_pickles(folder: Path, stem: str, size: tuple[int, int], *, by_columns: bool) -> None:
     """Two pickles of columns x rows with some times, ms, in some pixels."""
     width, height = size
@@ -29,8 +41,6 @@ def lab_pickles(folder: Path, stem: str, size: tuple[int, int], *, by_columns: b
         ("on", {(3, 5): [10.0, 12.5], (width - 1, height - 1): [11]}),
         ("off", {(3, 5): [11.25], (0, 0): [0.125]}),
     ):
-        cells = np.frompyfunc(lambda _: [], 1, 1)(np.zeros((width, height)))
-        for (x, y), times in places.items():
-            cells[x, y] = times
+        cells = lab_cells(size, places)
         cells = cells if by_columns else np.ascontiguousarray(cells.T)
         (folder / f"{stem}_events_{polarity}.pickle").write_bytes(pickle.dumps(cells))

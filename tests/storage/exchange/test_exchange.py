@@ -35,10 +35,8 @@ from storage.recording import Recording
 from storage.store import Store
 from storage.streams import EventChunk
 from storage.verify import verify
-from tests.storage.exchange.files import lab_hdf5, lab_pickles
+from tests.storage.exchange.files import SMALL, lab_hdf5, lab_pickles
 from tests.storage.trials import campaign, commit
-
-SMALL = (6, 8)
 
 
 @pytest.fixture(scope="module")
@@ -279,12 +277,6 @@ def test_aedat4_goes_round_with_every_trigger(tmp_path: Path) -> None:
         for mine, yours in zip(was.pictures(1), file.pictures(1), strict=True):
             assert mine.t_ns == yours.t_ns
             np.testing.assert_array_equal(mine.image, yours.image)
-
-
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera of few pixels: 307,200 lists take seconds to make."""
-    monkeypatch.setattr(lab, "LANDSCAPE", SMALL)
 
 
 @pytest.mark.parametrize("by_columns", [False, True])
