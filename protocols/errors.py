@@ -7,8 +7,9 @@ prints it as one message and exits with 2.
 
 from __future__ import annotations
 
-from decimal import Decimal
 from pathlib import Path
+
+from protocols.shown import MASK, printable, shown, shown_key
 
 
 class InputError(ValueError):
@@ -17,15 +18,17 @@ class InputError(ValueError):
     Attributes:
         file: the file the input came from, or a command-line option's name.
         key: the path of the key inside it, such as ``collection.factors.depth.values[2]``.
-        value: what was found there, as text; ``None`` where nothing was found.
+        value: what was found there, as text, secrets masked; ``None`` where nothing was found.
         expected: what would be right, as a phrase.
     """
 
     def __init__(self, file: str | Path, key: str, value: object | None, expected: str) -> None:
         self.file = str(file)
-        self.key = key
-        self.value = None if value is None else _short(value)
+        self.key = shown_key(key)
+        self.value = None if value is None else shown(value, key)
         self.expected = expected
+        if self.value == MASK:
+            self.expected = expected.replace(str(value), MASK)
         super().__init__(self.message)
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str | None, ...]]:
@@ -37,15 +40,8 @@ class InputError(ValueError):
         """``file: key = value: expected`` in one line."""
         where = f"{self.file}: {self.key}" if self.key else self.file
         found = "" if self.value is None else f" = {self.value}"
-        return f"{where}{found}: {self.expected}"
+        return printable(f"{where}{found}: {self.expected}").replace("\n", "\\n")
 
     def in_file(self, file: str | Path) -> InputError:
         """The same error, for input that turned out to come from `file`."""
         return InputError(file, self.key, self.value, self.expected)
-
-
-def _short(value: object, limit: int = 80) -> str:
-    # a person wrote 0.9, not the type that it was read into
-    text = str(value) if isinstance(value, str | Decimal) else repr(value)
-    text = " ".join(text.split())
-    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from protocols.quantity import UNITS, canonical, check_size, to_decimal
+from protocols.quantity import UNITS, canonical, check_size, number_meant, to_decimal
 from protocols.yaml_file import KeyedError, StrictModel
 
 MAX_TRIALS = 1_000_000
@@ -74,6 +74,10 @@ class Range(StrictModel):
 def _level(raw: object) -> Level:
     if isinstance(raw, str):
         if not _WORD.fullmatch(raw):
+            if meant := number_meant(raw):
+                raise ValueError(meant)
+            if re.fullmatch(r"[+-]?[\d.]+([eE][+-]?\d+)?", raw):
+                raise ValueError(f"reads as text; write {canonical(to_decimal(raw))}")
             raise ValueError(
                 "must be a number (the unit stands once, in 'unit') or a word of letters, "
                 "digits, '_' and '-'"

@@ -106,7 +106,7 @@ class Collection(StrictModel):
         acting = [index for index, name in enumerate(names) if name in {"slide", "retract"}]
 
         def fail(expected: str, value: object = None) -> None:
-            raise KeyedError("collection.motion", value or " -> ".join(names), expected)
+            raise KeyedError("collection.motion", value or " -> ".join(names) or [], expected)
 
         if names[:1] != ["approach"] and names[:1] != ["plate"]:
             fail("must begin with 'approach' (or 'plate')")

@@ -8,6 +8,7 @@ kept as `decimal.Decimal` in the canonical unit of their kind, and never pass th
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -41,7 +42,11 @@ UNITS: dict[str, tuple[str, Decimal]] = {
 # how a canonical unit is written where a slash or a percent sign cannot stand (file names)
 FILE_UNITS = {"mm/s": "mmps", "percent": "pct"}
 
-_PATTERN = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
+_DIGITS = r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
+_NUMBER = re.compile(rf"{_DIGITS}\s*([A-Za-z%/]+)?")
+_PATTERN = re.compile(rf"\s*{_DIGITS}\s*([A-Za-z%/]+)\s*")
+_DASHES = "\u2010\u2011\u2012\u2013\u2014\u2212\ufe63"
+_PLAIN = str.maketrans(dict.fromkeys(_DASHES, "-") | {"\u03bc": "u"})
 _LARGEST = Decimal("1e9")
 # by canonical unit, far beyond any rig: what is larger was meant in another unit, or not at all
 _SIZES = {
@@ -68,6 +73,8 @@ def to_decimal(raw: object) -> Decimal:
     """
     if isinstance(raw, bool) or not isinstance(raw, (int, float, str, Decimal)):
         raise ValueError("must be a number")
+    if isinstance(raw, str) and (meant := number_meant(raw)):
+        raise ValueError(meant)
     try:
         value = Decimal(repr(raw)) if isinstance(raw, float) else Decimal(raw)
     except InvalidOperation as error:
@@ -92,6 +99,8 @@ def parse(raw: object, unit: str) -> Decimal:
         raise ValueError(f"has no unit: write a number with a unit, such as '{raw} {unit}'")
     match = _PATTERN.fullmatch(raw) if isinstance(raw, str) else None
     if match is None:
+        if isinstance(raw, str) and (meant := number_meant(raw)):
+            raise ValueError(meant)
         raise ValueError(f"must be a finite number with a unit, such as '1.5 {unit}'")
     number, written = match.groups()
     base, factor = UNITS.get(written, ("", Decimal(1)))
@@ -101,6 +110,23 @@ def parse(raw: object, unit: str) -> Decimal:
     value = to_decimal(number) * factor
     check_size(value, unit)
     return value
+
+
+def number_meant(raw: str) -> str | None:
+    """The message for a number in characters that are not read: a minus sign, a decimal comma."""
+    odd = next((character for character in raw if not character.isascii()), "")
+    plain = unicodedata.normalize("NFKC", raw).translate(_PLAIN).strip()
+    numbers = [plain]
+    if re.search(r"\d,\d", plain):
+        whole = re.fullmatch(r"[^,.]*\d{1,3}(,\d{3})+\D*", plain) is not None
+        numbers = [plain.replace(",", "")] * whole + [plain.replace(",", ".")]
+    if numbers == [raw.strip()] or not all(_NUMBER.fullmatch(number) for number in numbers):
+        return None
+    if odd:
+        found = f"holds U+{ord(odd):04X} {unicodedata.name(odd, 'a character without a name')}"
+    else:
+        found = "has a comma" if len(numbers) > 1 else "has a decimal comma"
+    return f"{found}: write {' or '.join(repr(number) for number in numbers)}"
 
 
 def check_size(value: Decimal, unit: str) -> None:

@@ -23,6 +23,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from protocols.errors import InputError
+from protocols.shown import MASK, holds_secret
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
@@ -137,7 +138,7 @@ class _Builder:
             return [self.build(item, f"{key}[{index}]") for index, item in enumerate(node.value)]
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node, key)
-        raise self._wrong(node, key, None, _no_tag(node.tag))
+        raise self._wrong(node, key, None, _unread(node.tag))
 
     def _mapping(self, node: Any, key: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -159,12 +160,15 @@ class _Builder:
         return found
 
     def _name(self, node: Any, key: str) -> str:
-        name = self._scalar(node, key) if isinstance(node, yaml.ScalarNode) else None
-        if not isinstance(name, str):
+        is_text = isinstance(node, yaml.ScalarNode) and node.tag in {f"{_TAG}str", f"{_TAG}value"}
+        name = node.value if is_text else None
+        if name is None:
             text = "cannot be read: a key must be text; quote it if it is meant"
+            if node.tag == _ALIAS or not node.tag.startswith(_TAG):
+                text = _unread(node.tag)
             written = node.value if isinstance(node, yaml.ScalarNode) else None
             raise self._wrong(node, key, written, text)
-        return name
+        return str(name)
 
     def _scalar(self, node: Any, key: str) -> Any:
         text: str = node.value
@@ -193,19 +197,30 @@ class _Builder:
         elif kind in {"int", "float", "bool"}:
             words = {"int": "a decimal number", "float": "a number", "bool": "true or false"}
             expected = f"is not {words[kind]}"
-        elif node.tag == _ALIAS:
-            expected = "cannot be read: aliases are not read here, write it out"
         else:
-            expected = _no_tag(node.tag)
+            expected = _unread(node.tag)
         raise self._wrong(node, key, text, expected)
 
     def _wrong(self, node: Any, key: str, value: object, expected: str) -> InputError:
-        line = node.start_mark.line + 1
-        return InputError(self._path, key, value, f"{expected} (line {line})")
+        if holds_secret(key):
+            value, expected = MASK, _SECRET
+        return InputError(self._path, key, value, f"{expected} (line {node.start_mark.line + 1})")
 
 
-def _no_tag(tag: str) -> str:
+_SECRET = "cannot be read as text; quote it"
+"""All that is said of a secret: the parser's own words could hold it."""
+
+
+def _unread(tag: str) -> str:
+    if tag == _ALIAS:
+        return "cannot be read: aliases are not read here, write it out"
     return f"cannot be read: the tag {tag.replace(_TAG, '!!')} is not read here, write the value"
+
+
+def _problem(error: yaml.MarkedYAMLError, text: str) -> str:
+    lines = text.splitlines()
+    line = "" if error.problem_mark is None else "".join(lines[error.problem_mark.line :][:1])
+    return _SECRET if holds_secret(line.partition(":")[0]) else f"cannot be read: {error.problem}"
 
 
 def _is_rest(key_node: Any, value_node: Any, before: Any) -> bool:
@@ -272,7 +287,7 @@ def parse_yaml(text: str, path: str | Path) -> Document:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}"
-        raise InputError(path, where, None, f"cannot be read: {error.problem}") from None
+        raise InputError(path, where, None, _problem(error, text)) from None
     except (yaml.YAMLError, RecursionError) as error:
         raise InputError(path, "", None, f"is not YAML: {error}") from None
     if not isinstance(data, dict):

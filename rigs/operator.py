@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from protocols.shown import printable
 from rigs.capabilities import RigError
 
 
@@ -22,7 +23,7 @@ class ConsoleOperator:
             )
         while True:
             print(
-                f"\n{task}: {prompt}\nType '{expected}' when it is done, or 'stop': ",
+                printable(f"\n{task}: {prompt}\nType '{expected}' when it is done, or 'stop': "),
                 end="",
                 file=sys.stderr,
                 flush=True,
@@ -32,4 +33,4 @@ class ConsoleOperator:
                 return False
             if answer.split() == expected.split():
                 return True
-            print(f"That was '{answer.strip()}'.", file=sys.stderr)
+            print(printable(f"That was '{answer.strip()}'."), file=sys.stderr)

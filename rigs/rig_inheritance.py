@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from protocols.errors import InputError
-from protocols.yaml_file import parse_yaml, read_text
+from protocols.yaml_file import Document, parse_yaml, read_text
 
 KEY = "extends"
 _DEEPEST = 8
@@ -30,7 +30,7 @@ class RigSource:
     """Merged."""
     text: str
     """The file's own text if it extends nothing, else the merged content as YAML."""
-    parts: tuple[tuple[Path, dict[str, Any]], ...]
+    parts: tuple[tuple[Path, Document], ...]
     """Each file with its own keys, the one that was asked for first."""
 
     def blame(self, key: str) -> Path:
@@ -72,7 +72,7 @@ def read_rig(path: Path) -> RigSource:
     Raises:
         InputError: a file cannot be read, or extends itself, or goes on for more than 8 files.
     """
-    parts: list[tuple[Path, dict[str, Any]]] = []
+    parts: list[tuple[Path, Document]] = []
     text, here = read_text(path, "rig file"), path
     own = text
     while True:
@@ -97,12 +97,13 @@ def read_rig(path: Path) -> RigSource:
     if len(parts) > 1:
         names = " on ".join(file.name for file, _ in parts)
         text = f"# Merged: {names}\n" + rig_yaml(merged)
-    return RigSource(path, merged, text, tuple(parts))
+    written = {key: each for _, data in reversed(parts) for key, each in data.written.items()}
+    return RigSource(path, Document(merged, written), text, tuple(parts))
 
 
 def rig_yaml(data: dict[str, Any]) -> str:
     """A rig file's content as it is written down."""
-    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False)
+    text: str = yaml.dump(dict(data), Dumper=_Dumper, sort_keys=False)
     return text
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from protocols.errors import InputError
+from protocols.shown import is_secret
 from storage.errors import NoStore, StoreError
 from storage.files import json_text, make_folder, read_blocks, write_blocks
 from storage.streams import Json
@@ -26,7 +27,6 @@ LAYOUT_FILE, LAYOUT = "sliplab.json", 1
 SMALL_BYTES = 8_000_000
 """Objects up to this are fetched in one request."""
 _BLOCK = 8_000_000
-_SECRETS = ("secret", "token", "password", "passwd", "key", "credential")
 _SECRET_VARIABLES = ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_ACCESS_KEY_ID")
 _ANSWERS = 200
 """Characters that are passed on of what a server said."""
@@ -287,7 +287,7 @@ class Remote:
         known = [
             str(value)
             for name, value in options.items()
-            if isinstance(value, str) and any(part in name.lower() for part in _SECRETS)
+            if isinstance(value, str) and is_secret(name)
         ]
         known += [os.environ.get(name, "") for name in _SECRET_VARIABLES]
         for value in known:

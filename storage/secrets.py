@@ -8,15 +8,11 @@ change because it looks like somebody's key.
 from __future__ import annotations
 
 import os
-import re
 
-_NAMED = re.compile(
-    r"(?:^|_)(KEY|TOKEN|SECRET|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?|AUTH_STRING)(?:_|$)", re.I
-)
-_URL = re.compile(r"(://[^\s/@:\"']*:)([^\s/@\"']+)(?=@)")
+from protocols.shown import MASK, is_secret, password_in, without_passwords
+
 _SHORTEST = 8
 """A shorter value is a switch, or stands in many a word."""
-MASK = "****"
 
 
 def masked(text: str) -> str:
@@ -28,15 +24,17 @@ def masked(text: str) -> str:
     for secret in _secrets():
         if secret in text:
             text = text.replace(secret, MASK)
-    return _URL.sub(rf"\1{MASK}", text) if "://" in text else text
+    return without_passwords(text)
 
 
 def _secrets() -> list[str]:
     """Longest first: one may be part of another."""
     found = set()
     for name, value in os.environ.items():
-        if len(value) >= _SHORTEST and _NAMED.search(name) and not value.startswith("/"):
+        if len(value) < _SHORTEST:
+            continue
+        if is_secret(name) and not value.startswith("/"):
             found.add(value)
-        elif "@" in value and (told := _URL.search(value)) and len(told[2]) >= _SHORTEST:
-            found.add(told[2])
+        elif (password := password_in(value)) and len(password) >= _SHORTEST:
+            found.add(password)
     return sorted(found, key=len, reverse=True)

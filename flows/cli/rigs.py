@@ -15,6 +15,7 @@ from rigs.rig_file import RigFile, load_rig_file
 from rigs.rig_inheritance import shipped_rigs
 from rigs.rig_lock import held
 from storage.lock import Locked
+from storage.secrets import masked
 
 
 def rigs(
@@ -48,11 +49,11 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
     try:
         file, _ = load_rig_file(path)
     except InputError as error:
-        text = str(error)
+        text = masked(str(error))
         known = dict.fromkeys(COLUMNS, "")
         return {**known, "name": path.name, "answer": text, "wrong": True, "file": str(path)}
     answers = _ask(file) if ask and file.driver == "devices" else {}
-    silent = {name: why for name, why in answers.items() if why is not None}
+    silent = {name: masked(why) for name, why in answers.items() if why is not None}
     return {
         "name": file.name,
         "driver": file.driver,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from protocols.shown import shown
+
 MOST = 12
 _MISSING = object()
 
@@ -20,7 +22,7 @@ def differences(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, s
             before, after = (part[index] if index < len(part) else _MISSING for part in (old, new))
             yield from differences(before, after, f"{key}[{index}]")
     elif old != new:
-        yield key, _text(old), _text(new)
+        yield key, _text(old, key), _text(new, key)
 
 
 def told(old: Any, new: Any, key: str = "") -> str:
@@ -36,11 +38,5 @@ def _of_mappings(*lists: list[Any]) -> bool:
     return any(isinstance(item, dict) for part in lists for item in part)
 
 
-def _text(value: Any) -> str:
-    if value is _MISSING or value is None:
-        return "not there"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{name}: {_text(item)}" for name, item in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_text, value)) + "]"
-    return str(value)
+def _text(value: Any, key: str) -> str:
+    return "not there" if value is _MISSING or value is None else shown(value, key)

@@ -30,6 +30,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flows.running import stopping
+from protocols.shown import CONTROL, printable
 from storage.secrets import masked
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -60,7 +61,7 @@ results = Console(highlight=False, width=results_width())
 
 def say(text: str) -> None:
     """A line for people."""
-    messages.print(masked(text), markup=False)
+    messages.print(_clean(text), markup=False)
 
 
 _as_json = _printed = False
@@ -87,6 +88,7 @@ def print_json(data: Any) -> None:
     """The one JSON object of a command."""
     global _printed
     text = json.dumps(data, allow_nan=False, ensure_ascii=False)
+    text = CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
     _printed = True
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -113,7 +115,7 @@ def print_table(
     if limit and len(cells) > limit:
         more = [f"... {len(cells) - limit} more", *("" for _ in columns[1:])]
         cells[limit // 2 : limit // 2 - limit] = [more]
-    _print(Table(title=escape(title), box=SIMPLE_HEAD), columns, cells, spare)
+    _print(Table(title=escape(_clean(title)), box=SIMPLE_HEAD), columns, cells, spare)
 
 
 def _print(
@@ -124,7 +126,7 @@ def _print(
     table.title_justify, table.padding = "left", (0, 1 if gap == 3 else 0, 0, 1)
     table.width = _table_width(widths, gap)
     for column, width in zip(columns, widths, strict=False):
-        table.add_column(escape(column), width=width)
+        table.add_column(escape(_clean(column)), width=width)
     for row in cells:
         table.add_row(*map(Text, row[: len(widths)]))
     results.print(table, crop=False)
@@ -163,16 +165,19 @@ def _table_width(widths: Sequence[int], gap: int) -> int:
 
 def print_pairs(title: str, pairs: Mapping[str, object]) -> None:
     """Names and values, one pair a line."""
-    cells = [[name, _cell(value)] for name, value in pairs.items()]
-    _print(Table(title=escape(title), show_header=False, box=SIMPLE), ["", ""], cells)
+    cells = [[_cell(name), _cell(value)] for name, value in pairs.items()]
+    _print(Table(title=escape(_clean(title)), show_header=False, box=SIMPLE), ["", ""], cells)
 
 
 def _cell(value: object) -> str:
     if value is None:
         return "-"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return str(value)
+    return _clean(f"{value:.4g}" if isinstance(value, float) else str(value))
+
+
+def _clean(text: str) -> str:
+    """Return text for people: secrets are masked, control codes written out."""
+    return printable(masked(text))
 
 
 class Bar:
@@ -192,7 +197,7 @@ class Bar:
             KeyboardInterrupt: somebody asked the program to stop.
         """
         stopping.check()
-        self._progress.update(self._task, advance=count, note=note, left=left)
+        self._progress.update(self._task, advance=count, note=printable(note), left=left)
         now_s = time.monotonic()
         if not messages.is_terminal and now_s - self._said_s >= LINE_EVERY_S:
             self._said_s = now_s
@@ -220,18 +225,20 @@ def bar(title: str, total: float, left: str | None = None) -> Iterator[Bar]:
         left: the time that is left in words, where the caller knows better than a count would.
     """
     progress = Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn() if left is None else TextColumn("{task.fields[left]}"),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
         console=messages,
         transient=not messages.is_terminal,
         speed_estimate_period=SPEED_OVER_S,
     )
     with progress:
-        yield Bar(progress, progress.add_task(title, total=total, note="", left=left or ""))
+        yield Bar(
+            progress, progress.add_task(printable(title), total=total, note="", left=left or "")
+        )
 
 
 def duration(seconds: float) -> str:

@@ -97,7 +97,7 @@ class AbbSettings(_Arm):
     """UDP port on this host to which the controller sends its poses."""
     egm_bind: Host = "0.0.0.0"
     username: str = "Default User"
-    password: str = "robotics"
+    password: str = Field(default="robotics", repr=False)
     egm_point: Literal["tool", "flange"] = "tool"
     """Whose pose the controller's EGM stream tells; held against the web services on connecting."""
     task: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "T_ROB1"

@@ -1,0 +1,109 @@
+"""Text as it may be shown to a person: values as YAML writes them, no secrets, no control codes.
+
+A message quotes what a file says. The file may hold a password, or bytes that steer a terminal
+(``ESC ]0;...`` sets its title, an override of direction shows text backwards); neither is
+passed on.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from datetime import date
+from decimal import Decimal
+
+MASK = "****"
+
+CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]"
+)
+"""Characters that steer a terminal, or the direction of text; not line breaks and tabs."""
+_WORDS = re.compile(r"[A-Z]?[a-z0-9]+|[A-Z0-9]+")
+_ENDS = ("key", "keys", "token", "tokens", "secret", "secrets", "credential", "credentials")
+_PARTS = ("passw", "passphrase", "secret")
+_WHOLE = frozenset({"pass", "pwd", "pw", "auth"})
+_MISSPELT = ("password", "passwd", "passphrase", "secret", "token", "credentials")
+_CLOSE = 0.85
+_WRITTEN = re.compile(r"(?<![\w-])([\w-]+)\s*[:=]\s*(?=[^\s*])")
+_URL = re.compile(r"(://[^\s/@:\"']*:)([^\s/@\"']+)(?=@)")
+_LONGEST = 80
+_LOOKED_AT = 1000
+"""Characters of a text or a name that are searched: a file may hold a million."""
+
+
+def is_secret(name: str) -> bool:
+    """Whether a key or a variable of this name holds a secret, also if it is misspelt."""
+    for word in _WORDS.findall(name[:_LOOKED_AT]):
+        word = word.lower()
+        if word in _WHOLE or word.endswith(_ENDS) or any(part in word for part in _PARTS):
+            return True
+        if difflib.get_close_matches(word, _MISSPELT, n=1, cutoff=_CLOSE):
+            return True
+    return False
+
+
+def holds_secret(key: str) -> bool:
+    """Whether a part of a key's path (``devices.arm.password``) is a secret's name."""
+    return any(is_secret(name) for name in re.findall(r"[^.\[\]]+", key))
+
+
+def password_in(url: str) -> str | None:
+    """The password of the first address (``scheme://user:password@host``) in a text."""
+    found = _URL.search(url)
+    return None if found is None else found[2]
+
+
+def without_passwords(text: str) -> str:
+    """`text` with the passwords of its addresses masked."""
+    return _URL.sub(rf"\1{MASK}", text) if "://" in text else text
+
+
+def printable(text: str) -> str:
+    """`text` with control codes written out (``\\x1b``); line breaks and tabs stay."""
+    return CONTROL.sub(lambda found: _escaped(found[0]), text)
+
+
+def shown(value: object, key: str = "") -> str:
+    """A value in one line of at most 80 characters, as YAML would write it.
+
+    Args:
+        key: where it stands; values of secret keys are masked, at any depth.
+    """
+    text = printable(" ".join(_yaml(value, key).split()))
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+
+
+def shown_key(key: str) -> str:
+    """A key in one line of at most 1000 characters, a secret written into it masked."""
+    return printable(" ".join(_without_secret(key[:_LOOKED_AT]).split()))
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
+
+
+def _yaml(value: object, key: str) -> str:
+    if value is None:
+        return "null"
+    if holds_secret(key):
+        return MASK
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        pairs = ", ".join(f"{shown_key(str(k))}: {_yaml(v, str(k))}" for k, v in value.items())
+        return f"{{{pairs}}}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_yaml(part, "") for part in value) + "]"
+    if isinstance(value, float | Decimal) and not (number := Decimal(value)).is_finite():
+        return ".nan" if number.is_nan() else ".inf" if number > 0 else "-.inf"
+    if isinstance(value, date):
+        return value.isoformat()
+    return _without_secret(str(value))
+
+
+def _without_secret(text: str) -> str:
+    for found in _WRITTEN.finditer(text[:_LOOKED_AT]):
+        if is_secret(found[1]):
+            return without_passwords(text[: found.end()]) + MASK
+    return without_passwords(text)

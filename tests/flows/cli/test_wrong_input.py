@@ -1,0 +1,312 @@
+"""Wrong protocol and rig files through the command line: exit 2, one message that helps."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from protocols.shown import MASK
+from tests.command_line import here
+from tests.conftest import ROOT
+
+PILOT = (ROOT / "protocols" / "pilot.yaml").read_text()
+ABB = (ROOT / "rigs" / "irb120.yaml").read_text().replace("ur5.yaml", f"{ROOT}/rigs/ur5.yaml")
+MOTION = PILOT[PILOT.index("  motion:\n") : PILOT.index("  recording:\n")]
+MINUS, MICRO, MU = "\N{MINUS SIGN}", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"
+
+PROTOCOLS: dict[str, tuple[str, str, str, str]] = {
+    # what is replaced, by what, the message's "key = value", and what would be right
+    "decimal comma": (
+        "depth: $depth, speed: 2 mm/s}",
+        "depth: $depth, speed: 2,5 mm/s}",
+        "collection.motion[1].speed = 2,5 mm/s",
+        "write 2.5 mm/s",
+    ),
+    "decimal comma without a unit": (
+        "margin: 8,",
+        "margin: 8,5, ",
+        "analysis.detection.margin = 8,5",
+        "write 8.5",
+    ),
+    "decimal comma in text": (
+        "depth: 3.6 mm",
+        "depth: 3,6 mm",
+        "collection.limits.depth = 3,6 mm",
+        "write '3.6 mm'",
+    ),
+    "unicode minus": (
+        "x: {low: -10 mm",
+        f"x: {{low: {MINUS}10 mm",
+        f"collection.limits.workspace.x.low = {MINUS}10 mm",
+        "U+2212 MINUS SIGN: write '-10 mm'",
+    ),
+    "unicode minus in a level": (
+        "values: [0, 90, 180, 270]",
+        f"values: [0, {MINUS}90, 180]",
+        f"collection.factors.direction.values[1] = {MINUS}90",
+        "U+2212 MINUS SIGN: write '-90'",
+    ),
+    "micro sign": (
+        "clearance: 20 mm",
+        f"clearance: 5000 {MICRO}m",
+        f"collection.limits.clearance = 5000 {MICRO}m",
+        "U+00B5 MICRO SIGN: write '5000 um'",
+    ),
+    "greek mu": (
+        "clearance: 20 mm",
+        f"clearance: 5000 {MU}m",
+        f"collection.limits.clearance = 5000 {MU}m",
+        "U+03BC GREEK SMALL LETTER MU: write '5000 um'",
+    ),
+    "other digits": (
+        "clearance: 20 mm",
+        "clearance: \N{FULLWIDTH DIGIT TWO}0 mm",
+        "collection.limits.clearance = \N{FULLWIDTH DIGIT TWO}0 mm",
+        "U+FF12 FULLWIDTH DIGIT TWO: write '20 mm'",
+    ),
+    "a name that is a switch": ("name: pilot", "name: no", "name = no", "reads as a switch: quote"),
+    "a name that is a day": (
+        "name: pilot",
+        "name: 2026-11-23",
+        "name = 2026-11-23",
+        "reads as a day: quote",
+    ),
+    "a name that is a number": (
+        "name: pilot",
+        "name: 1.50",
+        "name = 1.50",
+        "reads as a number: quote",
+    ),
+    "a list where a number belongs": (
+        "depth: 3.6 mm",
+        "depth: [2.4, {a: 0.5}]",
+        "collection.limits.depth = [2.4, {a: 0.5}]",
+        "must be a finite number with a unit",
+    ),
+    "empty motion": (MOTION, "  motion:\n", "collection.motion", "is empty; must be a list"),
+    "no motion": (MOTION, "  motion: []\n", "collection.motion = []", "must begin with 'approach'"),
+    "motion is no list": (
+        MOTION,
+        "  motion: {phase: approach}\n",
+        "collection.motion = {phase: approach}",
+        "must be a list",
+    ),
+    "a merge": (
+        "  repetitions: 1",
+        "  <<: {repetitions: 1}",
+        "collection.<<",
+        "'<<' takes over nothing here, write the keys out (line 14)",
+    ),
+    "a tag": (
+        "depth: 3.6 mm",
+        "depth: !include x",
+        "collection.limits.depth = x",
+        "the tag !include is not read here",
+    ),
+    "an alias": (
+        "depth: 3.6 mm",
+        "depth: *deep",
+        "collection.limits.depth = *deep",
+        "aliases are not read here",
+    ),
+    "which phase": (
+        "depth: $depth",
+        "depth: $dept",
+        "collection.motion[1].depth = $dept",
+        "unknown factor $dept; defined factors: depth, speed, direction",
+    ),
+    "escape bytes": ("name: pilot", 'name: "\\e[31mred"', "name = \\x1b[31mred", "pattern"),
+    "escape bytes in a key": (
+        "  repetitions: 1",
+        '  "\\e]0;title\\a": 1',
+        "collection.\\x1b]0;title\\x07 = 1",
+        "unknown key",
+    ),
+    "text that runs backwards": (
+        "name: pilot",
+        'name: "\\u202Etolip"',
+        "name = \\u202etolip",
+        "pattern",
+    ),
+    "no day": (
+        "name: pilot",
+        "name: 2026-02-30",
+        "name = 2026-02-30",
+        "is no day of the calendar",
+    ),
+    "a name twice": (
+        "  repetitions: 1",
+        "  repetitions: 1\n  repetitions: 2",
+        "collection.repetitions",
+        "the key stands twice (line 15)",
+    ),
+    "strata": (
+        "strata: [depth, speed]",
+        "strata: [depht, speed]",
+        "analysis.split.strata[0] = depht",
+        "unknown factor depht; defined factors: depth, speed, direction",
+    ),
+    "repetitions": ("repetitions: 1", "repetitions: yes", "collection.repetitions = yes", "number"),
+    "false early": (
+        "false_early_ms: 30",
+        "false_early_ms: .inf",
+        "analysis.detection.false_early_ms = .inf",
+        "must be a finite number",
+    ),
+    "margin": ("margin: 8", "margin: .inf", "analysis.detection.margin = .inf", "finite number"),
+    "a count": (
+        "frames_lost: 0",
+        "frames_lost: 1000000000000",
+        "collection.gates.frames_lost = 1000000000000",
+        "less than or equal to 1000000",
+    ),
+    "directions": (
+        "values: [0, 90, 180, 270]",
+        "values: [0, 90, 180, 360]",
+        "collection.factors.direction.values[3] = 360",
+        "is the same direction as 0 deg",
+    ),
+    "a direction": (
+        "values: [0, 90, 180, 270]",
+        "values: [-1.0e+9]",
+        "collection.factors.direction.values[0] = -1.0e+9",
+        "must be from -360 to 360 deg",
+    ),
+    "a direction that YAML takes for text": (
+        "values: [0, 90, 180, 270]",
+        "values: [-1e9]",
+        "collection.factors.direction.values[0] = -1e9",
+        "reads as text; write -1000000000",
+    ),
+    "thousands": (
+        "depth: 3.6 mm",
+        "depth: 1,000 um",
+        "collection.limits.depth = 1,000 um",
+        "has a comma: write '1000 um' or '1.000 um'",
+    ),
+}
+
+
+def refused(*arguments: object) -> str:
+    """The one message of a command that refuses its input."""
+    done = here(*arguments)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert not re.search(r"[\x00-\x1f\x7f-\x9f]|Decimal\(|datetime", line)
+    return line
+
+
+@pytest.mark.parametrize("command", ["plan", "check"])
+@pytest.mark.parametrize("case", PROTOCOLS)
+def test_a_wrong_protocol(case: str, command: str, tmp_path: Path) -> None:
+    old, new, found, right = PROTOCOLS[case]
+    assert old in PILOT
+    path = tmp_path / "wrong.yaml"
+    path.write_text(PILOT.replace(old, new, 1))
+    more = [] if command == "plan" else ["--rig", "mock", "--store", tmp_path / "store"]
+    line = refused(command, path, *more)
+    assert line.startswith(f"error: {path}: {found}: "), line
+    assert right in line
+
+
+RIGS: dict[str, tuple[str, str, str, str]] = {
+    "no day": (
+        "name: irb120 ",
+        "skin: {made: 2026-02-30}\nname: irb120 ",
+        "skin.made = 2026-02-30",
+        "is no day of the calendar; write one like 2026-02-28 (line 4)",
+    ),
+    "a number for a day": (
+        "name: irb120 ",
+        "skin: {made: 20261101}\nname: irb120 ",
+        "skin.made = 20261101",
+        "must be a day, such as 2026-11-23",
+    ),
+    "digits for a day": (
+        "name: irb120 ",
+        'skin: {made: "20261101"}\nname: irb120 ',
+        "skin.made = 20261101",
+        "must be a day, such as 2026-11-23",
+    ),
+    "password": (
+        "password: robotics",
+        "password: 12345",
+        f"devices.arm.password = {MASK}",
+        "quote",
+    ),
+    "passwrd": (
+        "password: robotics",
+        "passwrd: hunter2",
+        f"devices.arm.passwrd = {MASK}",
+        "did you mean 'password'",
+    ),
+    "a token": ("password: robotics", "token: hunter2", f"devices.arm.token = {MASK}", "unknown"),
+    "a password as a key": (
+        "password: robotics",
+        '"password:hunter2": 1',
+        f"devices.arm.password:{MASK} = {MASK}",
+        "unknown key",
+    ),
+    "a password below a wrong key": (
+        "devices:\n",
+        "devices:\n  amr: {password: hunter2}\n",
+        f"devices.amr = {{password: {MASK}}}",
+        "did you mean 'arm'",
+    ),
+    "a tag as a password": (
+        "password: robotics",
+        "password: !hunter2 12345",
+        f"devices.arm.password = {MASK}",
+        "quote",
+    ),
+    "an alias as a password": (
+        "password: robotics",
+        "password: *hunter2",
+        f"devices.arm.password = {MASK}",
+        "quote",
+    ),
+    "a comma in a password": (
+        "password: robotics",
+        "tool: {password: 12,34}",
+        f"devices.arm.tool.password = {MASK}",
+        "quote",
+    ),
+    "a handle as a password": (
+        "password: robotics",
+        "password: !hunter2!12345 x",
+        "",
+        "quote",
+    ),
+    "an address with a password": (
+        "host: 192.168.125.1 ",
+        "host: http://anna:hunter2@10.0.0.1 ",
+        f"devices.arm.host = http://anna:{MASK}@10.0.0.1",
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("command", ["plan", "check", "rigs"])
+@pytest.mark.parametrize("case", RIGS)
+def test_a_wrong_rig_file(case: str, command: str, tmp_path: Path) -> None:
+    old, new, found, right = RIGS[case]
+    assert old in ABB
+    path = tmp_path / "rig.yaml"
+    path.write_text(ABB.replace(old, new, 1))
+    if command == "rigs":
+        done = here("rigs", path, "--json")
+        assert done.returncode == 1
+        line = json.loads(done.stdout)["rigs"][0]["answer"]
+    else:
+        more = ["--store", tmp_path / "store"] if command == "check" else []
+        line = refused(command, ROOT / "protocols/pilot.yaml", "--rig", path, *more)
+    assert f"{path}: " in line
+    assert found in line
+    assert right in line
+    for secret in ("hunter2", "12345", "12.34", "12,34", "robotics"):
+        assert secret not in line

@@ -1,0 +1,109 @@
+"""Values in messages: as a person wrote them, in one line, without secrets and control codes."""
+
+from __future__ import annotations
+
+import re
+from datetime import date
+from decimal import Decimal
+from typing import Any, get_args
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from protocols.errors import InputError
+from protocols.model import Protocol
+from protocols.shown import MASK, is_secret, printable, shown, shown_key
+from rigs.rig_file import RigFile
+
+SECRETS = [
+    "password", "passwrd", "pasword", "passord", "paswrd", "Passwort", "pass", "pwd", "passphrase",
+    "secret", "secrt", "client_secret", "token", "tokn", "api_key", "apiKey", "key", "auth",
+    "credentials", "AWS_SECRET_ACCESS_KEY",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SECRETS)
+def test_names_of_secrets(name: str) -> None:
+    assert is_secret(name)
+    error = InputError("rig.yaml", f"devices.arm.{name}", "hunter2", "is 'hunter2': unknown key")
+    assert error.message == f"rig.yaml: devices.arm.{name} = {MASK}: is '{MASK}': unknown key"
+    assert shown({"arm": [{name: "hunter2", "n": Decimal("2.4")}]}) == (
+        f"{{arm: [{{{name}: {MASK}, n: 2.4}}]}}"
+    )
+
+
+def _names(kind: Any, seen: set[Any]) -> set[str]:
+    """Names of all keys of a file's model."""
+    found: set[str] = set()
+    if isinstance(kind, type) and issubclass(kind, BaseModel) and kind not in seen:
+        seen.add(kind)
+        for name, field in kind.model_fields.items():
+            found |= {field.alias or name} | _names(field.annotation, seen)
+    for part in get_args(kind):
+        found |= _names(part, seen)
+    return found
+
+
+def test_no_other_key_of_our_files_counts_as_a_secret() -> None:
+    names = _names(Protocol, set()) | _names(RigFile, set())
+    assert len(names) > 300
+    assert {name for name in names if is_secret(name)} == {"password"}
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (Decimal("2.4"), "2.4"),
+        ([Decimal("2.40"), 1, True], "[2.40, 1, true]"),
+        ((), "[]"),
+        ({"a": {"b": None}}, "{a: {b: null}}"),
+        (date(2026, 11, 23), "2026-11-23"),
+        (Decimal("Infinity"), ".inf"),
+        ([float("-inf"), float("nan")], "[-.inf, .nan]"),
+        ("two\nlines\x1b[31m", "two lines\\x1b[31m"),
+        ("password: hunter2", f"password: {MASK}"),
+        ("user=a password=hunter2", f"user=a password={MASK}"),
+        ("http://anna:hunter2@host/x", f"http://anna:{MASK}@host/x"),
+        ("x" * 100, "x" * 77 + "..."),
+    ],
+)
+def test_values_as_yaml_writes_them(value: object, text: str) -> None:
+    assert shown(value) == text
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.decimals(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=8,
+)
+SEEN = re.compile(r"[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*")
+
+
+@given(st.text(), st.text(), JSON, st.text())
+def test_no_message_steers_a_terminal(file: str, key: str, value: object, expected: str) -> None:
+    error = InputError(file, key, value, expected)
+    assert SEEN.fullmatch(error.message)
+    again = error.in_file(file)
+    assert again.message == error.message
+    assert "Decimal(" not in shown(value).replace(str(value), "")
+
+
+@given(st.text())
+def test_text_for_people_keeps_its_lines(text: str) -> None:
+    left = printable(text)
+    assert SEEN.fullmatch(left.replace("\n", "").replace("\t", ""))
+    assert left.count("\n") == text.count("\n")
+    assert printable(left) == left
+
+
+@given(st.sampled_from(SECRETS), st.text(min_size=8, alphabet="abc123"), st.sampled_from(":="))
+def test_a_secret_in_a_key_is_masked(name: str, secret: str, sign: str) -> None:
+    assert secret not in shown_key(f"devices.arm.{name}{sign}{secret}")
+
+
+def test_long_text_is_shown_at_once() -> None:
+    for text in ("x" * 10**6, "a: " * 300_000, "://" * 300_000, "a" * 10**6 + ": b"):
+        assert len(shown(text)) == 80
+        assert len(shown_key(text)) <= 1000
