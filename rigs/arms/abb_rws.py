@@ -25,6 +25,10 @@ from rigs.capabilities import ArmState, Pose
 
 REQUEST_S = 1.0
 """Connecting, and each wait for bytes of an answer, s."""
+STATUS_REQUESTS = 4
+"""Requests of one look at the state."""
+FULL_SPEED_PERCENT = 100.0
+"""The speed ratio at which a segment has the speed that was asked for."""
 START_REQUESTS = 12
 """Requests that starting a motion program takes at most, with those of logging in."""
 T = TypeVar("T")
@@ -57,6 +61,8 @@ class WebStatus:
     """AUTO, MANR, ..."""
     execution: str
     """running or stopped."""
+    speed_percent: float
+    """The speed ratio of the pendant: every move is slower by it."""
 
     @property
     def state(self) -> ArmState:
@@ -80,16 +86,22 @@ class WebServices:
         self._client = MotionProgramExecClient(abb_client=self._rws)
         self._task = settings.task
         self._lock = threading.Lock()
+        self._answers = False
 
     def status(self) -> WebStatus:
-        """State of controller, mode and execution, in three requests. Raises WebError."""
+        """State of controller, mode, execution and speed ratio. Raises WebError."""
         return self._ask(
             lambda: WebStatus(
                 self._rws.get_controller_state(),
                 self._rws.get_operation_mode(),
                 self._rws.get_execution_state().ctrlexecstate,
+                self._rws.get_speedratio(),
             )
         )
+
+    def is_running(self) -> bool:
+        """Whether a program runs, in one request. Raises WebError."""
+        return self._ask(lambda: self._rws.get_execution_state().ctrlexecstate != "stopped")
 
     def flange(self) -> tuple[Pose, tuple[float, ...]]:
         """The flange's pose in the base frame and the arm's configuration. Raises WebError."""
@@ -121,15 +133,32 @@ class WebServices:
         """Stop the program that runs, and the arm with it. Raises WebError."""
         self._ask(self._client.stop_motion_program)
 
+    def read_signal(self, name: str) -> float:
+        """The value of an analog signal. Raises WebError; WebRefused if there is none."""
+        return self._ask(lambda: self._rws.get_analog_io(name))
+
+    def write_signal(self, name: str, value: float) -> None:
+        """Set an analog output. Raises WebError; WebRefused if there is none."""
+        self._ask(lambda: self._rws.set_analog_io(name, value))
+
     def close(self) -> None:
-        """Give the session back."""
-        self._rws._session.close()
+        """Log out if it answers, and close the connection; takes at most 2 `REQUEST_S`.
+
+        A controller keeps a session that nobody logs out of for minutes, and has few of them.
+        """
+        with self._lock:
+            if self._answers:
+                self._rws.close()
+            else:
+                self._rws._session.close()
 
     def _ask(self, request: Callable[[], T]) -> T:
         try:
             with self._lock:
+                self._answers = True
                 return request()
         except requests.RequestException as error:
+            self._answers = False
             raise WebError(f"the controller's web services do not answer: {error}") from None
         except ABBException as error:
             raise WebRefused(f"the controller refused: {error}") from None

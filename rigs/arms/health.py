@@ -34,8 +34,12 @@ def ur_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
     )
 
 
-def abb_health(web: WebServices) -> DeviceHealth:
+def abb_health(web: WebServices, notes: tuple[str, ...]) -> DeviceHealth:
     """Of an ABB controller, by its web services (RobotWare 6).
+
+    Args:
+        web: a session of them.
+        notes: what the driver has to say besides.
 
     Raises:
         WebError: it does not answer.
@@ -48,7 +52,7 @@ def abb_health(web: WebServices) -> DeviceHealth:
         firmware=f"RobotWare {system.get('rwversion', UNKNOWN)}",
         temperature_c=None,
         clock="the controller's, in every EGM pose",
-        notes=(f"mode {status.mode}", f"controller {status.controller}"),
+        notes=(f"mode {status.mode}", f"controller {status.controller}", *notes),
     )
 
 

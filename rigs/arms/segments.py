@@ -39,12 +39,17 @@ class SegmentWatch:
         """Whether every segment has ended."""
         return self._count == len(self._path)
 
+    @property
+    def begun(self) -> bool:
+        """Whether the arm has left the place where the path begins."""
+        return self._count > 0 or self._start_ns is not None
+
     def see(self, t_ns: int, pose: Pose) -> tuple[int, int] | None:
         """Take one sample; start and end of the segment that has ended with it, if one has."""
         before, self._before = self._before, (t_ns, pose)
         if self.done or before is None or t_ns <= before[0]:
             return None
-        if self._start_ns is None and not _left(self._begin, pose):
+        if self._start_ns is None and not has_left(self._begin, pose):
             return None
         if self._start_ns is None:
             self._start_ns = before[0]
@@ -63,5 +68,6 @@ def is_at(pose: Pose, target: Pose) -> bool:
     return distance_mm(pose, target) <= NEAR_MM and angle_deg(pose, target) <= _NEAR_DEG
 
 
-def _left(begin: Pose, pose: Pose) -> bool:
+def has_left(begin: Pose, pose: Pose) -> bool:
+    """Whether a pose is another one than where the arm stood."""
     return distance_mm(begin, pose) > LEFT_MM or angle_deg(begin, pose) > _LEFT_DEG

@@ -96,11 +96,17 @@ class AbbSettings(_Arm):
     egm_port: Port = 6510
     """UDP port on this host to which the controller sends its poses."""
     egm_bind: Host = "0.0.0.0"
+    egm_host: Host | None = None
+    """Address that the poses come from, if it is not `host`; packets of any other are dropped."""
     username: str = "Default User"
     password: str = Field(default="robotics", repr=False)
     egm_point: Literal["tool", "flange"] = "tool"
     """Whose pose the controller's EGM stream tells; held against the web services on connecting."""
     task: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] = "T_ROB1"
+    watchdog_s: Annotated[float, Field(ge=0.3, le=5)] | None = 1.0
+    """The controller stops the arm when this host has been silent for so long, by the module
+    `sliplab_watchdog.mod` (`docs/arms.md`), without which it does not connect. null: it has no
+    such module, and a path runs to its end when this host or the network is gone."""
 
 
 class AbbSocketSettings(_Arm):

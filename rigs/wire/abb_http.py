@@ -1,4 +1,4 @@
-"""The HTTP of Robot Web Services, version 1: digest authentication, keep-alive, JSON."""
+"""The HTTP of Robot Web Services, version 1: digest authentication, sessions, keep-alive, JSON."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 USER, PASSWORD = "Default User", "robotics"
 REALM = "validusers@robapi.abb"
 _END_S = 5.0
+_COOKIE = "ABBCX"
+MOST_SESSIONS = 70
+"""So many clients may be logged in; a further one is answered 503, as the controller does."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,15 @@ class HttpServer:
         )
         self._thread.start()
 
+    @property
+    def sessions(self) -> int:
+        """How many clients are logged in."""
+        return len(self._server.sessions)
+
+    def cut(self) -> None:
+        """Cut the connections there are."""
+        self._server.cut()
+
     def close(self) -> None:
         """Cut every connection and give the port back."""
         self._server.released.set()
@@ -63,6 +75,7 @@ class _Server(ThreadingHTTPServer):
         self.released = threading.Event()
         self.nonce = secrets.token_hex(16)
         self._open: set[socket.socket] = set()
+        self.sessions: set[str] = set()
 
     def process_request(self, request: Any, client_address: Any) -> None:
         self._open.add(request)
@@ -86,6 +99,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: _Server
     timeout = 30
+    _session = ""
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing is logged."""
@@ -94,6 +108,9 @@ class _Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         if not self._is_allowed():
             self._send(Reply(401, None))
+            return
+        if not self._log_in():
+            self._send(Reply(503, None))
             return
         parts = urlsplit(self.path)
         # The client writes `?action=set?json=1` for some requests.
@@ -104,9 +121,23 @@ class _Handler(BaseHTTPRequestHandler):
             self.server.released.wait()
             self.close_connection = True
             return
+        if path == "logout":
+            self.server.sessions.discard(self._session)
         self._send(reply)
 
     do_GET = do_POST = do_PUT = do_DELETE = _serve
+
+    def _log_in(self) -> bool:
+        """Find the session of the request's cookie, or begin one if there is room."""
+        sent = re.search(rf"{_COOKIE}=(\w+)", self.headers.get("Cookie", ""))
+        self._session = sent[1] if sent else ""
+        if self._session in self.server.sessions:
+            return True
+        if len(self.server.sessions) >= MOST_SESSIONS:
+            return False
+        self._session = secrets.token_hex(8)
+        self.server.sessions.add(self._session)
+        return True
 
     def _is_allowed(self) -> bool:
         """RFC 2617 digest with MD5 and qop=auth, which is what the controller asks for."""
@@ -135,6 +166,8 @@ class _Handler(BaseHTTPRequestHandler):
         if reply.code == 401:
             challenge = f'Digest realm="{REALM}", nonce="{self.server.nonce}", qop="auth"'
             self.send_header("WWW-Authenticate", challenge)
+        if self._session:
+            self.send_header("Set-Cookie", f"{_COOKIE}={self._session}; path=/")
         self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()

@@ -1,20 +1,25 @@
-"""A stand-in UR controller and the real driver on it, each test on an address of its own."""
+"""Stand-in controllers and the real drivers on them, each test on an address of its own."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import pytest
 
-from rigs.arms.settings import UrSettings
+from rigs.arms.abb import AbbArm
+from rigs.arms.settings import AbbSettings, UrSettings
 from rigs.arms.ur import UrArm
+from rigs.capabilities import Arm, ArmFault
+from rigs.wire.abb_rws import AbbStandIn
 from rigs.wire.ur import UrStandIn
 from tests.rigs.loopback import own_address
 
 MakeRobot = Callable[..., UrStandIn]
 MakeArm = Callable[..., UrArm]
+MakeAbb = Callable[..., tuple[AbbArm, AbbStandIn]]
+ABB_PORT, EGM_PORT = 8080, 6510
 LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
 
 
@@ -45,5 +50,44 @@ def arm_on() -> Iterator[MakeArm]:
             if connected:
                 arm.connect()
             return arm
+
+        yield make
+
+
+def abb_settings(host: str, **more: Any) -> AbbSettings:
+    """A tool of 120 mm on an arm whose web services and poses are at the test's address."""
+    return AbbSettings(
+        **{
+            "host": host,
+            "rws_port": ABB_PORT,
+            "egm_bind": host,
+            "egm_port": EGM_PORT,
+            "limits": LIMITS,
+            "tool": {"tcp_mm": (0, 0, 120), "mass_kg": 0.4},
+            **more,
+        }
+    )
+
+
+def closed(arm: Arm) -> None:
+    """Give an arm's connections back, whether or not it could be stopped in the test."""
+    with suppress(ArmFault):
+        arm.close()
+
+
+@pytest.fixture
+def abb_pair() -> Iterator[MakeAbb]:
+    """Makes an ABB stand-in and the driver on it; both are closed after the test."""
+    with ExitStack() as stack:
+
+        def make(connected: bool = True, arm: Any = None, **how: Any) -> tuple[AbbArm, AbbStandIn]:
+            host = own_address()
+            robot = AbbStandIn(host, ABB_PORT, (host, EGM_PORT), **{"cycle_hz": 125, **how})
+            stack.enter_context(robot)
+            made = AbbArm(abb_settings(host, **(arm or {})))
+            stack.callback(closed, made)
+            if connected:
+                made.connect()
+            return made, robot
 
         yield make

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,19 +15,15 @@ from rigs.arms.abb import AbbArm
 from rigs.arms.abb_rws import REQUEST_S, START_REQUESTS
 from rigs.arms.guard import WorkspaceError
 from rigs.arms.pose import distance_mm
-from rigs.arms.settings import AbbSettings
 from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from rigs.wire.abb_rws import HOME, AbbStandIn
+from rigs.wire.abb_rws import HOME
 from rigs.wire.faults import Fault, Kind, Stage
+from tests.rigs.arms.conftest import EGM_PORT, MakeAbb, abb_settings
 from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
 
 BUSY_S = 3.0
-PORT, EGM_PORT = 8080, 6510
-LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
-TOOL = {"tcp_mm": (0, 0, 120), "mass_kg": 0.4}
-MakePair = Callable[..., tuple[AbbArm, AbbStandIn]]
 
 
 def at(y_mm: float) -> Pose:
@@ -37,38 +31,6 @@ def at(y_mm: float) -> Pose:
 
 
 SLIDE = [Segment(at(15.0), 1.6)]
-
-
-def settings(host: str, **more: Any) -> AbbSettings:
-    return AbbSettings(
-        **{
-            "host": host,
-            "rws_port": PORT,
-            "egm_bind": host,
-            "egm_port": EGM_PORT,
-            "limits": LIMITS,
-            "tool": TOOL,
-            **more,
-        }
-    )
-
-
-@pytest.fixture
-def pair() -> Iterator[MakePair]:
-    """Makes a stand-in and the driver on it; both are closed after the test."""
-    with ExitStack() as stack:
-
-        def make(connected: bool = True, arm: Any = None, **how: Any) -> tuple[AbbArm, AbbStandIn]:
-            host = own_address()
-            robot = AbbStandIn(host, PORT, (host, EGM_PORT), **{"cycle_hz": 125, **how})
-            stack.enter_context(robot)
-            made = AbbArm(settings(host, **(arm or {})))
-            stack.callback(made.close)
-            if connected:
-                made.connect()
-            return made, robot
-
-        yield make
 
 
 def fails(action: Callable[[], object], within_s: float, match: str) -> None:
@@ -79,8 +41,8 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> None:
 
 
 @pytest.mark.parametrize("speed", [pytest.param(0.6, marks=pytest.mark.long), 1.6])
-def test_a_slide_is_straight_and_at_its_speed(pair: MakePair, speed: float) -> None:
-    arm, _ = pair(rate=5.0, cycle_hz=50)  # 25 s of controller time at 0.6 mm/s
+def test_a_slide_is_straight_and_at_its_speed(abb_pair: MakeAbb, speed: float) -> None:
+    arm, _ = abb_pair(rate=5.0, cycle_hz=50)  # 25 s of controller time at 0.6 mm/s
     arm.read_poses()
     arm.start([Segment(at(15.0), speed)])
     until(lambda: arm.progress().done, 20.0)
@@ -94,9 +56,9 @@ def test_a_slide_is_straight_and_at_its_speed(pair: MakePair, speed: float) -> N
     assert (span[1] - span[0]) / 1e9 == pytest.approx(15 / speed, rel=0.01)
 
 
-def test_it_is_an_arm_that_sets_its_tool(pair: MakePair) -> None:
-    arm, robot = pair()
-    assert isinstance(build_arm(settings("127.0.0.1")), Arm)
+def test_it_is_an_arm_that_sets_its_tool(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
+    assert isinstance(build_arm(abb_settings("127.0.0.1")), Arm)
     assert arm.state() is ArmState.READY
     assert distance_mm(arm.pose(), HOME) < 1e-3
     assert robot.tool.xyz_mm == pytest.approx((0, 0, 120))
@@ -104,8 +66,8 @@ def test_it_is_an_arm_that_sets_its_tool(pair: MakePair) -> None:
     assert len(arm.read_pulses()) == 0
 
 
-def test_a_path_of_segments_is_followed_from_rest_to_rest(pair: MakePair) -> None:
-    arm, _ = pair()
+def test_a_path_of_segments_is_followed_from_rest_to_rest(abb_pair: MakeAbb) -> None:
+    arm, _ = abb_pair()
     arm.start([Segment(at(5.0), 20.0), Segment(at(0.0), 10.0)])
     until(lambda: arm.progress().done, 10.0)
     first, second = arm.progress().finished
@@ -113,10 +75,10 @@ def test_a_path_of_segments_is_followed_from_rest_to_rest(pair: MakePair) -> Non
     assert distance_mm(arm.pose(), HOME) < 0.05
 
 
-def test_egm_that_tells_the_flange_is_noticed_and_may_be_set(pair: MakePair) -> None:
-    arm, robot = pair(connected=False, egm_point="flange")
+def test_egm_that_tells_the_flange_is_noticed_and_may_be_set(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair(connected=False, egm_point="flange")
     fails(arm.connect, driver.FIRST_POSE_S, r"120\.0 mm apart: set `egm_point`")
-    right = AbbArm(settings(robot.host, egm_point="flange"))
+    right = AbbArm(abb_settings(robot.host, egm_point="flange"))
     try:
         right.connect()
         assert distance_mm(right.pose(), HOME) < 1e-3
@@ -124,8 +86,8 @@ def test_egm_that_tells_the_flange_is_noticed_and_may_be_set(pair: MakePair) -> 
         right.close()
 
 
-def test_a_stop_in_a_slide(pair: MakePair) -> None:
-    arm, robot = pair()
+def test_a_stop_in_a_slide(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
     arm.stop()
@@ -137,8 +99,8 @@ def test_a_stop_in_a_slide(pair: MakePair) -> None:
     assert len(arm.progress().finished) == 1
 
 
-def test_what_the_guard_forbids_is_never_sent(pair: MakePair) -> None:
-    arm, robot = pair()
+def test_what_the_guard_forbids_is_never_sent(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
     with pytest.raises(WorkspaceError):
         arm.start([Segment(at(101.0), 1.0)])
     with pytest.raises(RigError, match="empty"):
@@ -155,8 +117,8 @@ def test_what_the_guard_forbids_is_never_sent(pair: MakePair) -> None:
         (Kind.PROGRAM_END, ArmState.READY),
     ],
 )
-def test_a_stop_from_outside_ends_the_path(pair: MakePair, kind: Kind, state: ArmState) -> None:
-    arm, robot = pair(faults=[Fault(kind, Stage.MOVING, after_mm=0.5)])
+def test_a_stop_from_outside_ends_the_path(abb_pair: MakeAbb, kind: Kind, state: ArmState) -> None:
+    arm, robot = abb_pair(faults=[Fault(kind, Stage.MOVING, after_mm=0.5)])
     arm.start(SLIDE)
     until(lambda: arm.progress().done, 5.0)
     assert arm.state() is state
@@ -171,9 +133,9 @@ def test_a_stop_from_outside_ends_the_path(pair: MakePair, kind: Kind, state: Ar
 
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(
-    pair: MakePair, kind: Kind
+    abb_pair: MakeAbb, kind: Kind
 ) -> None:
-    arm, robot = pair()
+    arm, robot = abb_pair(arm={"watchdog_s": None})
     arm.start(SLIDE)
     until(lambda: robot.pose().xyz_mm[1] > 0.5, 5.0)
     robot.happen(kind)
@@ -187,9 +149,9 @@ def test_a_link_lost_while_sliding_is_told_and_cannot_be_stopped(
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 @pytest.mark.parametrize("stage", [Stage.CONNECTING, Stage.UPLOADING])
 def test_a_link_lost_while_connecting_or_uploading(
-    pair: MakePair, kind: Kind, stage: Stage
+    abb_pair: MakeAbb, kind: Kind, stage: Stage
 ) -> None:
-    arm, robot = pair(connected=False, faults=[Fault(kind, stage)])
+    arm, robot = abb_pair(connected=False, faults=[Fault(kind, stage)])
     fails(arm.connect, (7 + START_REQUESTS) * REQUEST_S, "check its power")
     assert arm.state() is ArmState.DISCONNECTED
     robot.restore()
@@ -197,8 +159,8 @@ def test_a_link_lost_while_connecting_or_uploading(
     assert arm.state() is ArmState.READY
 
 
-def test_a_link_lost_while_idle(pair: MakePair) -> None:
-    arm, robot = pair()
+def test_a_link_lost_while_idle(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
     robot.happen(Kind.LINK_CUT)
     lost_s = driver.FAILURES * (driver.MONITOR_S + 2 * REQUEST_S)
     until(lambda: arm.state() is ArmState.DISCONNECTED, lost_s + BUSY_S)
@@ -207,32 +169,32 @@ def test_a_link_lost_while_idle(pair: MakePair) -> None:
 
 
 def test_an_address_where_nothing_listens_is_a_fault() -> None:
-    arm = AbbArm(settings(own_address()))
+    arm = AbbArm(abb_settings(own_address()))
     fails(arm.connect, REQUEST_S, "check its power")
 
 
-def test_poses_that_do_not_come_are_a_fault(pair: MakePair) -> None:
-    arm, _ = pair(connected=False, arm={"egm_port": EGM_PORT + 1})
+def test_poses_that_do_not_come_are_a_fault(abb_pair: MakeAbb) -> None:
+    arm, _ = abb_pair(connected=False, arm={"egm_port": EGM_PORT + 1})
     fails(arm.connect, driver.FIRST_POSE_S + 7 * REQUEST_S, "no pose came on UDP port 6511")
 
 
-def test_a_second_client_is_refused(pair: MakePair) -> None:
-    arm, robot = pair()
+def test_a_second_client_is_refused(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
     arm.start(SLIDE)
-    second = AbbArm(settings(robot.host))
+    second = AbbArm(abb_settings(robot.host))
     fails(second.connect, REQUEST_S, "UDP port 6510 cannot be opened")  # on one host
-    second = AbbArm(settings(robot.host, egm_port=EGM_PORT + 1))
+    second = AbbArm(abb_settings(robot.host, egm_port=EGM_PORT + 1))
     fails(second.connect, (7 + START_REQUESTS) * REQUEST_S, "must be stopped")  # on another
     assert robot.moving()
 
 
-def test_a_wrong_password_is_a_fault(pair: MakePair) -> None:
-    arm, _ = pair(connected=False, arm={"password": "wrong"})
+def test_a_wrong_password_is_a_fault(abb_pair: MakeAbb) -> None:
+    arm, _ = abb_pair(connected=False, arm={"password": "wrong"})
     fails(arm.connect, 7 * REQUEST_S, "401")
 
 
-def test_sockets_are_given_back(pair: MakePair) -> None:
-    arm, robot = pair()
+def test_sockets_are_given_back(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair()
     arm.close()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind((robot.host, EGM_PORT))

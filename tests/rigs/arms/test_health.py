@@ -46,7 +46,9 @@ def test_an_abb_by_its_web_services() -> None:
             found = arm.health()
             assert (found.model, found.serial) == ("IRB120 stand-in", "120-000000")
             assert found.firmware == "RobotWare 6.08.00.01"
-            assert found.notes == ("mode AUTO", "controller motoron")
+            assert found.notes[:2] == ("mode AUTO", "controller motoron")
+            assert found.notes[2] == "stopped by its controller 1 s after this computer is gone"
+            assert found.notes[3].startswith("poses_missing ")
             robot.happen(Kind.SILENCE)
             with pytest.raises(ArmFault, match="do not answer"):
                 arm.health()
