@@ -256,6 +256,23 @@ def same_rig(one: str, other: str) -> bool:
     return without_taught(first) == without_taught(second)
 
 
+def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
+    """Where every tick triggers a frame, its exposure must end before the next tick."""
+    rate = plan.protocol.collection.recording.sync_rate
+    if rig.timing.frames != "hardware trigger":
+        return
+    for name in ("devices", "mock"):
+        section = getattr(rig, name)
+        if section is not None and section.frame_camera.exposure_us * rate > 1e6:
+            raise InputError(
+                file,
+                f"{name}.frame_camera.exposure_us",
+                f"{section.frame_camera.exposure_us:g}",
+                f"must be at most {1e6 / rate:g}, the period of {plan.file}'s sync_rate: "
+                "every tick triggers a frame",
+            )
+
+
 def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     """Hold every motion of a plan against the rig's own limits.
 
@@ -274,6 +291,7 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
                 f"must be at most {most_us:g}, a quarter of a tick of {plan.file}'s sync_rate: "
                 "pulses could not be told apart",
             )
+    _check_exposure(rig, plan, file)
     frame_px = rig.frame_px(plan)
     for side, axis in (("width", 0), ("height", 1)):
         available = getattr(rig.frame_camera, f"{side}_px")

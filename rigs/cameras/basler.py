@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigs.cameras.basler_setup import check_rate, read_back, write_settings
 from rigs.cameras.counts import GrabCounts
 from rigs.cameras.grabbing import Grab, GrabSettings
 from rigs.cameras.health import basler_health
@@ -86,38 +87,12 @@ class BaslerCamera:
 
     def _configure(self) -> None:
         nodes, settings = self._nodes, self.settings
-        nodes.put("Mono8", "PixelFormat")
-        for automatic in ("ExposureAuto", "GainAuto"):
-            if nodes.offers(automatic, "Off"):
-                nodes.put("Off", automatic)
-        # the emulation keeps both names and obeys the older one
-        nodes.put(settings.exposure_us, "ExposureTime", "ExposureTimeAbs")
+        write_settings(nodes, settings)
         exposure = "ExposureTime" if nodes.has("ExposureTime") else "ExposureTimeAbs"
         self.mid_exposure_ns = round(float(nodes.get(exposure)) * 500)
-        self._trigger()
-        if settings.exposure_line is not None:
-            nodes.put(settings.exposure_line, "LineSelector")
-            nodes.put("Output", "LineMode")
-            nodes.put("ExposureActive", "LineSource")
         self.stamping = choose(self._abilities(), settings.trigger)
         self._shape = (int(nodes.get("Height")), int(nodes.get("Width")))
-
-    def _trigger(self) -> None:
-        nodes, settings = self._nodes, self.settings
-        if nodes.offers("TriggerSelector", "FrameStart"):
-            nodes.put("FrameStart", "TriggerSelector")
-        if settings.trigger == "free run":
-            nodes.put("Off", "TriggerMode")
-            nodes.put(True, "AcquisitionFrameRateEnable")
-            nodes.put(settings.rate_hz, "AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-            return
-        if nodes.has("AcquisitionFrameRateEnable"):
-            nodes.put(False, "AcquisitionFrameRateEnable")
-        source = "Software" if settings.trigger == "software" else settings.trigger_line
-        nodes.put(source, "TriggerSource")
-        if settings.trigger == "hardware":
-            nodes.put("RisingEdge", "TriggerActivation")
-        nodes.put("On", "TriggerMode")
+        self._in_force = read_back(nodes)
 
     def _abilities(self) -> Abilities:
         """What the camera has; what of it is used is switched on."""
@@ -187,6 +162,8 @@ class BaslerCamera:
             "serial": info.GetSerialNumber(),
             "region_px": [width, height],
             "exposure_us": self.mid_exposure_ns / 500,
+            "settings": self.settings.model_dump(mode="json"),
+            "in_force": self._in_force,
             "time_stamps": stamping.means,
             "grade": stamping.grade,
             "counts": vars(self.counts) | {"lost": self.counts.lost},
@@ -221,13 +198,14 @@ class BaslerCamera:
         """Begin to grab; frames of an earlier run that nobody read are dropped.
 
         Raises:
-            RigError: it grabs already, or the camera is gone.
+            RigError: it grabs already, it cannot keep the rate, or the camera is gone.
         """
         from pypylon import pylon
 
         if self._running:
             raise RigError(DEVICE, "it grabs already; stop first")
         settings = self.settings
+        check_rate(self._nodes, settings)
         self._ends.clear()
         try:
             self._device.MaxNumBuffer.Value = self._buffers

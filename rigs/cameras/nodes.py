@@ -5,7 +5,9 @@ Names differ between families (`ExposureTime`, `ExposureTimeAbs`); SFNC 2 names 
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -15,6 +17,7 @@ from rigs.capabilities import RigError
 from storage.streams import ClockReads
 
 DEVICE = "frame camera"
+_LOOK_S = 0.01
 # command, value and ticks a second of the clock, by family; None: nanoseconds
 _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue", None),
@@ -42,6 +45,24 @@ class Nodes:
     def offers(self, name: str, choice: str) -> bool:
         """Whether a setting can be set and `choice` is one of its values."""
         return self.has(name) and choice in self._map.GetNode(name).Symbolics
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """Values that an enumeration may be set to now; none where it cannot be set."""
+        return tuple(self._map.GetNode(name).Symbolics) if self.has(name) else ()
+
+    def select(self, name: str, *choices: str) -> None:
+        """Set a selector to the first of `choices` that it offers; left alone where it has none."""
+        for choice in choices:
+            if self.offers(name, choice):
+                self.put(choice, name)
+                return
+
+    def each(self, selector: str) -> Iterator[str]:
+        """Set a selector to each of its values; once, with nothing set, where there is none."""
+        for choice in self.choices(selector) or ("",):
+            if choice:
+                self.put(choice, selector)
+            yield choice
 
     def get(self, name: str) -> Any:
         """The value of a setting.
@@ -87,10 +108,27 @@ class Nodes:
             except self._genicam.GenericException as error:
                 raise RigError(DEVICE, f"{name} = {value}: {_short(error)}") from None
 
-    def execute(self, name: str) -> None:
-        """Give a command. Raises RigError."""
+    def put_near(self, value: float, name: str) -> None:
+        """Set a number as near to `value` as it goes, if it is there. Raises RigError."""
+        if not self.has(name):
+            return
+        node = self._map.GetNode(name)
+        self.put(type(value)(min(max(value, node.Min), node.Max)), name)
+
+    def execute(self, name: str, within_s: float = 0.0) -> None:
+        """Give a command, and wait until it is done where a time is given.
+
+        Raises:
+            RigError: it is not there, fails or takes longer.
+        """
         try:
-            self._map.GetNode(name).Execute()
+            node = self._map.GetNode(name)
+            node.Execute()
+            end = time.monotonic() + within_s
+            while within_s and not node.IsDone():
+                if time.monotonic() > end:
+                    raise RigError(DEVICE, f"{name} is not done within {within_s:g} s")
+                threading.Event().wait(_LOOK_S)
         except (self._genicam.GenericException, AttributeError) as error:
             raise RigError(DEVICE, f"{name} failed: {_short(error)}") from None
 

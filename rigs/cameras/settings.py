@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from protocols.yaml_file import StrictModel
+from protocols.yaml_file import KeyedError, StrictModel
 
 FrameTrigger = Literal["hardware", "software", "free run"]
 Readout = Literal[
@@ -26,6 +26,10 @@ class BaslerSettings(StrictModel):
     """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
     exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
     """Exposure, microseconds; the camera may round it, and what it says then counts."""
+    gain_db: float = Field(default=0.0, ge=0, le=48)
+    """Gain, dB."""
+    user_set: str = "Default"
+    """Set that is loaded from the camera before all else is written; `Default` is the maker's."""
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
     """Frames a second: its own rate in free run, else the most that the triggers ask for."""
     trigger: FrameTrigger = "hardware"
@@ -45,6 +49,32 @@ class BaslerSettings(StrictModel):
     need time to set up buffers. Triggered, it may wait for ever for its first trigger."""
     stall_s: float = Field(default=1.0, ge=0.2, le=60)
     """Silence for so long after the first frame is a fault, seconds."""
+
+    @model_validator(mode="after")
+    def _exposure_fits(self) -> BaslerSettings:
+        if self.exposure_us * self.rate_hz > 1e6:
+            raise KeyedError(
+                ".exposure_us",
+                f"{self.exposure_us:g}",
+                f"must be at most {1e6 / self.rate_hz:g}, the period of rate_hz = {self.rate_hz:g}",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> BaslerSettings:
+        inputs = {"sync_line": f"Line{self.sync_line}"}
+        if self.trigger == "hardware":
+            inputs["trigger_line"] = self.trigger_line
+        for key, line in inputs.items():
+            if self.exposure_line == line:
+                raise KeyedError(".exposure_line", line, f"is an input already: {key}")
+        if self.trigger == "hardware" and self.trigger_line == inputs["sync_line"]:
+            raise KeyedError(
+                ".sync_line",
+                self.sync_line,
+                "must be another line than trigger_line: it has a code",
+            )
+        return self
 
 
 class UsbCamera(StrictModel):

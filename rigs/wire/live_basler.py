@@ -2,7 +2,8 @@
 
 Every frame of the scene is one software trigger of the emulated camera, so that it passes through
 pylon's own buffers, threads and results; only the picture, its number and its chunks, which the
-emulation does not have, are the scene's. What pylon loses on the way is lost here too.
+emulation does not have, are the scene's. What pylon loses on the way is lost here too. A setting
+that the scene's pictures do not show is refused, and so is a grab with one in force.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from rigs.cameras.basler import find_camera
 from rigs.wire.basler import emulate
+from rigs.wire.basler_nodes import Command, NodeMap, ReadOnly, Selected, Setting
 from storage.streams import U8, FrameChunk
 
 TRIES = 3
@@ -28,6 +30,10 @@ EXPOSURE_US = 100.0
 """Of the emulated camera; the scene's own is in its pictures."""
 FEED_S = 5.0
 """The longest that the feeding thread takes to end, s."""
+MOST_HZ = 160.0
+"""Frames a second that the sensor gives at the most."""
+LINES = (1, 2, 3)
+"""Numbers of its inputs: one has the sync line, the ticks may come by any other."""
 
 
 _Frame = tuple[U8, int, int, int]
@@ -55,12 +61,19 @@ class LiveBasler:
         scene: asked for frames when the camera grabs.
         mid_exposure_ns: from a frame's start to its middle, which is what the scene's times say.
         sync_line: number of the input that shows the sync line's level.
+        stored: settings by name that somebody left in the camera, as its user set `UserSet1`.
 
     Attributes:
         fed: frames that pylon took since the grab began.
     """
 
-    def __init__(self, scene: Scene, mid_exposure_ns: int, sync_line: int) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        mid_exposure_ns: int,
+        sync_line: int,
+        stored: Mapping[str, Any] | None = None,
+    ) -> None:
         emulate(1)
         self._device = find_camera(None)
         self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
@@ -71,6 +84,8 @@ class LiveBasler:
         self._feeder: threading.Thread | None = None
         self._drop, self._gone = 0, False
         self.fed = 0
+        self._stored = dict(stored or {})
+        self._nodes: dict[str, Any] = {}
         scene.on_frames = self._take
 
     def __getattr__(self, name: str) -> Any:
@@ -89,16 +104,100 @@ class LiveBasler:
     # -- as pylon's ------------------------------------------------------------------------
 
     def GetNodeMap(self) -> Any:
-        """The emulated camera's settings, and the chunks and lines that it does not have."""
-        return _NodeMap(self._device.GetNodeMap(), self._end_frames)
+        """The emulated camera's settings, and those that it lacks or does not obey."""
+        emulated = self._device.GetNodeMap()
+        if not self._nodes:
+            self._nodes = self._lay_over(emulated)
+        return NodeMap(emulated, self._nodes)
+
+    def _lay_over(self, emulated: Any) -> dict[str, Any]:
+        """What the scene shows, by name; open cameras have settings."""
+        exposure_us = self._mid_exposure_ns / 500
+        ticks = tuple(f"Line{number}" for number in LINES if number - 1 != self._bit)
+        plain: dict[str, tuple[Any, tuple[Any, ...]]] = {
+            "PixelFormat": ("Mono8", ()),
+            "ReverseX": (False, ()),
+            "ReverseY": (False, ()),
+            "BinningHorizontal": (1, ()),
+            "BinningVertical": (1, ()),
+            "Gain": (0.0, ()),
+            "GainAuto": ("Off", ()),
+            "BlackLevel": (0.0, ()),
+            "Gamma": (1.0, ()),
+            "DigitalShift": (0, ()),
+            "ExposureAuto": ("Off", ()),
+            "ExposureMode": ("Timed", ()),
+            "AcquisitionMode": ("Continuous", ()),
+            "AcquisitionFrameRateEnable": (False, ()),
+            "TriggerActivation": ("RisingEdge", ()),
+            "LineInverter": (False, ()),
+            "LUTEnable": (False, ()),
+            "TestPattern": ("Off", ()),
+            "BslInputFilterTime": (0.0, ()),
+            "ChunkModeActive": (False, (False, True)),
+            "ChunkSelector": ("Timestamp", ("Timestamp", "LineStatusAll")),
+            "UserSetSelector": ("Default", ("Default", "UserSet1")),
+            # the emulated exposure stays short, so that no trigger comes too soon
+            "ExposureTime": (exposure_us, ()),
+            "ExposureTimeAbs": (exposure_us, ()),
+            "TriggerSource": (ticks[0], ticks),
+        }
+        held = {"ChunkModeActive", "UserSetSelector", "ExposureTime", "ExposureTimeAbs"}
+        held |= {"TriggerSource"}
+        if unknown := set(self._stored) - set(plain):
+            raise ValueError(f"the stand-in has no {', '.join(sorted(unknown))} to store")
+        own: dict[str, Any] = {
+            name: Setting(
+                name,
+                factory,
+                choices,
+                stored=self._stored.get(name),
+                node=None if name in held else emulated.GetNode(name),
+            )
+            for name, (factory, choices) in plain.items()
+        }
+        own["ChunkEnable"] = Selected(own["ChunkSelector"])
+        own["UserSetLoad"] = Command(self._load_user_set)
+        # what was exposed by then is still to be taken by pylon
+        own["AcquisitionStop"] = Command(self._end_frames, emulated.GetNode("AcquisitionStop"))
+        own["BslResultingAcquisitionFrameRate"] = ReadOnly(lambda: min(MOST_HZ, 1e6 / exposure_us))
+        return own
+
+    def _load_user_set(self) -> None:
+        chosen = self._nodes["UserSetSelector"].Value
+        for name, node in self._nodes.items():
+            if isinstance(node, Setting) and name != "UserSetSelector":
+                node.load(stored=chosen != "Default")
+
+    def _chunks(self) -> frozenset[str]:
+        """Chunks that come with every frame."""
+        active = self._nodes and self._nodes["ChunkModeActive"].Value
+        return self._nodes["ChunkEnable"].on if active else frozenset()
 
     def IsCameraDeviceRemoved(self) -> bool:
         """Whether it was unplugged."""
         return self._gone or bool(self._device.IsCameraDeviceRemoved())
 
     def StartGrabbing(self, strategy: Any) -> None:
-        """Begin: the scene sends frames of the region that was set."""
+        """Begin: the scene sends frames of the region that was set.
+
+        Raises:
+            genicam.GenericException: a setting is in force that the scene does not show.
+        """
+        from pypylon import genicam
+
         nodes = self._device.GetNodeMap()
+        for own in self._nodes.values():
+            if isinstance(own, Setting) and not own.simulated:
+                raise genicam.InvalidArgumentException(own.refusal(own.Value))
+        for choice in nodes.GetNode("TriggerSelector").Symbolics:
+            nodes.GetNode("TriggerSelector").Value = choice
+            mode = nodes.GetNode("TriggerMode").Value
+            if mode != ("On" if choice == "FrameStart" else "Off"):
+                raise genicam.InvalidArgumentException(
+                    f"the stand-in simulates a trigger of FrameStart alone, not {choice} {mode}"
+                )
+        nodes.GetNode("TriggerSelector").Value = "FrameStart"
         nodes.GetNode("TriggerSource").Value = "Software"
         nodes.GetNode("ExposureTimeAbs").Value = EXPOSURE_US
         self._coming.clear()
@@ -134,7 +233,7 @@ class LiveBasler:
             self._drop -= 1
             result.Release()
             return pylon.GrabResult()
-        return _Result(result, *frame, self._mid_exposure_ns, self._bit)
+        return _Result(result, *frame, self._mid_exposure_ns, self._bit, self._chunks())
 
     # --------------------------------------------------------------------------------------
 
@@ -227,69 +326,16 @@ class _Result:
         sync: int,
         mid_exposure_ns: int,
         bit: int,
+        chunks: frozenset[str],
     ) -> None:
         self._result = result
         self.Array, self.BlockID, self.ImageNumber = image, number, number + 1
         self.NumberOfSkippedImages = 0  # the numbers say it
         self.TimeStamp = t_ns - mid_exposure_ns
-        self.ChunkTimestamp = _Value(self.TimeStamp)
-        self.ChunkLineStatusAll = _Value(sync << bit)
+        if "Timestamp" in chunks:
+            self.ChunkTimestamp = _Value(self.TimeStamp)
+        if "LineStatusAll" in chunks:
+            self.ChunkLineStatusAll = _Value(sync << bit)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._result, name)
-
-
-class _Choice:
-    """A setting that the emulation lacks: it takes what it is given."""
-
-    def __init__(self, symbolics: tuple[str, ...] = ()) -> None:
-        self.Symbolics, self.Value = symbolics, None
-
-    def GetAccessMode(self) -> int:
-        """Can be read and written."""
-        from pypylon import genicam
-
-        mode: int = genicam.RW
-        return mode
-
-
-class _Command:
-    """A command of the emulated camera, with something that is done first."""
-
-    def __init__(self, node: Any, first: Callable[[], None]) -> None:
-        self._node, self._first = node, first
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._node, name)
-
-    def Execute(self) -> None:
-        """Do it."""
-        self._first()
-        self._node.Execute()
-
-
-class _NodeMap:
-    """Settings of an emulated camera, with chunks and with lines to be triggered by.
-
-    Args:
-        end_frames: called before the acquisition is stopped.
-    """
-
-    def __init__(self, node_map: Any, end_frames: Callable[[], None]) -> None:
-        self._map = node_map
-        self._own: dict[str, Any] = {
-            # what was exposed by then is still to be taken by pylon
-            "AcquisitionStop": _Command(node_map.GetNode("AcquisitionStop"), end_frames),
-            "ChunkModeActive": _Choice(),
-            "ChunkSelector": _Choice(("Timestamp", "LineStatusAll")),
-            "ChunkEnable": _Choice(),
-            # the emulated exposure stays short, so that no trigger comes too soon
-            "ExposureTime": _Choice(),
-            "ExposureTimeAbs": _Choice(),
-            "TriggerSource": _Choice(("Software", "Line1", "Line2", "Line3")),
-        }
-
-    def GetNode(self, name: str) -> Any:
-        """A setting by its name."""
-        own = self._own.get(name)
-        return own if own is not None else self._map.GetNode(name)

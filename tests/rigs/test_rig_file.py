@@ -151,6 +151,22 @@ def test_a_region_larger_than_the_sensor_is_refused(tmp_path: Path) -> None:
         check_plan(rig, plan, str(path))
 
 
+@pytest.mark.parametrize(("name", "driver"), [("mock", "mock"), ("ur5", "devices")])
+def test_an_exposure_longer_than_a_tick_is_refused(name: str, driver: str, tmp_path: Path) -> None:
+    data = yaml.safe_load((ROOT / "rigs" / f"{name}.yaml").read_text())
+    camera = data[driver].setdefault("frame_camera", {})
+    camera |= {"exposure_us": 20_000} | ({"rate_hz": 50} if driver == "devices" else {})
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    rig, _ = load_rig_file(path)
+    plan = load_plan(ROOT / "protocols" / "pilot.yaml")
+    with pytest.raises(
+        InputError,
+        match=rf"{driver}.frame_camera.exposure_us = 20000: must be at most 10000, the period of",
+    ):
+        check_plan(rig, plan, str(path))
+
+
 def test_a_plan_beyond_the_rig_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(MOCK.replace("depth: 4 mm", "depth: 3 mm"))

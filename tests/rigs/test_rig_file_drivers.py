@@ -55,6 +55,19 @@ CASES: dict[str, tuple[Change, str, str]] = {
         _set("devices", "frame_camera", "exposure_us", to=1000),
         "devices.frame_camera.exposure_us", "must be 2000",
     ),
+    "an exposure longer than the camera's period": (
+        _set("devices", "frame_camera", "rate_hz", to=1000),
+        "devices.frame_camera.exposure_us",
+        "= 2000: must be at most 1000, the period of rate_hz = 1000",
+    ),
+    "an output that is an input": (
+        _set("devices", "frame_camera", "exposure_line", to="Line1"),
+        "devices.frame_camera.exposure_line", "is an input already: trigger_line",
+    ),
+    "ticks on the line of the code": (
+        _set("devices", "frame_camera", "sync_line", to=1),
+        "devices.frame_camera.sync_line", "must be another line than trigger_line",
+    ),
     "frames that no stand-in times so": (
         _set("timing", "frames", to="exposure line"),
         "timing.frames", "must be hardware trigger",

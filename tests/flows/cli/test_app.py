@@ -55,6 +55,18 @@ def test_wrong_input_is_exit_2_and_one_message(tmp_path: Path) -> None:
     assert not (tmp_path / "s").exists()
 
 
+def test_an_exposure_longer_than_its_period_is_refused_by_plan_and_check(tmp_path: Path) -> None:
+    rig = (ROOT / "rigs" / "ur5.yaml").read_text()
+    assert "exposure_us: 2000" in rig
+    path = tmp_path / "rig.yaml"
+    path.write_text(rig.replace("exposure_us: 2000", "exposure_us: 20000"))
+    for command in (("plan",), ("check", "--store", tmp_path / "s")):
+        done = here(*command, "protocols/pilot.yaml", "--rig", path)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert "devices.frame_camera.exposure_us = 20000: must be at most 10000" in done.stderr
+        assert str(path) in done.stderr
+
+
 def test_a_store_that_is_none_is_said() -> None:
     done = here("label", "docs")
     assert done.returncode == 2
