@@ -92,6 +92,8 @@ class Gates(StrictModel):
     """Most events in any 10 ms: more is flicker, not skin."""
     path_deviation: PositiveMillimetres = Decimal("0.1")
     """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
+    speed_deviation: PositivePercent = Decimal(10)
+    """How far the speed may be from the one asked for, anywhere along the way."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """How often a trial is taken again before it is set aside."""
     reference: ReferenceGate | None = None

@@ -14,6 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from protocols.conditions import Gates
 from protocols.consistency import check_consistency
 from protocols.errors import InputError
 from protocols.factors import Level, unknown_factor
@@ -180,8 +181,11 @@ class Plan:
     def collection_data(self) -> dict[str, Any]:
         """The `collection:` section as JSON data, defaults written out."""
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
-        if data["gates"]["reference"] is None:  # hashes of protocols from before it came stay
+        gates = self.protocol.collection.gates
+        if gates.reference is None:  # hashes of protocols from before it came stay
             data["gates"].pop("reference")
+        if gates.speed_deviation == Gates().speed_deviation:  # the same
+            data["gates"].pop("speed_deviation")
         return data
 
     @cached_property

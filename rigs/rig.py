@@ -55,6 +55,8 @@ class Way:
     begin_mm: tuple[float, float, float]
     end_mm: tuple[float, float, float]
     """Tool centre point in the arm's base frame."""
+    speed_mm_s: float = 0.0
+    """Along the way; 0 for a place to stay at."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,8 @@ class Rig:
                 steps.append((times, step.recorded))
                 began, at = at, step_seconds(step, at)[1]
                 if step.recorded:
-                    ways.append(self._way(times, began, at))
+                    speed = step.speed_mm_s if isinstance(step, Move) else 0.0
+                    ways.append(self._way(times, began, at, speed))
             truth = None
             if self.simulation is not None:
                 truth = self.simulation.truth(reference)
@@ -377,9 +380,9 @@ class Rig:
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
 
-    def _way(self, times: StepTimes, begin: Position, end: Position) -> Way:
+    def _way(self, times: StepTimes, begin: Position, end: Position, speed: float) -> Way:
         places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
-        return Way(times.start_ns, times.end_ns, *places)
+        return Way(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
         """Where the tool centre point is now, in plate coordinates."""

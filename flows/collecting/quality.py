@@ -14,11 +14,12 @@ import numpy as np
 from numba import njit
 
 from analysis.timeline.synchronise import TrialSync, streams_of, synchronise
+from flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
 from protocols.conditions import Gates
 from protocols.timing import Timing
 from rigs.rig import TrialRun
 from storage.hdf5 import StreamReader
-from storage.streams import F64, I64
+from storage.streams import I64
 from storage.writer import DATA
 
 UNVOUCHED_S = 0.3
@@ -92,11 +93,19 @@ def assess(
         "limit": gates.event_burst,
         "passed": burst <= gates.event_burst,
     }
-    away, away_limit = _path_deviation(streams.pose_ns, pose_mm, run), float(gates.path_deviation)
+    away = path_deviation_mm(streams.pose_ns, pose_mm, run.ways)
+    away_limit = float(gates.path_deviation)
     results["path_deviation_mm"] = {
         "value": away,
         "limit": away_limit,
         "passed": 0 <= away <= away_limit,
+    }
+    off = speed_deviation_percent(streams.pose_ns, streams.pose_host_ns, pose_mm, run.ways)
+    off_limit = float(gates.speed_deviation)
+    results["speed_deviation_percent"] = {
+        "value": off,
+        "limit": off_limit,
+        "passed": 0 <= off <= off_limit,
     }
     return Assessment(
         sync.to_json(),
@@ -192,26 +201,3 @@ def _event_burst(event_us):  # type: ignore[no-untyped-def]
             end += 1
         most = max(most, end - begin)
     return most
-
-
-def _path_deviation(pose_ns: I64, pose_mm: F64, run: TrialRun) -> float:
-    """How far the tool was, at most, from the ways of the recorded steps, mm, to a micrometre.
-
-    Only across: along its way an arm may be early or late, as it gathers speed. -1 without poses
-    in some step, or when the arm's clock is not to be believed.
-    """
-    worst = 0.0
-    for way in run.ways:
-        if way.end_ns <= way.start_ns:
-            continue
-        inside = (pose_ns >= way.start_ns) & (pose_ns <= way.end_ns)
-        if not inside.any():
-            return -1.0
-        begin = np.asarray(way.begin_mm)
-        along = np.asarray(way.end_mm) - begin
-        from_begin = pose_mm[inside] - begin
-        length_2 = float(along @ along)
-        share = np.zeros(len(from_begin)) if length_2 == 0 else from_begin @ along / length_2
-        across: F64 = from_begin - np.clip(share, 0.0, 1.0)[:, None] * along
-        worst = max(worst, float(np.max(np.linalg.norm(across, axis=1))))
-    return round(worst, 3)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flows.collecting.session import Session
@@ -197,6 +199,37 @@ def test_the_deviation_that_a_gate_measures_is_the_arms(tmp_path: Path) -> None:
     values = {k: v["quality"]["gates"]["path_deviation_mm"]["value"] for k, v in found.items()}
     assert values["bad"] == pytest.approx(0.3, abs=0.015)
     assert values["good"] < 0.015  # noise of the poses
+
+
+@pytest.mark.parametrize("part", [1.0, 0.4])
+def test_an_arm_slower_than_it_was_told_is_taken_again(tmp_path: Path, part: float) -> None:
+    """At half its speed, all the way or in its last part, and "done" for all that it says."""
+    work, campaign = begin(tmp_path, [], slides(1))
+    start, slowed = work.rig.arm.start, [False]
+
+    def slow(path: Any) -> None:
+        (segment,) = path
+        if segment.speed_mm_s != 1.6 or slowed[0]:
+            start(path)
+            return
+        slowed[0] = True
+        here, there = np.array(work.rig.arm.pose().xyz_mm), np.array(segment.to.xyz_mm)
+        x, y, z = (there - part * (there - here)).tolist()
+        at = replace(segment, to=replace(segment.to, xyz_mm=(x, y, z)))
+        slower = replace(segment, speed_mm_s=0.8)
+        start([slower] if part == 1.0 else [at, slower])
+
+    work.rig.arm.start = slow  # type: ignore[method-assign]
+    take_all(work)
+    assert slowed == [True]
+    assert (work.taken, work.retaken) == (2, 1)
+    (failed,) = campaign.quarantined()
+    assert "speed_deviation_percent = " in failed["cause"]
+    bad = read_json(campaign.folder / "quarantine" / _only(campaign) / "record.json")
+    good = next(campaign.recordings()).record
+    values = [r["quality"]["gates"]["speed_deviation_percent"]["value"] for r in (bad, good)]
+    assert values[0] == pytest.approx(50.0, abs=3.0)
+    assert 0 <= values[1] < 2.0
 
 
 def _only(campaign: Campaign) -> str:
