@@ -55,6 +55,7 @@ def serve(
         str(rig_path(rig).resolve()),
         name or file.name,
         found,
+        folders=[Path.cwd(), *([] if schedules is None else [schedules.parent])],
         port=port,
         poll_s=poll,
     )

@@ -17,6 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from flows.cli.chain import package_file
 from flows.running import console, run_records
 from flows.running.embedded_server import EmbeddedServer, new_password
 from flows.serving.serve_control import answer_page
@@ -107,6 +108,7 @@ def serve(
     name: str,
     schedules: Sequence[Scheduled],
     *,
+    folders: Sequence[Path],
     port: int = PORT,
     poll_s: float = 3.0,
 ) -> None:
@@ -115,6 +117,8 @@ def serve(
     Args:
         rig: a rig file's absolute path, or the name of one that ships.
         name: of the deployments.
+        folders: below which a run may name its protocol; a relative name is of the first. Those
+            that ship, and those that a schedule names, it may name as well.
         port: of the embedded server's page.
         poll_s: how often the server is asked for new runs, s.
 
@@ -130,7 +134,8 @@ def serve(
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
         url = stack.enter_context(page_server(port))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
-        Service(str(store.folder.resolve()), rig, name, server, os.getpid()).tell()
+        protocols = _protocols(folders, schedules)
+        Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols).tell()
         for item in run_records.close_dead(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
         asyncio.run(_serve(store, rig, name, schedules, url, poll_s))
@@ -181,6 +186,15 @@ async def _serve(
     for outcome in await asyncio.gather(running, answering, ending, return_exceptions=True):
         if isinstance(outcome, Exception):
             raise outcome
+
+
+def _protocols(folders: Sequence[Path], schedules: Sequence[Scheduled]) -> tuple[str, ...]:
+    """Where protocols may be, absolute; the root of the file system is no folder of anybody's."""
+    named = [
+        Path(item.parameters["protocol"]) for item in schedules if "protocol" in item.parameters
+    ]
+    found = [path.resolve() for path in (*folders, package_file("protocols", ""), *named)]
+    return tuple(str(path) for path in found if path != path.parent)
 
 
 def _tags(store: Store, rig: str) -> list[str]:

@@ -114,8 +114,8 @@ def _take(wanted: OnRig, order: Order, run: Any) -> str:
 
 def _collect(wanted: Collect, here: Service, run: Any) -> str:
     order = _order(
-        here, wanted, wanted.protocol, run, most=wanted.trials, campaign=wanted.campaign,
-        enable=tuple(wanted.enable),
+        here, wanted, here.protocol(wanted.protocol), run,
+        most=wanted.trials, campaign=wanted.campaign, enable=tuple(wanted.enable),
     )  # fmt: skip
     return _take(wanted, order, run)
 

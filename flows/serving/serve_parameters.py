@@ -47,7 +47,7 @@ class OnRig(Parameters):
 class Collect(OnRig):
     """Takes the trials that the store lacks."""
 
-    protocol: Path = Field(description="A protocol file (YAML), from the service's own folder.")
+    protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
     trials: int | None = Field(
         default=None, ge=1, description="Take so many of the missing, no more."
     )

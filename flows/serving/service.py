@@ -11,7 +11,11 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from protocols import InputError
+from protocols.yaml_file import parse_yaml, read_text
+
 ENVIRONMENT = "SLIPLAB_SERVICE"
+SUFFIXES = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,8 @@ class Service:
         name: of the deployments: ``collect/NAME``.
         server: Prefect's, as `run_records.server_name` calls it.
         pid: of the program that serves.
+        protocols: folders below which a run may name its protocol, and files that a schedule names;
+            a relative name is of the first.
     """
 
     store: str
@@ -30,6 +36,7 @@ class Service:
     name: str
     server: str
     pid: int
+    protocols: tuple[str, ...]
 
     @property
     def folder(self) -> Path:
@@ -39,6 +46,35 @@ class Service:
     def tell(self) -> None:
         """Put it into the environment of the processes that are started from here on."""
         os.environ[ENVIRONMENT] = json.dumps(asdict(self))
+
+    def protocol(self, given: Path) -> Path:
+        """The protocol file that a run's parameter names.
+
+        Whoever names it may see less than the service does: a file that is not below the service's
+        folders is not looked at, and nothing of one that is no protocol is quoted.
+
+        Raises:
+            InputError: it is elsewhere, links followed, or is no protocol.
+        """
+        found = (Path(self.protocols[0]) / given).resolve()
+        roots = [Path(root) for root in self.protocols]
+        if not any(found == root or root in found.parents for root in roots) or (
+            found.suffix not in SUFFIXES
+        ):
+            below = ", ".join(self.protocols)
+            raise InputError(
+                "protocol", "", str(given), f"must be a file {' or '.join(SUFFIXES)} below {below}"
+            )
+        text = read_text(found, "protocol")
+        try:
+            known = "protocol" in parse_yaml(text, found)
+        except InputError:
+            known = False
+        if not known:
+            raise InputError(
+                found, "", None, "is no protocol; `sliplab plan` says what is wrong with it"
+            )
+        return found
 
 
 def service() -> Service:
@@ -50,4 +86,5 @@ def service() -> Service:
     text = os.environ.get(ENVIRONMENT)
     if text is None:
         raise RuntimeError("this flow runs under `sliplab serve` only")
-    return Service(**json.loads(text))
+    told = json.loads(text)
+    return Service(**{**told, "protocols": tuple(told["protocols"])})

@@ -52,7 +52,7 @@ class Page:
         self.url, self.password, self._name, self.log = url, password, name, log
         self._headers: dict[str, str] = {}
 
-    def call(self, path: str, data: Any = None) -> Any:
+    def call(self, path: str, data: Any = None, tries: int = 4) -> Any:
         """The server's answer, or ``{"status": ..., "detail": ...}`` of its refusal."""
         if not self._headers:
             self._headers = access(self.url, self.password)
@@ -63,6 +63,9 @@ class Page:
             with urllib.request.urlopen(request, timeout=30) as answer:
                 return json.loads(answer.read() or b"null")
         except urllib.error.HTTPError as error:
+            # SQLite was written to meanwhile: Prefect's own clients ask again, too
+            if error.code == 503 and tries > 1:
+                return self.call(path, data, tries - 1)
             return {"status": error.code, "detail": error.read().decode()}
 
     def deployment(self, flow: str) -> Any:
@@ -96,7 +99,12 @@ class Page:
 
 @contextmanager
 def serving(
-    store: Path, rig: Path, name: str, server: tuple[str, str] | None, log: Path
+    store: Path,
+    rig: Path,
+    name: str,
+    server: tuple[str, str] | None,
+    log: Path,
+    schedules: Path | None = None,
 ) -> Iterator[Page]:
     """`sliplab serve` as a process of its own.
 
@@ -104,6 +112,7 @@ def serving(
         server: address and password of a Prefect server; None for the service's own.
     """
     command = [sys.executable, "-m", "flows", "serve", "--store", str(store), "--rig", str(rig)]
+    command += [] if schedules is None else [str(schedules)]
     environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
     if server is None:
         command += ["--port", "0"]

@@ -54,7 +54,8 @@ def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
     monkeypatch.setattr(orchestration, "private", lambda: False)  # as if somebody could look
     store = Store.create(tmp_path / "store")
-    found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid())
+    here = str(tmp_path)
+    found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid(), (here,))
     found.tell()
     return found
 
@@ -115,6 +116,46 @@ def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> Non
     labels = Derived.of(store, "labels", campaign.NAME)
     assert all(labels.read(trial) for trial in store.campaign(campaign.NAME).committed())
     assert sorted(end["state"] for end in ends(service)) == [*["COMPLETED"] * 2, *["FAILED"] * 3]
+
+
+SECRET = "hunter2-not-yours"
+
+
+def test_a_run_reads_no_file_outside_the_services_folders(
+    service: Service, protocol: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "protocol.yaml"
+    elsewhere.write_text(f"password: {SECRET}\n")
+    folder = protocol.parent
+    (folder / "link.yaml").symlink_to(elsewhere)
+    (folder / "folder").symlink_to(elsewhere.parent)
+    (folder / "key.pem").write_text(SECRET)
+    for given in (
+        "/proc/self/environ", "/etc/shadow", str(elsewhere), "../elsewhere0/protocol.yaml",
+        "link.yaml", "folder/protocol.yaml", "key.pem", "", "/",
+        str(elsewhere.with_name("missing.yaml")),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=r"must be a file .yaml or .yml below ") as error:
+            service.protocol(Path(given))
+        assert SECRET not in str(error.value)
+    assert service.protocol(Path("protocol.yaml")) == protocol.resolve()
+    assert service.protocol(protocol) == protocol.resolve()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"password: {SECRET}\n", SECRET, f"a: *{SECRET}\n", f"{SECRET}: 1\n{SECRET}: 2\n",
+        f"!{SECRET} x\n", f"? {{{SECRET}: 1}}\n: 2\n", f"protocol_of: {SECRET}\n",
+    ],
+)  # fmt: skip
+def test_nothing_is_quoted_of_what_is_no_protocol(
+    service: Service, tmp_path: Path, text: str
+) -> None:
+    (tmp_path / "settings.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"settings\.yaml: is no protocol") as error:
+        service.protocol(Path("settings.yaml"))
+    assert SECRET not in str(error.value)
 
 
 def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protocol: Path) -> None:

@@ -193,10 +193,18 @@ def test_its_page_is_framed_by_nobody(service: Service) -> None:
 
 def test_every_run_knows_the_password_by_itself(service: Service) -> None:
     run = service.page.run("label")
+    assert "id" in run, run
     ended = service.page.ended(run["id"])
     assert ended["type"] == "FAILED", ended  # the store has no campaign, and the run could say so
     assert "holds no campaign" in ended["message"] or "no campaign" in ended["message"]
     assert Store.open(service.store).campaigns() == []
+
+
+def test_a_run_is_answered_nothing_of_files_elsewhere(service: Service) -> None:
+    run = service.page.run("collect", protocol="/proc/self/environ")
+    ended = service.page.ended(run["id"])
+    assert ended["type"] == "FAILED"
+    assert "protocol = /proc/self/environ: must be a file .yaml or .yml below " in ended["message"]
 
 
 def test_a_service_that_is_ended_at_once_ends(tmp_path: Path) -> None:

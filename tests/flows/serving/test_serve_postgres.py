@@ -105,7 +105,9 @@ def test_a_campaign_is_paused_and_cancelled_and_goes_on(
         folder = store / "campaigns" / campaign.NAME / "trials"
         return len(list(folder.iterdir())) if folder.is_dir() else 0
 
-    with serving(store, rig, "postgres", server, tmp_path / "serve.log") as page:
+    nights = tmp_path / "schedules.yaml"  # its folder is one from which protocols may be named
+    nights.write_text("timezone: UTC\nschedules: []\n")
+    with serving(store, rig, "postgres", server, tmp_path / "serve.log", nights) as page:
         page_collects(page, file, committed)
 
     reference = campaign.make_order(file, rig, tmp_path / "undisturbed")
