@@ -163,7 +163,7 @@ class Training(StrictModel):
 class Comparison(StrictModel):
     """Other detectors beside the paper's rule, at equal rates of false early detections."""
 
-    rates: tuple[float, ...] = (0.005, 0.01, 0.02)
+    rates: tuple[Annotated[float, Field(le=1)], ...] = (0.005, 0.01, 0.02)
     """False early detections allowed, as shares of the validation trials."""
     stride_ms: int | None = Field(default=None, ge=1, le=1000)
     """The finer of two strides that they are compared at; by default a third of the window's
@@ -175,7 +175,7 @@ class Comparison(StrictModel):
 
     @field_validator("rates")
     @classmethod
-    def _shares(cls, rates: tuple[float, ...]) -> tuple[float, ...]:
+    def _shares(cls, rates: tuple[Annotated[float, Field(le=1)], ...]) -> tuple[float, ...]:
         if not rates or list(rates) != sorted(set(rates)) or not 0 <= rates[0] <= rates[-1] < 1:
             raise ValueError("must be ascending shares from 0 to below 1, at least one")
         return rates

@@ -50,6 +50,7 @@ Days = Annotated[
     WithJsonSchema({"type": "string", "pattern": f"^{_DAYS.pattern}$", "examples": ["30 d"]}),
 ]
 Point = tuple[Millimetre, Millimetre, Millimetre]
+Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 Method = Annotated[str, Field(min_length=1, max_length=120)]
 
 
@@ -104,7 +105,7 @@ class ToolCentrePoint(StrictModel):
     """From the flange, in the flange's axes: what the controller's tool has to be."""
     pivot: Point
     """The fixed point, in the arm's base frame."""
-    poses: int = Field(ge=4)
+    poses: int = Field(ge=4, le=10_000)
     taught: date
     residual: Millimetre
     """Root mean square distance of the tip from the fixed point."""
@@ -119,13 +120,13 @@ class Lens(StrictModel):
     focal: tuple[Pixel, Pixel]
     centre: tuple[Pixel, Pixel]
     """Where the optical axis meets the picture."""
-    distortion: tuple[float, float, float, float, float]
+    distortion: tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
     """k1, k2, p1, p2, k3."""
     tilt: Degree
     """Between the plate and the picture."""
     size: tuple[Pixel, Pixel]
     """Of the pictures that it was measured in: width, height."""
-    views: int = Field(ge=1)
+    views: int = Field(ge=1, le=10_000)
     measured: date
     residual: Pixel
     """Root mean square distance of corners from where the model puts them."""

@@ -16,6 +16,7 @@ from protocols.program import Move
 from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
 from protocols.timing import Timing
 from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from rigs.arms.settings import check_units
 from rigs.calibration import Calibration, without_taught
 from rigs.devices import DeviceSettings
 from rigs.mock.promises import check_promises
@@ -41,7 +42,9 @@ class Skin(StrictModel):
     serial: str = Field(min_length=1, max_length=40)
     made: date | None = None
     """When it was cured; bench records keep its age."""
-    ring_counts: tuple[Annotated[int, Field(ge=1, le=60)], ...]
+    ring_counts: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=60)], ...], Field(min_length=1, max_length=60)
+    ]
     ring_spacing: PositiveMillimetres
     radius: PositiveMillimetres
 
@@ -59,19 +62,19 @@ class Skin(StrictModel):
 class Estimates(StrictModel):
     """What this rig's streams take, measured, for the plan's estimate of disk space."""
 
-    noise_events_per_s: float = Field(ge=0)
-    signal_events_per_mm: float = Field(ge=0)
+    noise_events_per_s: float = Field(ge=0, le=1e9)
+    signal_events_per_mm: float = Field(ge=0, le=1e9)
     """Events of one millimetre of recorded motion in contact."""
-    events_per_fall: float = Field(default=0.0, ge=0)
+    events_per_fall: float = Field(default=0.0, ge=0, le=1e9)
     """Events of a plate that falls, besides."""
-    bytes_per_event: float = Field(gt=0)
-    bytes_per_frame: float = Field(ge=0)
+    bytes_per_event: float = Field(gt=0, le=1000)
+    bytes_per_frame: float = Field(ge=0, le=1e9)
     """Of one frame without the plate's marker: its papillae; the dark ground costs little."""
-    bytes_per_plate_frame: float = Field(ge=0)
+    bytes_per_plate_frame: float = Field(ge=0, le=1e9)
     """Of one frame with the plate's marker."""
-    bytes_per_tracked_frame: float = Field(ge=0)
+    bytes_per_tracked_frame: float = Field(ge=0, le=1e9)
     """Of one frame that is kept as the places of its markers."""
-    fixed_bytes: float = Field(ge=0)
+    fixed_bytes: float = Field(ge=0, le=1e12)
     """Of one trial: poses, pulses, record."""
 
 
@@ -79,8 +82,8 @@ class FrameCameraSpec(StrictModel):
     """The outside camera."""
 
     scale_px_per_mm: float = Field(gt=0, le=200)
-    width_px: int = Field(default=1920, ge=16)
-    height_px: int = Field(default=1200, ge=16)
+    width_px: int = Field(default=1920, ge=16, le=100_000)
+    height_px: int = Field(default=1200, ge=16, le=100_000)
     """Pixels of the whole sensor."""
     spool: bool = False
     """Write raw frames first and encode after the trial, where encoding live is too slow."""
@@ -220,18 +223,25 @@ class RigFile(StrictModel):
         return tuple(max(16, round(side * scale / 16) * 16) for side in sides)  # type: ignore[return-value]
 
 
-def load_rig_file(path: Path) -> tuple[RigFile, str]:
+def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
     """A checked rig file and its text, what it extends merged in.
 
     Args:
         path: a file, or the name of a rig that ships with the package, such as ``mock``.
+        stored: it is a campaign's own copy, which is not held to rules that came after it.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
     found = read_rig(rig_path(path))
     try:
-        return validate(RigFile, found.data, found.path), found.text
+        rig = validate(RigFile, found.data, found.path)
+        if rig.devices is not None and not stored:
+            try:
+                check_units(rig.devices.arm)
+            except KeyedError as error:
+                raise InputError(found.path, error.key, error.value, str(error)) from None
+        return rig, found.text
     except InputError as error:
         raise error.in_file(found.blame(error.key)) from None
 

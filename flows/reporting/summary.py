@@ -162,7 +162,7 @@ def _quality(campaigns: list[Collected]) -> dict[str, Any]:
 
 def _planned(item: Collected) -> dict[str, Any]:
     """The plan's seconds and bytes beside what the committed trials really took."""
-    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml")
+    rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
     done = {trial.id for trial, _ in item.trials}
     missing = {trial.id for trial in item.plan} - done
     return {

@@ -118,7 +118,7 @@ class Guesses:
         return [Setting(), *(Setting(name, factor) for name in guesses for factor in factors)]
 
     def _value(self, item: Collected, name: str) -> float:
-        rig, _ = load_rig_file(item.campaign.folder / "rig.yaml")
+        rig, _ = load_rig_file(item.campaign.folder / "rig.yaml", stored=True)
         try:
             value = value_of(rig.scene, name)
         except (AttributeError, TypeError, ValueError):

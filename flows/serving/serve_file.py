@@ -24,10 +24,10 @@ Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 _NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
 
 
-class Timing(BaseModel):
+class Timing(StrictModel):
     """When something is started: on days from an hour on, or by a cron line."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+    model_config = ConfigDict(populate_by_name=True)
 
     name: str
     days: list[Day] | None = Field(default=None, min_length=1)
@@ -79,7 +79,8 @@ def load_schedules(path: Path) -> list[Scheduled]:
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
-    file = validate(_File, parse_yaml(read_text(path, "schedule file"), path), path)
+    read = parse_yaml(read_text(path, "schedule file"), path)
+    file = validate(_File, read, path)
     made: list[Scheduled] = []
     for number, data in enumerate(file.schedules):
         where = f"schedules[{number}]"
@@ -87,7 +88,8 @@ def load_schedules(path: Path) -> list[Scheduled]:
             made.append(_one(data, file.timezone, path))
         except InputError as error:
             key = f"{where}.{error.key}" if error.key else where
-            raise InputError(path, key, error.value, error.expected) from None
+            value = error.value and read.written.get(key, error.value)
+            raise InputError(path, key, value, error.expected) from None
         if made[-1].name in {item.name for item in made[:-1]}:
             raise InputError(path, f"{where}.name", made[-1].name, "stands twice")
     return made
@@ -95,7 +97,7 @@ def load_schedules(path: Path) -> list[Scheduled]:
 
 def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     flow = data.get("flow")
-    if flow not in _MODELS:
+    if not isinstance(flow, str) or flow not in _MODELS:
         raise InputError(path, "flow", flow, f"must be one of {', '.join(get_args(FlowName))}")
     if "timezone" in data:
         raise InputError(path, "timezone", data["timezone"], "stands once, at the file's top")
@@ -110,7 +112,8 @@ def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
     if issubclass(SCHEDULED[flow], OnRig):
         parameters["timezone"] = timezone
     if "protocol" in parameters:
-        parameters["protocol"] = _protocol(path, model.protocol)
+        parameters["protocol"] = _protocol(path, model.protocol, model.enable)
+        _check_campaign(path, model.campaign)
     return Scheduled(
         name=model.name, flow=flow, cron=cron, timezone=timezone, active=model.active,
         parameters=parameters,
@@ -142,16 +145,30 @@ def _cron(model: Any, timezone: str) -> str:
     return str(model.cron)
 
 
-def _protocol(path: Path, name: Path) -> str:
+def _protocol(path: Path, name: Path, enable: list[str]) -> str:
     """A protocol's path, found now: a night must not fail for a name.
 
     Raises:
-        InputError: there is none, or it is wrong itself.
+        InputError: there is none, or it or a level to be enabled is wrong.
     """
     from protocols import load_plan
 
     found = (path.parent / name).resolve()
     if not found.is_file():
         raise InputError(path, "protocol", str(name), f"is no file ({found})")
-    load_plan(found)
+    try:
+        load_plan(found, enable)
+    except InputError as error:
+        if error.file == "--enable":
+            raise InputError(path, "enable", enable, error.expected) from None
+        raise InputError(path, "protocol", str(name), error.message) from None
     return str(found)
+
+
+def _check_campaign(path: Path, name: str | None) -> None:
+    from storage.store import StoreError, safe_name
+
+    try:
+        safe_name("any" if name is None else name)
+    except StoreError as error:
+        raise InputError(path, "campaign", name, str(error)) from None

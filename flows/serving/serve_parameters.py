@@ -9,22 +9,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from flows.serving.serve_windows import Until, Zone
+from protocols.yaml_file import StrictModel
 
 
-class Parameters(BaseModel):
+class Parameters(StrictModel):
     """Base of all: an unknown parameter is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class OnRig(Parameters):
     """What everything that moves the arm may be told."""
 
     operator: str = Field(default="", description="Who stands at the rig.")
-    temperature_c: float | None = Field(default=None, description="Room, degrees Celsius.")
+    temperature_c: float | None = Field(
+        default=None, ge=-50, le=100, description="Room, degrees Celsius."
+    )
     humidity_percent: float | None = Field(
         default=None, ge=0, le=100, description="Relative, percent."
     )
@@ -49,7 +50,7 @@ class Collect(OnRig):
 
     protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
     trials: int | None = Field(
-        default=None, ge=1, description="Take so many of the missing, no more."
+        default=None, ge=1, le=1_000_000, description="Take so many of the missing, no more."
     )
     enable: list[str] = Field(default=[], description="Optional levels to switch on: factor=level.")
     campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
@@ -82,8 +83,12 @@ class Step(Parameters):
 class Evaluate(Step):
     """Scores the network on trials it has never seen."""
 
-    margin: float | None = Field(default=None, ge=0, description="Spikes a winner must lead by.")
-    smoothing: int | None = Field(default=None, ge=1, description="Windows to average over.")
+    margin: float | None = Field(
+        default=None, ge=0, le=1e6, description="Spikes a winner must lead by."
+    )
+    smoothing: int | None = Field(
+        default=None, ge=1, le=1000, description="Windows to average over."
+    )
 
 
 class Ask(Parameters):

@@ -15,8 +15,8 @@ from pydantic import AfterValidator
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"
-_UNTIL = re.compile(rf"(?:({'|'.join(DAYS)}) )?{_CLOCK}")
-_FROM = re.compile(_CLOCK)
+_UNTIL = re.compile(rf"(?:({'|'.join(DAYS)}) )?{_CLOCK}", re.ASCII)
+_FROM = re.compile(_CLOCK, re.ASCII)
 
 
 def _zone(name: str) -> str:

@@ -6,17 +6,18 @@ belong to the rig, not to the protocol.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from protocols.yaml_file import KeyedError, StrictModel
+from rigs.address import BindAddress, Host
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 Triple = tuple[Finite, Finite, Finite]
 Port = Annotated[int, Field(ge=1, le=65535)]
-Host = Annotated[str, Field(min_length=1, max_length=253, pattern=r"^[A-Za-z0-9.\-]+$")]
 
 
 class PlaneSettings(StrictModel):
@@ -95,7 +96,7 @@ class AbbSettings(_Arm):
     rws_port: Port = 80
     egm_port: Port = 6510
     """UDP port on this host to which the controller sends its poses."""
-    egm_bind: Host = "0.0.0.0"
+    egm_bind: BindAddress = "0.0.0.0"
     egm_host: Host | None = None
     """Address that the poses come from, if it is not `host`; packets of any other are dropped."""
     username: str = "Default User"
@@ -119,3 +120,49 @@ class AbbSocketSettings(_Arm):
 
 
 ArmSettings = UrSettings | AbbSettings | AbbSocketSettings
+
+_SHORTEST_MM = 1.0
+"""A tool or a plate in metres is shorter, and no real one in millimetres is."""
+_SMALLEST_MM = 2.0
+"""Side of a box of limits; of one in metres all are shorter."""
+_RADIANS = 1e-3
+
+
+def check_units(arm: ArmSettings) -> None:
+    """Look for lengths that were written in metres and turns that were written in radians.
+
+    Raises:
+        KeyedError: a value that no arm can have in the unit of its key.
+    """
+    tool, limits, key = arm.tool, arm.limits, "devices.arm"
+    for name, vector in (
+        ("tcp_mm", tool.tcp_mm),
+        ("centre_of_mass_mm", tool.centre_of_mass_mm),
+    ):
+        if 0 < math.hypot(*vector) < _SHORTEST_MM:
+            raise _in_metres(f"{key}.tool.{name}", vector, "is less than a millimetre long")
+    turn = math.hypot(*tool.tcp_rotvec_deg)
+    if any(abs(turn - part * math.pi) < _RADIANS for part in (0.5, 1.0)):
+        raise KeyedError(
+            f"{key}.tool.tcp_rotvec_deg",
+            tool.tcp_rotvec_deg,
+            f"is a turn in radians: write degrees, such as {_row(tool.tcp_rotvec_deg, 57.29578)}",
+        )
+    sides = [high - low for low, high in zip(limits.low_mm, limits.high_mm, strict=True)]
+    if max(sides) < _SMALLEST_MM:
+        text = f"to high_mm is a box of {' x '.join(f'{side:g}' for side in sides)} mm"
+        raise _in_metres(f"{key}.limits.low_mm", limits.low_mm, text)
+    if limits.plate is not None:
+        for name in ("right_mm", "above_mm"):
+            point = getattr(limits.plate, name)
+            if math.dist(limits.plate.centre_mm, point) < _SHORTEST_MM:
+                text = "is less than a millimetre from centre_mm"
+                raise _in_metres(f"{key}.limits.plate.{name}", point, text)
+
+
+def _in_metres(key: str, vector: Triple, text: str) -> KeyedError:
+    return KeyedError(key, vector, f"{text}: write millimetres, such as {_row(vector, 1000)}")
+
+
+def _row(vector: Triple, factor: float) -> str:
+    return f"[{', '.join(f'{value * factor:g}' for value in vector)}]"

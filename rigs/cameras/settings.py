@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from protocols.yaml_file import KeyedError, StrictModel
+from rigs.address import Host
 
 FrameTrigger = Literal["hardware", "software", "free run"]
 Readout = Literal[
@@ -95,7 +96,7 @@ class NetworkStream(StrictModel):
     """Two streams of dv-processing on the network, one of events and one of triggers."""
 
     kind: Literal["network"] = "network"
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     """Address of the computer that serves them."""
     events_port: int = Field(ge=1, le=65_535)
     triggers_port: int = Field(ge=1, le=65_535)

@@ -21,7 +21,7 @@ PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 
 class _Fault(StrictModel):
-    trial: Annotated[int, Field(ge=1)] | None = None
+    trial: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Which trial begun on this rig, counting from 1; left out, every one."""
 
 

@@ -143,3 +143,94 @@ def test_a_camera_whose_times_are_worse_than_promised_is_refused(tmp_path: Path)
         _check_grade(file, poor)
     simulated: Any = object()
     _check_grade(file, simulated)  # knows of no stamps
+
+
+def _arm(**change: Any) -> Change:
+    def apply(data: dict[str, Any]) -> None:
+        for path, value in change.items():
+            part = data["devices"]["arm"]
+            *parents, last = path.split("__")
+            for name in parents:
+                part = part.setdefault(name, {})
+            part[last] = value
+
+    return apply
+
+
+HOSTS = [
+    "192.168.1", "192.168.1.", "10", "192.168..10", "192.168.1.256", "192.168.1.10.5", "1.2.3.04",
+    "192.168.1.x", "192.168.1.10:30004", "0.0.0.0", "255.255.255.255", "224.0.0.1", "ur5-", "-ur5",
+    "ur5..lab", ".", "ur5 lab", "", "\u0661\u0669\u0662.168.1.10",
+]  # fmt: skip
+MILLIMETRES = "write millimetres"
+UNITS: dict[str, tuple[Change, str, str]] = {
+    "a tool centre in metres": (
+        _arm(tool__tcp_mm=[0, 0, 0.12]), "tool.tcp_mm", f"{MILLIMETRES}, such as [0, 0, 120]",
+    ),
+    "a centre of mass in metres": (
+        _arm(tool__centre_of_mass_mm=[0, 0.01, 0.05]), "tool.centre_of_mass_mm", MILLIMETRES,
+    ),
+    "a turn in radians": (
+        _arm(tool__tcp_rotvec_deg=[0, 3.1416, 0]), "tool.tcp_rotvec_deg", "write degrees",
+    ),
+    "a box in metres": (
+        _arm(limits__low_mm=[-0.4, -0.6, 0], limits__high_mm=[0.4, -0.2, 0.5]),
+        "limits.low_mm", MILLIMETRES,
+    ),
+    "a plate in metres": (
+        _arm(limits__plate={
+            "centre_mm": [0.4, 0, 0.3], "right_mm": [0.4, 0.06, 0.3], "above_mm": [0.4, 0, 0.36],
+        }),
+        "limits.plate.right_mm", MILLIMETRES,
+    ),
+}  # fmt: skip
+
+
+def _real(tmp_path: Path, change: Change) -> Path:
+    """The UR5's rig file with a change."""
+    data = yaml.safe_load((ROOT / "rigs" / "ur5.yaml").read_text())
+    change(data)
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize("host", HOSTS)
+def test_an_address_is_whole(host: str, tmp_path: Path) -> None:
+    path = _real(tmp_path, _arm(host=host))
+    with pytest.raises(InputError) as caught:
+        load_rig_file(path)
+    assert caught.value.key == "devices.arm.host"
+    assert "192.168.1.10" in caught.value.expected
+    source = {"kind": "network", "host": host, "events_port": 1, "triggers_port": 2}
+    path = _real(tmp_path, _set("devices", "event_camera", to={"source": source}))
+    with pytest.raises(InputError) as caught:
+        load_rig_file(path)
+    assert caught.value.key == "devices.event_camera.source.host"
+
+
+@pytest.mark.parametrize(
+    "host", ["192.168.1.10", "ur5", "ur5.lab.example.org", "localhost", "3com"]
+)
+def test_whole_addresses_are_taken(host: str, tmp_path: Path) -> None:
+    rig, _ = load_rig_file(_real(tmp_path, _arm(host=host)))
+    assert rig.devices is not None
+    assert rig.devices.arm.host == host
+
+
+@pytest.mark.parametrize("case", UNITS)
+def test_lengths_in_metres_are_noticed(case: str, tmp_path: Path) -> None:
+    change, key, says = UNITS[case]
+    path = _real(tmp_path, change)
+    with pytest.raises(InputError) as caught:
+        load_rig_file(path)
+    assert caught.value.key == f"devices.arm.{key}"
+    assert says in caught.value.expected
+    assert str(path) in caught.value.message
+    rig, _ = load_rig_file(path, stored=True)  # trials were taken with it, and stay usable
+    assert rig.name == "ur5"
+
+
+@pytest.mark.parametrize("name", ["ur5", "irb120", "loopback"])
+def test_shipped_rigs_are_in_millimetres(name: str) -> None:
+    load_rig_file(Path(name))

@@ -60,6 +60,21 @@ def test_the_shipped_example_is_right() -> None:
         ({"name": "Nights!"}, "schedules[0].name = Nights!"),
         ({"flow": "pause"}, "schedules[0].flow = pause: must be one of"),
         ({"flow": "label"}, "schedules[0].protocol"),
+        ({"flow": ["collect"]}, "schedules[0].flow = [collect]: must be one of collect, label"),
+        ({"name": False}, "schedules[0].name = false: must be text and reads as a switch: quote"),
+        ({"trials": True}, "schedules[0].trials = true: must be a number"),
+        ({"trials": 10**12}, "schedules[0].trials = 1000000000000"),
+        ({"temperature_c": float("inf")}, "schedules[0].temperature_c = .inf: must be a finite"),
+        ({"temperature_c": 300}, "schedules[0].temperature_c = 300"),
+        ({"patience_min": float("nan")}, "schedules[0].patience_min = .nan: must be a finite"),
+        ({"active": 3}, "schedules[0].active = 3: must be true or false"),
+        ({"enable": ["dept=3"]}, "schedules[0].enable = [dept=3]: unknown factor dept; "),
+        ({"enable": ["depth=9"]}, "schedules[0].enable = [depth=9]: is not an optional level"),
+        (
+            {"campaign": "../x"},
+            "schedules[0].campaign = ../x: '../x' cannot be the name",
+        ),
+        ({"from": "2\u0662:00"}, "schedules[0].from = 2\u0662:00: must be a time like"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, change: dict[str, Any], said: str) -> None:
@@ -67,6 +82,25 @@ def test_what_is_wrong_is_named(tmp_path: Path, change: dict[str, Any], said: st
     with pytest.raises(InputError) as error:
         load_schedules(write(tmp_path, wrong))
     assert said in error.value.message
+
+
+def test_a_value_is_shown_as_it_was_written(tmp_path: Path) -> None:
+    path = write(tmp_path, NIGHT)
+    path.write_text(path.read_text().replace("name: nights", "name: off"))
+    with pytest.raises(InputError, match=r"schedules\[0\]\.name = off: must be text"):
+        load_schedules(path)
+    path.write_text(path.read_text().replace("name: off", "name: n").replace("'22:00'", "22:00"))
+    with pytest.raises(InputError, match=r"schedules\[0\]\.from = 22:00: reads as a base-60"):
+        load_schedules(path)
+
+
+def test_a_wrong_protocol_is_named_with_its_own_key(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text((ROOT / "protocols/pilot.yaml").read_text()[:-10])
+    with pytest.raises(InputError) as caught:
+        load_schedules(write(tmp_path, {**NIGHT, "protocol": "mine.yaml"}))
+    assert caught.value.key == "schedules[0].protocol"
+    assert caught.value.value == "mine.yaml"
+    assert f"{tmp_path / 'mine.yaml'}: " in caught.value.message
 
 
 def test_names_and_zones_are_checked(tmp_path: Path) -> None:
