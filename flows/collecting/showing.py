@@ -17,7 +17,7 @@ from typing import Any
 from uuid import UUID
 
 from flows.planning.orders import Order, campaign_counts
-from flows.running import orchestration
+from flows.running import orchestration, server_calls, stopping
 from protocols import Trial
 from protocols.hashing import hash_text
 from storage.store import Store, StoreError
@@ -25,7 +25,13 @@ from storage.streams import Json
 
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0
-"""How long the end of a collection waits for its page."""
+"""How long the end of a collection waits for its page, while the server answers."""
+STOP_LIMIT_S = 1.0
+"""How long it does when a stop was requested."""
+ANSWER_S = 5.0
+"""How long one answer of the server is waited for."""
+LOST_AFTER = 3
+"""So many periods without an answer, and the server is called lost."""
 MOST_POINTS = 300
 
 
@@ -86,6 +92,7 @@ class _Page:
         self._order, self._run = order, run
         self._over = threading.Event()
         self._progress: Any = None
+        self._misses = 0
         self._public = not orchestration.private()
         settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
         self._thread = threading.Thread(
@@ -96,28 +103,48 @@ class _Page:
     def end(self) -> None:
         """Tell the last of it; waits for it, but not for ever."""
         self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(END_LIMIT_S)
+        if self._thread.is_alive() and not server_calls.lost():
+            self._thread.join(STOP_LIMIT_S if stopping.requested() else END_LIMIT_S)
 
     def _tell(self) -> None:
+        from httpx import TransportError
         from prefect.client.orchestration import get_client
+        from prefect.settings import PREFECT_CLIENT_MAX_RETRIES, temporary_settings
 
-        with suppress(Exception), get_client(sync_client=True) as client:
-            with suppress(Exception):
-                self._rig(client, True)
-            try:
-                before = None
-                while not self._over.wait(PERIOD_S):
-                    with suppress(Exception):
-                        if (now := self.show.progress) != before:
-                            self._tell_progress(client)
-                            before = now
-                self._tell_progress(client)
-                self._tell_table(client)
-                if self._public:
-                    self._tell_picture(client)
-            finally:
-                self._rig(client, False)
+        with (
+            suppress(Exception),
+            temporary_settings(updates={PREFECT_CLIENT_MAX_RETRIES: 0}),
+            # with settings of its own it is not the client of the flow run
+            get_client(httpx_settings={"timeout": ANSWER_S}, sync_client=True) as client,
+        ):
+            self._answered(self._rig, client, True)
+            before = None
+            while not self._over.wait(PERIOD_S):
+                if (now := self.show.progress) != before and self._answered(
+                    self._tell_progress, client
+                ):
+                    before = now
+            public = [self._tell_picture, lambda client: self._rig(client, False)]
+            for tell in (self._tell_progress, self._tell_table, *(public if self._public else ())):
+                try:
+                    tell(client)
+                except TransportError as error:
+                    server_calls.lose(server_calls.reason_of(error))
+                    return
+                except Exception:
+                    continue
+
+    def _answered(self, tell: Callable[..., None], *about: Any) -> bool:
+        """Whether the server took it; without an answer again and again it is lost."""
+        try:
+            tell(*about)
+        except Exception as error:
+            self._misses += 1
+            if self._misses == LOST_AFTER:
+                server_calls.lose(server_calls.reason_of(error))
+            return False
+        self._misses = 0
+        return True
 
     def _rig(self, client: Any, busy: bool) -> None:
         """The concurrency limit of the rig's name: a sign on its door, and not its lock."""

@@ -16,15 +16,19 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import fcntl
 import os
+import re
+import resource
 import secrets
 import signal
 import socket
 import subprocess
 import sys
 import time
-import urllib.error
 import urllib.request
+from contextlib import suppress
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +50,10 @@ LEAN = {
 """Settings of a server without a page; what the user has set in the environment counts more."""
 _HEADLESS = {"PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
 _PR_SET_PDEATHSIG = 1
+_RAISED = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
+"""The line of a traceback that says what was raised."""
+_direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Asks the loopback itself, whatever proxy the environment names."""
 
 
 class ServerError(RuntimeError):
@@ -78,8 +86,9 @@ class EmbeddedServer:
             except OSError as error:
                 raise ServerError(f"port {port} of the loopback: {error.strerror}") from None
             self.port = int(listener.getsockname()[1])
-            # the server is given the port itself: another program could take a number meanwhile
-            handle = listener.fileno()
+            # the server is given the port itself: another program could take a number meanwhile.
+            # Above the standard streams: with one of these closed, the port would have its number
+            handle = fcntl.fcntl(listener, fcntl.F_DUPFD_CLOEXEC, 3)
             self._process = subprocess.Popen(
                 [
                     *(sys.executable, "-P", "-m", "flows.running.embedded_server"),
@@ -92,6 +101,7 @@ class EmbeddedServer:
                 pass_fds=[handle],
                 env={**kind, **kept, **_closed(self.port, self.password)},
             )
+            os.close(handle)
         self._answers = False
         atexit.register(self.stop)
 
@@ -110,6 +120,11 @@ class EmbeddedServer:
         if not self._answers:
             self._wait_until_healthy()
             self._answers = True
+        return self.address
+
+    @property
+    def address(self) -> str:
+        """The same, without a look whether it answers."""
         return f"http://127.0.0.1:{self.port}/api"
 
     def settings(self) -> dict[Any, str]:
@@ -122,6 +137,11 @@ class EmbeddedServer:
 
         return {PREFECT_API_URL: self.url, PREFECT_API_AUTH_STRING: self.password}
 
+    @property
+    def alive(self) -> bool:
+        """Whether it answers, or has not been waited for yet."""
+        return self._process.poll() is None and (not self._answers or self._healthy())
+
     def _wait_until_healthy(self) -> None:
         end = time.monotonic() + START_LIMIT_S
         while time.monotonic() < end:
@@ -132,20 +152,39 @@ class EmbeddedServer:
                     return
             else:
                 break
+        code = self._process.poll()
         self.stop()
-        raise ServerError(f"the embedded Prefect server did not start; see {self._log}")
+        raise ServerError(
+            f"the embedded Prefect server did not start: {self._cause(code)}; see {self._log}"
+        )
+
+    def _cause(self, code: int | None) -> str:
+        """Why it did not start, in words: its exit code, its last message, a limit of the shell."""
+        if code is None:
+            return f"no answer at {self.address} in {START_LIMIT_S:.0f} s"
+        found = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        with suppress(OSError):
+            lines = [line.strip() for line in self._log.read_text(errors="replace").split("\n")]
+            lines = [line for line in lines if _RAISED.match(line)] or [
+                line for line in lines if line
+            ]
+            found += f", {lines[-1][:300]}" if lines else ""
+        limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+        if limit != resource.RLIM_INFINITY:
+            found += f" (this shell has a file size limit of {limit} bytes, see `ulimit -f`)"
+        return found
 
     def _healthy(self) -> bool:
-        at = f"http://127.0.0.1:{self.port}/api/health"
         try:
-            with urllib.request.urlopen(at, timeout=5) as answer:
+            with _direct.open(f"{self.address}/health", timeout=5) as answer:
                 return int(answer.status) == 200
-        except (urllib.error.URLError, OSError):
+        except (OSError, HTTPException):
             return False
 
     def stop(self) -> None:
         """End the server; safe to call more than once."""
         self._process.terminate()
+        self._process.send_signal(signal.SIGCONT)  # one that was stopped would not see it
         try:
             self._process.wait(timeout=STOP_LIMIT_S)
         except subprocess.TimeoutExpired:

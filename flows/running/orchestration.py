@@ -10,8 +10,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from flows.running import run_records
-from flows.running.embedded_server import EmbeddedServer
+from flows.running import run_records, server_calls
+from flows.running.embedded_server import EmbeddedServer, ServerError
 
 if TYPE_CHECKING:
     from flows.running.cluster import Cluster
@@ -26,6 +26,7 @@ _DEFAULTS = {
     "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
     "PREFECT_CLI_PROMPT": "false",
 }
+_LOOPBACK = ("127.0.0.1", "localhost")
 _servers: dict[str, EmbeddedServer] = {}
 _store: Path | None = None
 
@@ -63,6 +64,15 @@ def prepare(store: Path) -> None:
         os.environ["PREFECT_HOME"] = str(home)
     for name, value in _DEFAULTS.items():
         os.environ.setdefault(name, value)
+    _ask_loopback_directly()
+
+
+def _ask_loopback_directly() -> None:
+    """Except the loopback from the proxies that the environment names: they cannot reach it."""
+    kept = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
+    names = [name.strip() for name in kept.split(",") if name.strip()]
+    names += [name for name in _LOOPBACK if name not in names]
+    os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(names)
 
 
 def begin() -> None:
@@ -72,10 +82,16 @@ def begin() -> None:
 
 
 def embedded() -> EmbeddedServer:
-    """The embedded server of Prefect's home, which the first call starts."""
+    """Return the embedded server of Prefect's home; start it if there is none that answers."""
     home = os.environ["PREFECT_HOME"]
+    if home in _servers and not _servers[home].alive:
+        from flows.running import run_events
+
+        _servers.pop(home).stop()
+        run_events.renew()
     if home not in _servers:
         _servers[home] = EmbeddedServer(Path(home))
+        server_calls.forget(run_records.EMBEDDED)
     return _servers[home]
 
 
@@ -83,20 +99,21 @@ def private() -> bool:
     """Whether Prefect's server is this program's own, with no page that anybody could look at."""
     from prefect.settings import PREFECT_API_URL
 
-    return PREFECT_API_URL.value() in {None, *(server.url for server in _servers.values())}
+    return PREFECT_API_URL.value() in {None, *(server.address for server in _servers.values())}
 
 
 def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Inside a flow that is served it is part of that flow's run, which has an end of its own.
+    A server that is lost, or cannot be started, holds nothing up (`server_calls`).
     Without heartbeats, because each would cost a flow a second of waiting for their thread; a
     killed run is known by what the store lacks, and closed by the next one.
 
     Args:
         cluster: where its tasks go that are submitted, instead of threads.
     """
-    from prefect.context import FlowRunContext
+    from prefect.context import FlowRunContext, SyncClientContext
     from prefect.settings import (
         PREFECT_API_URL,
         PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
@@ -109,13 +126,23 @@ def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
         return flow.fn(parcel)
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     server = run_records.server_name(PREFECT_API_URL.value())
+    calls = server_calls.Calls(server, _store)
     if server == run_records.EMBEDDED:
-        updates |= embedded().settings()
-    with temporary_settings(updates=updates):
-        run_events.install()
+        try:
+            updates |= embedded().settings()
+        except ServerError as error:
+            if cluster is not None:  # its workers report there
+                raise
+            updates[PREFECT_API_URL] = server_calls.NOWHERE
+            calls.absent(str(error))
+    with temporary_settings(updates=updates), calls:
+        run_events.install(silent=calls.nobody)
         if _store is not None:
-            run_records.close_dead(_store, server)
+            calls.close_dead()
             flow = flow.with_options(**run_records.hooks(_store, server))
         if cluster is not None:
             flow = flow.with_options(task_runner=cluster.runner())
-        return flow(parcel)
+        context = SyncClientContext()
+        calls.through(context.client)
+        with context:
+            return flow(parcel)

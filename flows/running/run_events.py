@@ -11,17 +11,24 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager
+from concurrent.futures import CancelledError
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import prefect.events.utilities
 import prefect.task_engine
+from prefect.events.clients import NullEventsClient
 from prefect.events.schemas.events import Event
 from prefect.events.worker import EventsWorker
+
+from flows.running import server_calls
 
 HELD_S = 0.25
 MOST = 100
 """Task runs that are held at once."""
+EXIT_S = 5.0
+"""How long the end of the program waits for events that a server has not taken yet."""
+EXIT_LOST_S = 0.2
 _TASK_RUN = "prefect.task-run."
 
 
@@ -64,7 +71,11 @@ class BatchingWorker(EventsWorker):
 
     def _begin_to_send(self) -> None:
         self._timer = None
-        self._later = asyncio.create_task(self._send())
+        self._later = asyncio.create_task(self._send_later())
+
+    async def _send_later(self) -> None:
+        with suppress(Exception):  # a server that is lost is said elsewhere
+            await self._send()
 
     async def _send(self) -> None:
         assert self._sending is not None
@@ -87,7 +98,37 @@ def _tell_but_pending(
     return told
 
 
-def install() -> None:
-    """Have the events of this process go that way."""
+_drain: Any = EventsWorker.drain
+
+
+def _drain_at_exit(self: Any, at_exit: bool = False) -> Any:
+    """Prefect's own, which knows no limit: at the program's end a server is not waited for long."""
+    if not at_exit:
+        return _drain(self)
+    limit_s = EXIT_LOST_S if server_calls.lost() else EXIT_S
+    with suppress(TimeoutError, CancelledError):
+        self._drain(at_exit=True).result(limit_s)
+    return True
+
+
+def install(silent: bool = False) -> None:
+    """Have the events of this process go that way.
+
+    Args:
+        silent: there is no server: they go nowhere.
+    """
+    bound_exit()
+    BatchingWorker.set_client_override(NullEventsClient if silent else None)
     _emitter.EventsWorker = BatchingWorker
     _engine.emit_task_run_state_change_event = _tell_but_pending
+
+
+def bound_exit() -> None:
+    """Have the end of this process wait for a few seconds at most until its events are sent."""
+    worker: Any = EventsWorker
+    worker.drain = _drain_at_exit
+
+
+def renew() -> None:
+    """Let go of the connection to a server that is no more; the next event makes another one."""
+    EventsWorker.drain_all(timeout=EXIT_LOST_S, at_exit=False)

@@ -2,10 +2,11 @@
 
     STORE/control/runs/ID.json       what began, when, and in which process on which machine
     STORE/control/runs/ID.end.json   how it ended; the first word stands
+    STORE/control/runs/ID.owed.json  how it ended, while Prefect's server does not know it yet
 
 A process that is killed writes no end. The next program that opens the store finds its begin, sees
 that the process is gone, writes the end, and tells Prefect, which would show the run as running
-for ever.
+for ever. The same program reports the ends that a server, which did not answer then, still lacks.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from storage.process import is_here, named, now, this_process
 from storage.streams import Json
 
 EMBEDDED = "embedded"
-_BEGIN = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\.json")
+_ID = r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"
+_BEGIN = re.compile(rf"{_ID}\.json")
+_OWED = re.compile(rf"({_ID})\.owed\.json")
 
 
 def server_name(url: str | None) -> str:
@@ -60,6 +63,12 @@ def end(store: Path, run: str, state: str, message: str, by: str) -> bool:
     return write_new_json(folder / f"{run}.end.json", said)
 
 
+def owe(store: Path, run: str, state: str, message: str) -> None:
+    """Keep how a flow run ended for a server that did not answer; `close_dead` reports it."""
+    said = {"state": state, "message": message, "when": now()}
+    write_new_json(_folder(store) / f"{run}.owed.json", said)
+
+
 def suspended(store: Path, run: str) -> None:
     """A flow run left its process to be resumed in another one: it has not begun any more."""
     (_folder(store) / f"{run}.json").unlink(missing_ok=True)
@@ -79,12 +88,12 @@ def open_runs(store: Path) -> list[Json]:
 
 
 def close_dead(store: Path, server: str) -> list[Json]:
-    """Close what killed processes of this machine left open on `server`.
+    """Close what killed processes of this machine left open on `server`, and report owed ends.
 
     Prefect is told first: a program that dies in between does both again.
 
     Returns:
-        The runs that were closed.
+        The runs that were closed because their process was killed.
     """
     here = this_process()["host"]
     dead = [
@@ -94,28 +103,46 @@ def close_dead(store: Path, server: str) -> list[Json]:
         and item.get("process", {}).get("host") == here
         and not is_here(item["process"])
     ]
-    if not dead:
+    owed = _owed(store, server)
+    if not dead and not owed:
         return []
     sweep_temporary(_folder(store))
     from prefect.client.orchestration import get_client
 
     with get_client(sync_client=True) as client:
+        for path, run in owed:
+            said = read_json(path)
+            _report(client, run, said["state"], said["message"])
+            path.unlink(missing_ok=True)
         for item in dead:
             message = f"its process was killed ({named(item['process'])}); found at the next start"
-            crash(client, item["run"], message)
+            _report(client, item["run"], "CRASHED", message)
             end(store, item["run"], "CRASHED", message, "next start")
     return dead
 
 
-def crash(client: Any, run: str, message: str) -> None:
-    """Set a flow run to CRASHED, unless it ended or the server does not know it."""
+def _owed(store: Path, server: str) -> list[tuple[Path, str]]:
+    """Files of the ends that a server lacks, with their runs."""
+    folder = _folder(store)
+    found = []
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if match := _OWED.fullmatch(path.name):
+            with suppress(OSError, ValueError):
+                if read_json(folder / f"{match[1]}.json")["server"] == server:
+                    found.append((path, match[1]))
+    return found
+
+
+def _report(client: Any, run: str, state: str, message: str) -> None:
+    """Set how a flow run ended, unless it has an end or the server does not know it."""
+    from prefect.client.schemas.objects import State, StateType
     from prefect.exceptions import ObjectNotFound
-    from prefect.states import Crashed
 
     with suppress(ObjectNotFound):
-        state = client.read_flow_run(run).state
-        if state is None or not state.is_final():
-            client.set_flow_run_state(run, Crashed(message=message), force=True)
+        known = client.read_flow_run(run).state
+        if known is None or not known.is_final():
+            ended: Any = State(type=StateType(state), message=message)
+            client.set_flow_run_state(run, ended, force=True)
 
 
 def hooks(store: Path, server: str) -> dict[str, list[Any]]:

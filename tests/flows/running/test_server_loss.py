@@ -1,0 +1,268 @@
+"""A Prefect server that stands still, dies or cannot write while trials are taken.
+
+The store is the truth: the trials go on and are committed, one line says what happened, and the
+run's end is reported by the next command.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.running.embedded_server import EmbeddedServer
+from tests.conftest import ROOT
+from tests.flows.conftest import tiny, write
+from tests.flows.serving.serving import until
+
+END_S = 60.0
+"""Generous: a run that waits for its server takes many minutes."""
+STOP_S = 20.0
+"""Generous, too: Ctrl-C acts within 2 s, arm first; the rest is the interpreter's end."""
+LOST = "Prefect server"
+
+
+class Collection:
+    """`sliplab collect` in a process of its own, as a terminal runs it."""
+
+    def __init__(self, folder: Path, **environment: str) -> None:
+        self.store, self.log = folder / "store", folder / "messages"
+        self._environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+        if "PREFECT_HOME" not in environment:
+            self._environment.pop("PREFECT_HOME", None)
+        protocol = write(folder / "p.yaml", tiny())
+        with self.log.open("w") as messages:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "flows", "collect", str(protocol)),
+                    *("--rig", "rehearsal", "--store", str(self.store), "--json"),
+                ],
+                cwd=ROOT, env=self._environment, start_new_session=True,
+                stdout=subprocess.DEVNULL, stderr=messages,
+            )  # fmt: skip
+
+    @property
+    def committed(self) -> int:
+        """Trials in the store."""
+        trials = self.store / "campaigns" / "tiny" / "trials"
+        return len(list(trials.iterdir())) if trials.is_dir() else 0
+
+    @property
+    def server(self) -> int:
+        """The embedded server's process."""
+        for path in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                parent = int(path.read_text().rsplit(")", 1)[1].split()[1])
+                command = (path.parent / "cmdline").read_text()
+            except OSError:  # it has ended meanwhile
+                continue
+            if parent == self.process.pid and "embedded_server" in command:
+                return int(path.parent.name)
+        raise AssertionError("there is no embedded server")
+
+    def begun(self) -> None:
+        """Wait for the first trial, when the flow run has long been told to the server."""
+        until("a trial", lambda: self.committed or self.process.poll() is not None)
+        assert self.process.poll() is None, self.log.read_text()
+        assert self.committed < 6
+
+    def ends(self, limit_s: float = END_S) -> int:
+        """Wait for the end; returns the exit code."""
+        return self.process.wait(limit_s)
+
+    def lines(self) -> list[str]:
+        """What it said of the server."""
+        return [line for line in self.log.read_text().splitlines() if LOST in line]
+
+    def label(self) -> str:
+        """Run the next command; returns its messages."""
+        done = subprocess.run(
+            [sys.executable, "-m", "flows", "label", str(self.store)],
+            cwd=ROOT, env=self._environment, text=True, capture_output=True, timeout=120,
+            check=True,
+        )  # fmt: skip
+        return done.stderr
+
+
+@contextmanager
+def collecting(folder: Path, **environment: str) -> Iterator[Collection]:
+    """One collection; nothing of it is left when the block ends."""
+    folder.mkdir(exist_ok=True)
+    running = Collection(folder, **environment)
+    try:
+        yield running
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(running.process.pid, signal.SIGKILL)
+        running.process.wait(60)
+
+
+def states(database: Path) -> list[tuple[str, str]]:
+    """Name and state of each flow run that a server knows."""
+    question = "select flow.name, state_type from flow_run join flow on flow.id = flow_id"
+    with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as file:
+        return sorted(file.execute(question).fetchall())
+
+
+def stand_still(server: int) -> None:
+    """Stop it as a debugger or a frozen disk does."""
+    os.kill(server, signal.SIGSTOP)
+
+
+def die(server: int) -> None:
+    """End it as the kernel does where memory is short."""
+    os.kill(server, signal.SIGKILL)
+
+
+def fill(server: int) -> None:
+    """Let the kernel refuse every byte that it writes into a file, as on a full disk."""
+    resource.prlimit(server, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+
+
+@pytest.mark.parametrize("lose", [stand_still, die, fill])
+def test_a_campaign_goes_on_without_its_server(lose: Callable[[int], None], tmp_path: Path) -> None:
+    with collecting(tmp_path) as running:
+        running.begun()
+        lose(running.server)
+        assert running.ends() == 0, running.log.read_text()
+        assert running.committed == 6
+        assert len(running.lines()) == 1, running.log.read_text()
+        assert "Traceback" not in (log := running.log.read_text()), log
+        said = running.label()
+        assert LOST not in said
+    database = running.store / ".prefect" / "prefect.db"
+    assert ("collect", "COMPLETED") in states(database)
+    assert all(state == "COMPLETED" for _, state in states(database))
+
+
+def test_ctrl_c_acts_while_the_server_stands_still(tmp_path: Path) -> None:
+    with collecting(tmp_path) as running:
+        running.begun()
+        stand_still(running.server)
+        running.process.send_signal(signal.SIGINT)
+        assert running.ends(STOP_S) == 130, running.log.read_text()
+        assert "every committed trial is kept" in running.log.read_text()
+        assert running.committed < 6
+        running.label()
+    known = dict(states(running.store / ".prefect" / "prefect.db"))
+    assert known["collect"] == "CRASHED"
+
+
+def test_ctrl_c_acts_while_the_end_is_reported(tmp_path: Path) -> None:
+    with collecting(tmp_path) as running:
+        running.begun()
+        stand_still(running.server)
+        until("all trials", lambda: running.committed == 6 or running.process.poll() is not None)
+        running.process.send_signal(signal.SIGINT)
+        assert running.ends(STOP_S) in {0, 130}, running.log.read_text()
+
+
+@contextmanager
+def users_server(home: Path) -> Iterator[EmbeddedServer]:
+    """A server that the user has started and named."""
+    home.mkdir()
+    server = EmbeddedServer(home)
+    try:
+        yield server
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+        server.stop()
+
+
+def test_a_named_server_that_stands_still_is_reported_to_again(tmp_path: Path) -> None:
+    with (
+        users_server(tmp_path / "home") as server,
+        collecting(
+            tmp_path / "work",
+            PREFECT_API_URL=server.url,
+            PREFECT_API_AUTH_STRING=server.password,
+        ) as running,
+    ):
+        running.begun()
+        stand_still(server.pid)
+        assert running.ends() == 0, running.log.read_text()
+        assert running.committed == 6
+        assert len(running.lines()) == 1
+        os.kill(server.pid, signal.SIGCONT)
+        assert LOST not in running.label()
+        assert all(state == "COMPLETED" for _, state in states(tmp_path / "home" / "prefect.db"))
+
+
+def test_a_named_server_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{free.getsockname()[1]}/api"
+    with collecting(tmp_path, PREFECT_API_URL=url) as running:
+        assert running.ends(120) == 0, running.log.read_text()
+        assert running.committed == 6
+        (line,) = running.lines()
+        assert url.removesuffix("/api") in line
+        assert "refused" in line
+
+
+def test_a_server_that_cannot_start_is_said_with_its_cause(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "prefect.db").write_bytes(b"is no database" * 1000)
+    with collecting(tmp_path / "work", PREFECT_HOME=str(home)) as running:
+        assert running.ends(120) == 0, running.log.read_text()
+        assert running.committed == 6
+        (line,) = running.lines()
+        assert "file is not a database" in line
+        assert str(home / "server.log") in line
+
+
+def test_a_proxy_is_not_asked_for_the_loopback(tmp_path: Path) -> None:
+    dead = "http://127.0.0.1:9"
+    proxies: dict[str, Any] = dict.fromkeys(("http_proxy", "https_proxy", "all_proxy"), dead)
+    proxies |= {name.upper(): value for name, value in proxies.items()}
+    with collecting(tmp_path, **proxies, no_proxy="", NO_PROXY="") as running:
+        assert running.ends(120) == 0, running.log.read_text()
+        assert running.lines() == []
+        assert states(running.store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
+        tasks = "select count(*) from task_run where state_type = 'COMPLETED'"
+        path = running.store / ".prefect" / "prefect.db"
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as file:
+            assert file.execute(tasks).fetchone() == (1,)
+
+
+def test_closed_standard_streams_do_not_matter(tmp_path: Path) -> None:
+    """A service manager may start a program without any of them."""
+    protocol = write(tmp_path / "p.yaml", tiny())
+    command = f"{sys.executable} -m flows collect {protocol} --rig rehearsal --trials 1"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PREFECT_HOME", None)
+    for number, closed in enumerate(("<&-", ">&-", "<&- >&- 2>&-")):
+        store = tmp_path / f"store{number}"
+        done = subprocess.run(
+            ["/bin/sh", "-c", f"exec {command} --store {store} {closed}"],
+            cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert LOST not in done.stderr
+        assert states(store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
+
+
+def test_a_limit_on_the_size_of_files_is_named(tmp_path: Path) -> None:
+    began = time.monotonic()
+    protocol = write(tmp_path / "p.yaml", tiny())
+    command = f"{sys.executable} -m flows collect {protocol} --rig rehearsal --trials 1"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "none")}
+    environment.pop("PREFECT_HOME", None)
+    done = subprocess.run(
+        ["/bin/sh", "-c", f"ulimit -f 100; exec {command} --store {tmp_path / 'store'}"],
+        cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE, timeout=120, check=False,
+    )  # fmt: skip
+    assert "file size limit" in done.stderr, done.stderr
+    assert time.monotonic() - began < 110
