@@ -56,12 +56,14 @@ class AbbSocketArm:
         self._info = ""
         self._run = Run((), done=True)
         self._one = threading.Lock()
+        self._may_move = False
+        """A path was begun, and nobody has seen the arm at rest since."""
 
     def connect(self) -> None:
-        """Take the one connection and set the tool. Takes at most 6 `ANSWER_S`.
+        """Take the one connection, set the tool, see that it stands. Takes at most 7 `ANSWER_S`.
 
         Raises:
-            ArmFault: no connection, or no answer: perhaps another client has it.
+            ArmFault: no connection, no answer (perhaps another client has it), or it moves.
         """
         if self._lost is None:
             return
@@ -72,18 +74,19 @@ class AbbSocketArm:
             self._info = self._link.info(ANSWER_S)
             self._ask(Command.SET_TCP, frame.xyz_mm, quaternion(frame))
             self._ask(Command.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-            self._look()
+            self._settle(self._link)
         except RapidError as error:
-            self.close()
+            self._release()
             raise ArmFault(
                 "arm",
                 f"{error}; the server takes one client: end the other one, or check its power",
             ) from None
-        self._lost = None
+        self._lost, self._may_move = None, False
 
     def recover(self) -> None:
         """Connect again after a person has put right what stopped the arm; unlocks nothing."""
-        self.close()
+        with contextlib.suppress(ArmFault):  # connecting finds out, and says so
+            self.close()
         self.connect()
 
     def state(self) -> ArmState:
@@ -132,7 +135,7 @@ class AbbSocketArm:
             self._guard.check_joints(self._watched(lambda: self._ask(Command.JOINTS)))
         run = Run(path)
         run.thread = threading.Thread(target=self._follow, args=(run, begin), daemon=True)
-        self._run = run
+        self._run, self._may_move = run, True
         run.thread.start()
 
     def progress(self) -> Progress:
@@ -156,28 +159,69 @@ class AbbSocketArm:
     def stop(self) -> None:
         """Send no further piece and wait for the one that runs: there is no stop on this wire.
 
-        Takes at most 2 `segment_s` + `OVERTIME_S` + `ANSWER_S`.
+        Where the connection was lost, a new one is asked whether the arm stands. Takes at most
+        2 `segment_s` + `OVERTIME_S` + 4 `ANSWER_S`.
 
         Raises:
-            ArmFault: the piece that runs did not end in time.
+            ArmFault: the piece that runs did not end in time, or the arm was not seen at rest.
         """
         run = self._run
         run.cancelled = True
-        if run.thread is None or run.thread is threading.current_thread():
-            return
-        run.thread.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
-        if not run.done:
-            raise ArmFault("arm", "does not end its move: press its emergency stop")
+        if run.thread is not None and run.thread is not threading.current_thread():
+            run.thread.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
+            if not run.done:
+                raise ArmFault("arm", "does not end its move: press its emergency stop")
+        if self._may_move:
+            self._see_rest()
 
     def close(self) -> None:
-        """Send no further piece, and give the connection to the next client."""
-        with contextlib.suppress(ArmFault):
+        """Send no further piece, and give the connection to the next client.
+
+        Raises:
+            ArmFault: it was not seen at rest; the connection is given back all the same.
+        """
+        try:
             self.stop()
+        finally:
+            self._release()
+
+    def _see_rest(self) -> None:
+        """See the arm stand, by a new connection if the one there was is lost.
+
+        Raises:
+            ArmFault: it was not seen to.
+        """
+        settings = self._settings
+        try:
+            with self._one:
+                if self._lost is None:
+                    self._settle(self._link)
+                else:
+                    self._hang_up()  # the server takes one client at a time
+                    link = RapidSocket(settings.host, settings.port, ANSWER_S)
+                    try:
+                        self._settle(link)
+                    finally:
+                        link.close()
+        except RapidError as error:
+            raise ArmFault(
+                "arm",
+                f"was not seen at rest ({error}); a piece of at most {settings.segment_s:g} s may "
+                "have gone on, and no other follows it: look at it, and press its emergency stop "
+                "if it moves",
+            ) from None
+        self._may_move = False
+
+    def _release(self) -> None:
+        """Give the connection back."""
         self._lost = self._lost or "closed"
+        self._hang_up()
+        self._run.done = True
+
+    def _hang_up(self) -> None:
         link, self._link = self._link, None
         if link is not None:
             link.close()
-        self._run.done = True
 
     def _follow(self, run: Run, begin: Pose) -> None:
         """A path's thread: piece after piece."""
@@ -192,6 +236,8 @@ class AbbSocketArm:
                     break
                 run.finished.append((start_ns, time.monotonic_ns()))
                 at = segment.to
+            else:
+                self._may_move = False
         except ArmFault as error:
             run.error = error
         finally:
@@ -207,7 +253,8 @@ class AbbSocketArm:
         self._ask(Command.SET_ZONE, ZONE if pieces > 1 else FINE)
         for piece in range(1, pieces + 1):
             if run.cancelled:
-                self._settle()
+                self._settle(self._link)
+                self._may_move = False
                 return False
             if piece == pieces > 1:
                 self._ask(Command.SET_ZONE, FINE)
@@ -218,12 +265,12 @@ class AbbSocketArm:
         last = self._stream.last
         return last is not None and distance_mm(last.pose, segment.to) <= ARRIVED_MM
 
-    def _settle(self) -> None:
+    def _settle(self, link: RapidSocket | None) -> None:
         """Wait until it stands: a fly-by move is answered before its end. Raises RapidError."""
         deadline, poll = time.monotonic() + ANSWER_S, threading.Event()
         before = None
         while time.monotonic() < deadline:
-            self._look()
+            self._look(link)
             here = self._stream.last
             if before is not None and here and distance_mm(before.pose, here.pose) < STILL_MM:
                 return
@@ -231,10 +278,13 @@ class AbbSocketArm:
             poll.wait(STILL_S)
         raise RapidError("the arm does not come to rest")
 
-    def _look(self) -> None:
+    def _look(self, link: RapidSocket | None = None) -> None:
         """Ask for the pose; its time is the middle of the question. Raises RapidError."""
         asked = time.monotonic_ns()
-        values = self._ask(Command.POSE)
+        link = self._link if link is None else link
+        if link is None:
+            raise RapidError("there is no connection")
+        values = link.ask(Command.POSE, within_s=ANSWER_S)
         answered = time.monotonic_ns()
         pose = from_quaternion(values[:3], values[3:])
         self._stream.add(Sample((asked + answered) // 2, answered, pose.xyz_mm, pose.rotvec_deg))

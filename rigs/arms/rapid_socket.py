@@ -7,6 +7,7 @@ answered when the RAPID instruction returns; no stop and no time-out exist.
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import time
@@ -14,6 +15,8 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 _WORD = struct.Struct(">H")
+_UNIT_TOLERANCE = 0.01
+"""How far a rotation's quaternion may be from length 1; the server sends single floats."""
 
 
 class Command(IntEnum):
@@ -80,7 +83,7 @@ class RapidSocket:
         """The numbers of the reply to one request.
 
         Raises:
-            RapidError: refused, or no whole reply within `within_s` seconds.
+            RapidError: refused, no whole reply within `within_s` seconds, or a malformed one.
         """
         flat = [
             value
@@ -91,14 +94,21 @@ class RapidSocket:
         try:
             self._socket.sendall(_WORD.pack(command) + pack(command, flat))
             (fine,) = _WORD.unpack(self._receive(_WORD.size, deadline))
-            if fine != 1:
+            if fine not in {0, 1}:
+                raise RapidError(f"the answer to {command.name} begins with {fine}, not 0 or 1")
+            if fine == 0:
                 raise RapidError(f"the controller refused {command.name}")
             if command is Command.INFO:
                 return ()
             numbers = struct.Struct(f">{RESULTS.get(command, 0)}f")
-            return numbers.unpack(self._receive(numbers.size, deadline))
+            values = numbers.unpack(self._receive(numbers.size, deadline))
         except OSError as error:
             raise RapidError(f"no answer to {command.name}: {error}") from None
+        if not all(map(math.isfinite, values)):
+            raise RapidError(f"the answer to {command.name} holds a number that is not finite")
+        if command is Command.POSE and abs(math.hypot(*values[3:]) - 1) > _UNIT_TOLERANCE:
+            raise RapidError("the answer to POSE holds no rotation: its quaternion has no length 1")
+        return values
 
     def info(self, within_s: float) -> str:
         """What the server says of itself: text without a length, taken as it comes in one piece.

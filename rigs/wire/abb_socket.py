@@ -2,7 +2,9 @@
 
 One client at a time; a second one is taken by the network and not answered until the first has
 left. A fly-by move is answered inside its zone, so that the next one can run on from it without a
-rest; a fine-point move is answered at rest. A move that a safety stop ends is never answered.
+rest; a fine-point move is answered at rest. A move that a safety stop ends is never answered. A
+server that lost its client in a move ends that move before it takes the next one. What is not
+simulated is refused.
 """
 
 from __future__ import annotations
@@ -37,6 +39,10 @@ class RapidStandIn:
         faults: what will go wrong.
         motion: where the tool centre point is.
         clock: the controller's; one of its own, at `rate`, if left out.
+
+    Attributes:
+        speed_percent: the pendant's speed ratio, for moves that begin from now on; the server
+            does not tell it.
     """
 
     def __init__(
@@ -53,6 +59,7 @@ class RapidStandIn:
         self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
         self.faults = list(faults)
         self.tool = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.speed_percent = 100.0
         self._speed_mm_s = 10.0
         self._zone_mm = 0.0
         self._stopped = self._silent = False
@@ -84,6 +91,12 @@ class RapidStandIn:
         assert self._thread is not None
         self._thread.call(lambda: self._happen(kind))
 
+    def drop_connections(self) -> None:
+        """Cut the connections there are; new ones are taken."""
+        assert self._thread is not None
+        self._thread.call(self._connections.cut)
+        self._thread.call(self._listen)
+
     def restore(self) -> None:
         """A person has put everything right: link and safety."""
         assert self._thread is not None
@@ -108,6 +121,8 @@ class RapidStandIn:
             self._connections.cut()
         elif kind is Kind.SILENCE:
             self._silent = True
+        elif kind in {Kind.CLOCK_BACK, Kind.PACKETS_LOST}:
+            raise ValueError(f"{kind.value} is not simulated: this server tells no time")
         else:
             self._stopped = True
             self.motion.stop(ACCELERATION_MM_S2, self.clock.now_s())
@@ -121,9 +136,14 @@ class RapidStandIn:
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert self._turn is not None
         async with self._turn:
+            while self.moving() or self._stopped:
+                await self._tick()
             while True:
                 (number,) = struct.unpack(">H", await reader.readexactly(2))
                 if number == Command.CLOSE:
+                    return
+                if number not in list(Command):
+                    writer.write(_REFUSED)
                     return
                 command = Command(number)
                 layout = struct.Struct(">" + ARGUMENTS[command])
@@ -137,6 +157,8 @@ class RapidStandIn:
     async def _do(self, command: Command, values: tuple[float, ...]) -> bytes:
         if command is Command.INFO:
             return _DONE + INFO
+        if command is Command.MOVE_LINEAR and self._speed_mm_s <= 0:
+            return _REFUSED
         if command is Command.MOVE_LINEAR:
             await self._move(from_quaternion(values[:3], values[3:]))
             return _DONE
@@ -151,25 +173,28 @@ class RapidStandIn:
         elif command is Command.POSE:
             pose = self.pose()
             return _DONE + struct.pack(">7f", *pose.xyz_mm, *quaternion(pose))
-        elif command is not Command.SET_WORK_OBJECT:
-            return _REFUSED  # moves by joints and on circles are not known here
+        elif command is not Command.SET_WORK_OBJECT or values != (0, 0, 0, 1, 0, 0, 0):
+            return _REFUSED  # moves by joints and on circles, other frames: not simulated
         return _DONE
 
     async def _move(self, to: Pose) -> None:
         begin = self.pose()
-        now = self.clock.now_s()
-        if not self.motion.extend(to, self._speed_mm_s, now):
-            self.motion.move(to, self._speed_mm_s, ACCELERATION_MM_S2, now)
+        now, speed_mm_s = self.clock.now_s(), self._speed_mm_s * self.speed_percent / 100
+        if not self.motion.extend(to, speed_mm_s, now):
+            self.motion.move(to, speed_mm_s, ACCELERATION_MM_S2, now)
         zone_mm = min(self._zone_mm, distance_mm(begin, to) / 2)  # RAPID's own rule
-        loop = asyncio.get_running_loop()
         while self.moving() or self._stopped:
             here = self.pose()
             self._reach(Stage.MOVING, distance_mm(begin, here))
             if not self._stopped and 0 < distance_mm(here, to) < zone_mm:
                 return
-            tick = loop.create_future()
-            loop.call_later(_POLL_S, _end, tick)
-            await tick
+            await self._tick()
+
+    async def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        tick = loop.create_future()
+        loop.call_later(_POLL_S, _end, tick)
+        await tick
 
 
 def _end(tick: asyncio.Future[None]) -> None:

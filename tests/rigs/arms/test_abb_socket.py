@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import signal
+import socket
+import struct
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -20,6 +26,7 @@ from rigs.arms.settings import AbbSocketSettings
 from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from rigs.wire.abb_socket import HOME, RapidStandIn
 from rigs.wire.faults import Fault, Kind, Stage
+from tests.rigs.arms.conftest import closed
 from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -49,7 +56,7 @@ def pair() -> Iterator[MakePair]:
         def make(connected: bool = True, **how: Any) -> tuple[AbbSocketArm, RapidStandIn]:
             robot = stack.enter_context(RapidStandIn(own_address(), **how))
             arm = AbbSocketArm(settings(robot.host))
-            stack.callback(arm.close)
+            stack.callback(closed, arm)
             if connected:
                 arm.connect()
             return arm, robot
@@ -130,7 +137,7 @@ def test_a_move_that_is_not_answered_is_a_fault(
     until(lambda: arm.state() is ArmState.DISCONNECTED, 2.0 + BUSY_S)
     until(lambda: arm.progress().done, 1.0)
     fails(lambda: arm.start(SLIDE), 0.1, "disconnected")
-    arm.stop()
+    fails(arm.stop, 4 * driver.ANSWER_S, "was not seen at rest .* piece of at most 0.25 s may have")
     robot.restore()
     arm.recover()
     assert arm.state() is ArmState.READY
@@ -156,6 +163,85 @@ def test_a_second_client_waits_and_is_told_why(pair: MakePair) -> None:
     second.close()
 
 
+def test_a_lost_link_in_mid_motion_ends_with_its_piece(pair: MakePair) -> None:
+    arm, robot = pair()
+    arm.start([Segment(at(90.0), 40.0)])
+    until(lambda: robot.pose().xyz_mm[1] > 5.0, 5.0)
+    cut = robot.pose()
+    robot.drop_connections()
+    until(lambda: arm._run.done, BUSY_S)
+    arm.stop()  # sees it stand, over a new connection
+    assert not robot.moving()
+    assert distance_mm(cut, robot.pose()) < 40.0 * 0.25 + 1.0
+    assert arm.state() is ArmState.DISCONNECTED
+    arm.stop()
+    arm.recover()
+    assert arm.state() is ArmState.READY
+
+
+@pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.PROTECTIVE_STOP])
+def test_a_stop_that_nobody_can_confirm_is_a_fault(
+    pair: MakePair, monkeypatch: pytest.MonkeyPatch, kind: Kind
+) -> None:
+    monkeypatch.setattr(driver, "OVERTIME_S", 1.0)
+    arm, robot = pair()
+    arm.start([Segment(at(90.0), 40.0)])
+    until(lambda: robot.pose().xyz_mm[1] > 5.0, 5.0)
+    robot.happen(kind)
+    for action in (arm.stop, arm.stop, arm.close):
+        fails(action, 2.0 + 4 * driver.ANSWER_S, "was not seen at rest")
+
+
+KILLED = """
+import sys, threading
+from rigs.arms.abb_socket import AbbSocketArm
+from rigs.arms.settings import AbbSocketSettings
+from rigs.capabilities import Pose, Segment
+arm = AbbSocketArm(AbbSocketSettings.model_validate_json(sys.argv[1]))
+arm.connect()
+arm.start([Segment(Pose((400.0, 90.0, 300.0), (180.0, 0.0, 0.0)), 40.0)])
+threading.Event().wait()
+"""
+
+
+def test_an_arm_stands_a_piece_after_the_program_was_killed(pair: MakePair) -> None:
+    _, robot = pair(connected=False)
+    given = settings(robot.host).model_dump_json()
+    with subprocess.Popen([sys.executable, "-c", KILLED, given]) as process:
+        try:
+            until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)
+        finally:
+            process.send_signal(signal.SIGKILL)
+    killed = robot.pose()
+    until(lambda: not robot.moving(), BUSY_S)
+    gone_mm = distance_mm(killed, robot.pose())
+    print(f"simulated: {gone_mm:.1f} mm at 40 mm/s after the program was killed")
+    assert gone_mm < 40.0 * 0.25 + 1.0
+
+
+@pytest.mark.parametrize(
+    ("answer", "match"),
+    [
+        (struct.pack(">H7f", 1, math.nan, 0, 0, 1, 0, 0, 0), "a number that is not finite"),
+        (struct.pack(">H7f", 1, 0, 0, math.inf, 1, 0, 0, 0), "a number that is not finite"),
+        (struct.pack(">H7f", 1, 0, 0, 0, 0, 0, 0, 0), "no rotation"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "begins with 18516, not 0 or 1"),
+        (struct.pack(">H2f", 1, 0, 0), "no answer to POSE"),
+    ],
+)
+def test_an_answer_that_makes_no_sense_is_an_error(answer: bytes, match: str) -> None:
+    with socket.create_server((own_address(), 0)) as server:
+        link = RapidSocket(*server.getsockname(), 1.0)
+        try:
+            client, _ = server.accept()
+            with client:
+                client.sendall(answer)
+                with pytest.raises(RapidError, match=match):
+                    link.ask(Command.POSE, within_s=0.5)
+        finally:
+            link.close()
+
+
 def test_an_address_where_nothing_listens_is_a_fault() -> None:
     fails(AbbSocketArm(settings(own_address())).connect, driver.ANSWER_S, "no connection")
 
@@ -168,5 +254,9 @@ def test_what_the_server_refuses_is_an_error(pair: MakePair) -> None:
         assert len(link.ask(Command.JOINTS, within_s=1.0)) == 6
         with pytest.raises(RapidError, match="refused MOVE_JOINTS"):
             link.ask(Command.MOVE_JOINTS, (0.0,) * 6, within_s=1.0)
+        with pytest.raises(RapidError, match="refused SET_WORK_OBJECT"):
+            link.ask(Command.SET_WORK_OBJECT, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), within_s=1.0)
     finally:
         link.close()
+    with pytest.raises(ValueError, match="clock back is not simulated"):
+        robot.happen(Kind.CLOCK_BACK)
