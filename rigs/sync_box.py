@@ -16,7 +16,7 @@ import numpy as np
 from protocols.timing import Code
 from rigs.capabilities import DeviceHealth, RigError
 from rigs.pulse_code import SEEDS
-from rigs.sync_line import LEAST_HZ, MOST_HZ, NAME
+from rigs.sync_line import LEAST_HZ, MOST_HZ, NAME, whole
 from rigs.sync_port import DEVICE, SyncBoxFault, SyncPort, began_anew
 from rigs.sync_settings import SyncBoxSettings
 from rigs.sync_train import Losses, Train
@@ -24,6 +24,8 @@ from storage.streams import ClockReads, PulseChunk
 
 MOST_WAITING = 100_000
 """Pulses or exposures kept for who reads them: 17 minutes at 100 Hz. More are counted, not kept."""
+AHEAD_US = 1_000_000
+"""An exposure further ahead of the host's clock than this, and 2 %, is a garbled line."""
 MOST_EARLY = 1000
 """Reports kept that come before the answer to `GO`, should that have to be asked for again."""
 
@@ -48,7 +50,7 @@ class SerialSyncBox:
         self._early: list[str] = []
         self._pulses: list[int] = []
         self._exposures: list[int] = []
-        self._heard_ns = self._questions = self._clock_us = 0
+        self._asked_ns = self._heard_ns = self._questions = self._clock_us = 0
 
     def connect(self) -> None:
         """Open the port and see that a sync box answers; anew if there was a fault.
@@ -120,6 +122,7 @@ class SerialSyncBox:
             self._train = Train(millihertz, seed, code)
             self._pulses, self._exposures, self._early = [], [], []
             port.lines.wrong = 0
+            self._asked_ns = self._now_ns()
         port.ask("GO", "OK GO ")
         with port.news:
             self._heard_ns, self._running = self._now_ns(), True
@@ -227,13 +230,13 @@ class SerialSyncBox:
         train = self._train
         if kind not in {"P", "X", "D"}:
             if kind == "T":
-                int(rest.rpartition(" ")[2])  # else it is garbled, and no answer
+                whole(rest.rpartition(" ")[2])  # else it is garbled, and no answer
             elif train is not None:
                 self._begin_or_end(train, body)
             return False
         if train is None:
             return True
-        numbers = [int(word) for word in rest.split(" ")]
+        numbers = [whole(word) for word in rest.split(" ")]
         if kind == "D":
             (train.losses.told_by_box,) = numbers
         elif train.first_us is None:
@@ -247,19 +250,20 @@ class SerialSyncBox:
                 self._keep(self._pulses, since_us, train)
         else:
             number, us = numbers
-            since_us = train.exposure(number, us)
+            passed_us = (self._now_ns() - self._asked_ns) // 1000
+            since_us = train.exposure(number, us, passed_us + passed_us // 50 + AHEAD_US)
             if since_us >= 0:
                 self._keep(self._exposures, since_us, train)
         return True
 
     def _begin_or_end(self, train: Train, body: str) -> None:
         if body.startswith("OK GO ") and train.first_us is None:
-            train.first_us = int(body.removeprefix("OK GO "))
+            train.first_us = whole(body.removeprefix("OK GO "))
             early, self._early = self._early, []
             for report in early:
                 self._take(report)
         elif body.startswith("OK STOP "):
-            train.end(int(body.removeprefix("OK STOP ")))
+            train.end(whole(body.removeprefix("OK STOP ")))
 
     @staticmethod
     def _keep(waiting: list[int], us: int, train: Train) -> None:

@@ -14,6 +14,7 @@ BAUD = 500_000
 LEAST_HZ, MOST_HZ = 1.0, 1000.0
 ALL_TO_HZ = 200.0
 """Up to here the box reports every tick; above only those with a code bit 1."""
+_DIGITS = 15
 LONGEST_LINE = 80
 """Bytes; what goes on for longer without an end is no line."""
 
@@ -33,6 +34,17 @@ def unseal(line: bytes) -> str | None:
         return text.decode("ascii")
     except UnicodeDecodeError:
         return None
+
+
+def whole(word: str) -> int:
+    """The number that a word of a line writes in digits alone, as the box does.
+
+    Raises:
+        ValueError: it writes none, or one beyond 200 years in microseconds.
+    """
+    if not (word.isdecimal() and len(word) <= _DIGITS):
+        raise ValueError(f"{word!r} is no number")
+    return int(word)
 
 
 class LineReader:

@@ -95,8 +95,11 @@ class Train:
         self._next_tick = number + 1
         return since_us if bit else None
 
-    def exposure(self, number: int, us: int) -> int:
+    def exposure(self, number: int, us: int, latest_us: int) -> int:
         """An exposure's time since tick 0, us: below 0 if it began before.
+
+        Args:
+            latest_us: since tick 0, where it would be yet to come.
 
         Raises:
             ValueError: that cannot be the next exposure, nor one soon after.
@@ -104,6 +107,8 @@ class Train:
         missed = number - self._next_exposure
         if self.first_us is None or not 0 <= missed <= _MOST_MISSED or us < self._last_exposure_us:
             raise ValueError(f"exposure {number} after {self._next_exposure - 1}")
+        if us - self.first_us > latest_us:  # else every later one would come before it
+            raise ValueError(f"exposure {number} at {us} us is yet to come")
         self.losses.exposures += missed
         self._next_exposure, self._last_exposure_us = number + 1, us
         return us - self.first_us

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import get_args
 
 from protocols.timing import Code
+from rigs.pulse_code import SEEDS
 from rigs.sync_line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 from rigs.sync_train import Bits
 
@@ -216,7 +217,7 @@ class PtySyncBox:
         command, _, rest = body.partition(" ")
         if body == "ID?":
             self._say(f"ID {NAME}")
-        elif command == "T?":
+        elif command == "T?" and rest.isdecimal():
             self._say(f"T {rest} {self._us()}")
         elif command == "ARM":
             self._arm(rest.split(" "))
@@ -243,6 +244,8 @@ class PtySyncBox:
             self._say("E running")
         elif not LEAST_HZ <= float(hz) <= MOST_HZ:
             self._say("E rate must be 1 to 1000 Hz")
+        elif not 1 <= int(seed) <= SEEDS:
+            self._say("E seed must be 1 to 65535")
         elif code not in CODES:
             self._say("E code must be lfsr, irregular or regular")
         else:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import threading
 import time
+import tty
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -15,7 +18,7 @@ from rigs.capabilities import RigError, SyncBox
 from rigs.pulse_code import code_bits
 from rigs.sync_box import SerialSyncBox
 from rigs.sync_line import LineReader, seal, unseal
-from rigs.sync_port import TRIES, SyncBoxFault
+from rigs.sync_port import JOIN_S, TRIES, SyncBoxFault
 from rigs.sync_settings import SyncBoxSettings
 from rigs.sync_train import Train
 from rigs.wire.sync_box import PtySyncBox
@@ -291,7 +294,13 @@ def test_what_the_box_refuses_is_said(
         box.start(100.0, SEED)
 
 
-@pytest.mark.parametrize("line", [b"ARM\n", seal("ARM 100"), seal("ARM x 1 0 lfsr"), seal("FLY")])
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"ARM\n", seal("ARM 100"), seal("ARM x 1 0 lfsr"), seal("ARM 100 0 0 lfsr"),
+        seal("ARM 100 65536 0 lfsr"), seal("FLY"), seal("T?"), seal("T? x"),
+    ],
+)  # fmt: skip
 def test_the_stand_in_survives_nonsense(wire: PtySyncBox, box: SerialSyncBox, line: bytes) -> None:
     with serial.Serial(wire.port, timeout=1.0) as port:
         port.write(line)
@@ -343,6 +352,117 @@ def test_closing_twice_and_before_opening(box: SerialSyncBox) -> None:
     box.close()
 
 
+CHATTER = {
+    "bytes": os.urandom(997),
+    "no line feed": b"x" * 997,
+    "lines": b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M*47\r\n",
+    "sealed lines": seal("P 1 1 10000") + seal("HELLO") + seal("E checksum"),
+    "empty lines": b"\n" * 500,
+}
+
+
+@pytest.mark.parametrize("what", list(CHATTER))
+def test_a_foreign_device_that_chatters_without_end_is_no_sync_box(what: str) -> None:
+    """And gives its port back, within the bound that a silent one has."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    ending = threading.Event()
+
+    def chatter() -> None:
+        while not ending.wait(0.0005):
+            with contextlib.suppress(BlockingIOError):
+                os.write(master, CHATTER[what])
+            with contextlib.suppress(BlockingIOError):
+                os.read(master, 4096)
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    found = SyncBoxSettings(port=os.ttyname(slave), answer_s=ANSWER_S, boot_s=0.5)
+    before = threading.active_count()
+    try:
+        begin = time.monotonic()
+        with pytest.raises(SyncBoxFault, match="no answer on"):
+            SerialSyncBox(found).connect()
+        assert time.monotonic() - begin < 0.5 + ANSWER_S + JOIN_S + SLACK_S
+        assert threading.active_count() == before
+    finally:
+        ending.set()
+        thread.join(5.0)
+        os.close(slave)
+        os.close(master)
+
+
+def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
+    wire: PtySyncBox, box: SerialSyncBox
+) -> None:
+    box.start(200.0, SEED)
+    pulses_of(box, 5)
+    wire._say = lambda body: os.write(wire._master, b"no line at all\n") and None  # type: ignore[method-assign]
+    assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
+    assert box.losses.lines > 10
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["X 0 99999999999999999999", "X 1 ", "X 1 -5", "X 1 1_000", "X 0 9999999999", "P", "P 1 1",
+     "P -1 1 10000", "D x", "D -3", "D 1 2", "OK STOP -1", "T 1 1e3", "X 0 0x10"],
+)  # fmt: skip
+def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
+    wire: PtySyncBox, box: SerialSyncBox, line: str
+) -> None:
+    box.start(200.0, SEED)
+    pulses_of(box, 3)
+    wire._say(line)
+    before = len(box.read_exposures())
+    exposures = gather(lambda: box.read_exposures().t_ns, lambda found: len(found) >= 20)
+    assert np.all(np.diff(exposures) == 5_000_000)
+    assert exposures[0] == before * 5_000_000 + 77_000 or before == 0
+    pulses_of(box, 10)
+    box.stop()
+    losses = box.losses
+    assert (losses.pulses, losses.exposures, losses.told_by_box, losses.lines) == (0, 0, 0, 1)
+
+
+@pytest.mark.parametrize("us", ["999999999", "99999999999999", "99999999999999999999"])
+def test_a_garbled_exposure_far_ahead_costs_one(
+    wire: PtySyncBox, box: SerialSyncBox, us: str
+) -> None:
+    """Believed, it would come after all that follow, and none of them could be."""
+    say = wire._say
+
+    def garble_fifth(body: str) -> None:
+        say(f"X 5 {us}" if body.startswith("X 5 ") else body)
+
+    wire._say = garble_fifth  # type: ignore[method-assign]
+    box.start(200.0, SEED)
+    exposures = gather(lambda: box.read_exposures().t_ns, lambda found: len(found) >= 20)
+    box.stop()
+    numbers = (exposures - 77_000) // 5_000_000
+    assert numbers.tolist() == [n for n in range(len(numbers) + 1) if n != 5]
+    assert (box.losses.exposures, box.losses.lines) == (1, 1)
+
+
+def test_a_clock_that_falls_back_in_a_train_ends_it(box: SerialSyncBox) -> None:
+    """Of a board whose 32 bits of microseconds wrap after 71.6 min, say."""
+    shift = [0]
+    with PtySyncBox(lambda: time.monotonic_ns() - shift[0]) as wire:
+        box = SerialSyncBox(settings(wire))
+        threading.Event().wait(0.3)
+        box.start(200.0, SEED)
+        pulses_of(box, 5)
+        box.read_clock()
+        shift[0] = 250_000_000
+        assert "fell back by 0.2" in fault_of(box.read_clock, 0.1)
+        assert "began anew" in fault_of(box.read_pulses, 0.1)
+        shift[0] = 0
+        box.start(200.0, SEED)
+        pulses_of(box, 5)
+        shift[0] = 4_294_967_296_000  # nobody reads the clock: no tick is due any more
+        assert "no pulse reported" in fault_of(box.read_pulses, 0.08 + SILENCE_S)
+        box.close()
+
+
 # -- lines and trains --------------------------------------------------------------------------
 
 
@@ -381,9 +501,10 @@ def test_a_garbled_report_that_passes_the_checksum_is_no_tick(
 def test_exposures_out_of_order_are_refused() -> None:
     train = Train(100_000, 1, "lfsr")
     train.first_us = 1000
-    assert train.exposure(0, 900) == -100
-    assert train.exposure(3, 2000) == 1000
+    assert train.exposure(0, 900, 5000) == -100
+    assert train.exposure(3, 2000, 5000) == 1000
     assert train.losses.exposures == 2
-    for number, us in ((3, 2001), (4, 1999), (50_000, 2001)):
+    for number, us in ((3, 2001), (4, 1999), (50_000, 2001), (4, 6001)):
         with pytest.raises(ValueError, match="exposure"):
-            train.exposure(number, us)
+            train.exposure(number, us, 5000)
+    assert train.exposure(4, 6000, 5000) == 5000
