@@ -11,7 +11,8 @@ dropped_on_purpose, dropped_noticed: in a second, short run the stand-in drops f
 those missing in the file's frame numbers that the driver counted too.
 memory_growth_mb: of this process, from its most in the first fifth of the run to its most of all;
 memory_end_growth_mb: from the median of the first fifth to that of the last.
-cores: processor time of this process, all drivers, pylon's emulation and writing, over time.
+cores: processor time of this process, drivers, pylon's emulation and writing, over time; that of
+dv-processing, which has a process of its own, is not in it.
 loop_max_ms: the longest time between two looks of the loop that reads and writes; queued_max_ms:
 how much of that it waited for a processor that others had.
 saturation_x_realtime: frames a second that the spool takes by itself, until they are on the disk,

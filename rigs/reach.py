@@ -7,7 +7,10 @@ import socket
 from collections.abc import Callable
 
 from rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
+from rigs.cameras.basler import look_for_camera
+from rigs.cameras.event_source import find_camera, greet
 from rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
+from rigs.capabilities import RigError
 from rigs.devices import DeviceSettings
 from rigs.sync_settings import SyncBoxSettings
 
@@ -32,6 +35,8 @@ def reach(devices: DeviceSettings) -> dict[str, str | None]:
     for name, look in looks.items():
         try:
             found[name] = look()
+        except RigError as error:
+            found[name] = str(error).removeprefix(f"{error.device}: ")
         except Exception as error:  # a maker's library may raise anything
             found[name] = str(error) or type(error).__name__
     return found
@@ -56,23 +61,15 @@ def _listens(host: str, port: int) -> str | None:
 def _event_camera(settings: DvxplorerSettings) -> str | None:
     source = settings.source
     if isinstance(source, NetworkStream):
-        return _listens(source.host, source.events_port)
-    import dv_processing as dv
-
-    there = [str(camera) for camera in dv.io.camera.discover()]
-    if not there or (source.serial and not any(source.serial in name for name in there)):
-        wanted = f"serial {source.serial}" if source.serial else "a camera"
-        return f"{wanted} was not found; there: {', '.join(there) or 'none'}; look at its cable"
+        greet(source.host, source.events_port)
+        greet(source.host, source.triggers_port)
+    else:
+        find_camera(source.serial)
     return None
 
 
 def _frame_camera(settings: BaslerSettings) -> str | None:
-    from pypylon import pylon
-
-    there = [info.GetSerialNumber() for info in pylon.TlFactory.GetInstance().EnumerateDevices()]
-    if not there or (settings.serial and settings.serial not in there):
-        wanted = f"serial {settings.serial}" if settings.serial else "a camera"
-        return f"{wanted} was not found; there: {', '.join(there) or 'none'}; look at its cable"
+    look_for_camera(settings.serial)
     return None
 
 

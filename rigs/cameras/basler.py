@@ -30,25 +30,45 @@ _LEAST_BUFFERS = 8
 _END_OF_EXPOSURE = "EventExposureEndData"
 
 
-def find_camera(serial: str | None) -> Any:
-    """An `InstantCamera` of pypylon that is not open yet.
+def look_for_camera(serial: str | None, device_class: str | None = None) -> Any:
+    """pylon's description of a camera that is plugged in; nothing is opened.
+
+    Args:
+        device_class: of pylon's, such as `BaslerCamEmu`; any where None.
 
     Raises:
-        RigError: no camera, or none with this serial number.
+        RigError: no camera, none with this serial number, or several to choose from.
+    """
+    from pypylon import pylon
+
+    found = [
+        info
+        for info in pylon.TlFactory.GetInstance().EnumerateDevices()
+        if device_class in (None, info.GetDeviceClass())
+    ]
+    fitting = [info for info in found if serial in (None, info.GetSerialNumber())]
+    if len(fitting) == 1:
+        return fitting[0]
+    there = ", ".join(info.GetSerialNumber() for info in found) or "none"
+    if fitting:
+        raise RigError(DEVICE, f"there are several: {there}; name one by serial")
+    wanted = "no camera" if serial is None else f"no camera with serial number {serial}"
+    raise RigError(DEVICE, f"{wanted}; found: {there}. Look at its cable and its power")
+
+
+def find_camera(serial: str | None, device_class: str | None = None) -> Any:
+    """An `InstantCamera` of pypylon that is not open yet; see `look_for_camera`.
+
+    Raises:
+        RigError: it is not there, not the only one, or another program has it.
     """
     from pypylon import genicam, pylon
 
-    factory = pylon.TlFactory.GetInstance()
-    found = factory.EnumerateDevices()
-    for info in found:
-        if serial is None or info.GetSerialNumber() == serial:
-            try:
-                return pylon.InstantCamera(factory.CreateDevice(info))
-            except genicam.GenericException as error:
-                raise RigError(DEVICE, f"{info.GetFriendlyName()}: {error}") from None
-    there = ", ".join(info.GetSerialNumber() for info in found) or "none"
-    wanted = "no camera" if serial is None else f"no camera with serial number {serial}"
-    raise RigError(DEVICE, f"{wanted}; found: {there}. Look at its cable and its power")
+    info = look_for_camera(serial, device_class)
+    try:
+        return pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateDevice(info))
+    except genicam.GenericException as error:
+        raise RigError(DEVICE, f"{info.GetFriendlyName()}: {error}") from None
 
 
 class BaslerCamera:

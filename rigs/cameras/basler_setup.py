@@ -88,6 +88,8 @@ def write_settings(nodes: Nodes, settings: BaslerSettings) -> None:
     nodes.select("GainSelector", "All", "AnalogAll")
     if nodes.has("Gain"):
         nodes.put(settings.gain_db, "Gain")
+    elif settings.gain_db:
+        raise RigError(DEVICE, f"gain_db = {settings.gain_db:g}: this camera has no Gain in dB")
     # the emulation keeps both names and obeys the older one
     nodes.put(settings.exposure_us, "ExposureTime", "ExposureTimeAbs")
     _write_lines(nodes, settings)

@@ -201,20 +201,24 @@ def find_camera(serial: str | None) -> Any:
     """The descriptor of a DVXplorer that is plugged in.
 
     Raises:
-        RigError: none, or none with this serial number; with all that are there.
+        RigError: none, none with this serial number, or several to choose from; with all that are
+            there.
     """
     import dv_processing as dv
 
     found = dv.io.camera.discover()
     kind = dv.io.camera.CameraModel.DVXPLORER
-    for camera in found:
-        if camera.cameraModel == kind and serial in (None, camera.serialNumber):
-            return camera
+    fitting = [c for c in found if c.cameraModel == kind and serial in (None, c.serialNumber)]
+    if len(fitting) == 1:
+        return fitting[0]
     there = ", ".join(f"{_plain(camera.cameraModel)} {camera.serialNumber}" for camera in found)
-    wanted = "no DVXplorer" if serial is None else f"no DVXplorer with serial number {serial}"
+    if fitting:
+        raise RigError(DEVICE, f"there are several: {there}; name one by source.serial")
+    wanted = "a DVXplorer" if serial is None else f"a DVXplorer with serial number {serial}"
     raise RigError(
         DEVICE,
-        f"{wanted}; found: {there or 'none'}. Look at its cable, and at iniVation's udev rules",
+        f"{wanted} was not found; there: {there or 'none'}. Look at its cable, and at iniVation's "
+        "udev rules",
     )
 
 

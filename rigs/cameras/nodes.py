@@ -47,8 +47,8 @@ class Nodes:
         return self.has(name) and choice in self._map.GetNode(name).Symbolics
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """Values that an enumeration may be set to now; none where it cannot be set."""
-        return tuple(self._map.GetNode(name).Symbolics) if self.has(name) else ()
+        """Values that an enumeration may be set to now; none where it is none or cannot be set."""
+        return tuple(getattr(self._map.GetNode(name), "Symbolics", ())) if self.has(name) else ()
 
     def select(self, name: str, *choices: str) -> None:
         """Set a selector to the first of `choices` that it offers; left alone where it has none."""
@@ -106,7 +106,14 @@ class Nodes:
             try:
                 self._map.GetNode(name).Value = value
             except self._genicam.GenericException as error:
-                raise RigError(DEVICE, f"{name} = {value}: {_short(error)}") from None
+                raise RigError(DEVICE, f"{name} = {value}: {self._why(name, error)}") from None
+
+    def _why(self, name: str, error: Exception) -> str:
+        """Why a value is refused; of an enumeration pylon says no more than its name."""
+        choices, text = self.choices(name), _short(error)
+        if choices and text.startswith("Feature "):
+            return f"this camera has {', '.join(choices)}"
+        return text
 
     def put_near(self, value: float, name: str) -> None:
         """Set a number as near to `value` as it goes, if it is there. Raises RigError."""

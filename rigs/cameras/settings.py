@@ -22,7 +22,7 @@ class BaslerSettings(StrictModel):
 
     driver: Literal["basler"] = "basler"
     serial: str | None = None
-    """Serial number; the first camera found where none is given."""
+    """Serial number; the only camera where none is given."""
     px_per_mm: float | None = Field(default=None, gt=0, le=1000)
     """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
     exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
@@ -83,7 +83,7 @@ class UsbCamera(StrictModel):
 
     kind: Literal["usb"] = "usb"
     serial: str | None = None
-    """Serial number; the first camera found where none is given."""
+    """Serial number; the only DVXplorer where none is given."""
     readout: Readout = "constant 1000"
     """Scans a second; at a constant rate every pixel's time is regular (docs/clocks.md)."""
     contrast_on: int | None = Field(default=None, ge=0, le=255)

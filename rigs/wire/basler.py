@@ -19,7 +19,8 @@ from rigs.scene.frames import FrameOptics, PlateView
 from storage.streams import U8
 
 VARIABLE = "PYLON_CAMEMU"
-_CLASS = "BaslerCamEmu"
+EMULATED = "BaslerCamEmu"
+"""pylon's class of devices that are not there."""
 
 
 def emulate(cameras: int = 1) -> None:
@@ -32,7 +33,7 @@ def emulate(cameras: int = 1) -> None:
     from pypylon import pylon
 
     found = pylon.TlFactory.GetInstance().EnumerateDevices()
-    there = sum(info.GetDeviceClass() == _CLASS for info in found)
+    there = sum(info.GetDeviceClass() == EMULATED for info in found)
     if there < cameras:
         raise RuntimeError(f"{there} emulated cameras instead of {cameras}: pylon began before")
 

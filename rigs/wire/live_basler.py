@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from rigs.cameras.basler import find_camera
-from rigs.wire.basler import emulate
+from rigs.wire.basler import EMULATED, emulate
 from rigs.wire.basler_nodes import Command, NodeMap, ReadOnly, Selected, Setting
 from storage.streams import U8, FrameChunk
 
@@ -75,7 +75,8 @@ class LiveBasler:
         stored: Mapping[str, Any] | None = None,
     ) -> None:
         emulate(1)
-        self._device = find_camera(None)
+        # never the real one of this computer
+        self._device = find_camera(None, EMULATED)
         self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
         self._coming: deque[_Frame | None] = deque()
         self._came = threading.Condition()

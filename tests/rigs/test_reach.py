@@ -11,6 +11,7 @@ import pytest
 
 from rigs.devices import DeviceSettings
 from rigs.reach import reach
+from rigs.wire.live_dvxplorer import LiveDvxplorer
 from tests.rigs.loopback import own_address
 
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
@@ -43,18 +44,41 @@ def test_what_is_not_there_is_named_with_what_to_look_at() -> None:
     assert "was not found" in (found["event camera"] or "")
 
 
-def test_an_arm_and_a_stream_that_answer_are_reached(listening: tuple[str, int]) -> None:
+def stream(events_port: int, triggers_port: int) -> dict[str, Any]:
+    """An event camera on the network."""
+    ports = {"events_port": events_port, "triggers_port": triggers_port}
+    return {"source": {"kind": "network", "host": "127.0.0.1", **ports}}
+
+
+def test_an_arm_and_streams_that_answer_are_reached(listening: tuple[str, int]) -> None:
     host, port = listening
-    found = reach(
-        devices(
-            arm={"driver": "abb_socket", "host": host, "port": port, "limits": LIMITS},
-            event_camera={
-                "source": {"kind": "network", "host": host, "events_port": port, "triggers_port": 1}
-            },
+    camera = LiveDvxplorer((640, 480))
+    try:
+        found = reach(
+            devices(
+                arm={"driver": "abb_socket", "host": host, "port": port, "limits": LIMITS},
+                event_camera=stream(*camera.ports),
+            )
         )
-    )
+    finally:
+        camera.close()
     assert found["arm"] is None
     assert found["event camera"] is None
+
+
+def test_a_stream_without_its_other_or_a_silent_port_is_not_reached() -> None:
+    camera = LiveDvxplorer((640, 480))
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        number = silent.getsockname()[1]
+        try:
+            half = reach(devices(event_camera=stream(camera.ports[0], 1)))["event camera"]
+            mute = reach(devices(event_camera=stream(camera.ports[0], number)))["event camera"]
+        finally:
+            camera.close()
+    assert half is not None
+    assert half.startswith("127.0.0.1:1: ")
+    assert mute is not None
+    assert mute.startswith(f"127.0.0.1:{number}: no answer within 2 s")
 
 
 def test_a_port_is_reached_and_a_rig_without_one_is_told() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from rigs.cameras.basler import BaslerCamera, find_camera
+from rigs.cameras.nodes import Nodes
 from rigs.cameras.settings import BaslerSettings
 from rigs.capabilities import RigError
 from rigs.wire.live_basler import LiveBasler
@@ -206,3 +209,25 @@ def test_settings_that_cannot_be_are_refused_before_a_camera_is_looked_for(
 ) -> None:
     with pytest.raises(ValidationError, match=message):
         BaslerSettings(**settings)
+
+
+def test_a_value_that_a_setting_does_not_have_is_named_with_those_that_it_has() -> None:
+    with opened(emulated(), **HARDWARE) as camera:
+        nodes = Nodes(camera.device.GetNodeMap())
+        with pytest.raises(RigError, match="PixelFormat = Mono99: this camera has Mono8, Mono10,"):
+            nodes.put("Mono99", "PixelFormat")
+        with pytest.raises(RigError, match=r"Gain = 99.0: Value 99.* must be smaller .* 48"):
+            nodes.put(99.0, "Gain")
+
+
+def test_of_several_cameras_one_must_be_named() -> None:
+    code = (
+        "from rigs.wire.basler import emulate; emulate(2); "
+        "from rigs.cameras.basler import look_for_camera; "
+        "print(look_for_camera('0815-0001').GetSerialNumber()); look_for_camera(None)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout == "0815-0001\n"
+    assert "there are several: 0815-0000, 0815-0001; name one by serial" in done.stderr

@@ -178,8 +178,8 @@ def test_a_packet_that_never_ends_is_silence(until: Until) -> None:
 @pytest.mark.parametrize(
     ("serial", "message"),
     [
-        (None, "event camera: no DVXplorer; found: none. Look at its cable"),
-        ("DXA00001", "no DVXplorer with serial number DXA00001; found: none"),
+        (None, "event camera: a DVXplorer was not found; there: none. Look at its cable"),
+        ("DXA00001", "a DVXplorer with serial number DXA00001 was not found; there: none"),
     ],
 )
 def test_no_camera_on_usb_is_named(serial: str | None, message: str) -> None:
@@ -196,11 +196,12 @@ def test_the_cameras_that_are_there_are_named(monkeypatch: pytest.MonkeyPatch) -
         SimpleNamespace(cameraModel=models.DVXPLORER, serialNumber="DXA00001"),
         SimpleNamespace(cameraModel=models.DVXPLORER, serialNumber="DXA00002"),
     ]
+    all_of_them = "davis 00000008, dvxplorer DXA00001, dvxplorer DXA00002"
     monkeypatch.setattr(dv.io.camera, "discover", lambda: there)
-    assert find_camera(None) is there[1]  # not the first one, which is none
     assert find_camera("DXA00002") is there[2]
-    with pytest.raises(
-        RigError,
-        match="serial number DXA9; found: davis 00000008, dvxplorer DXA00001, dvxplorer DXA00002",
-    ):
+    with pytest.raises(RigError, match=f"number DXA9 was not found; there: {all_of_them}"):
         find_camera("DXA9")
+    with pytest.raises(RigError, match=f"several: {all_of_them}; name one by source.serial"):
+        find_camera(None)
+    monkeypatch.setattr(dv.io.camera, "discover", lambda: there[:2])
+    assert find_camera(None) is there[1]  # not the first one, which is none
