@@ -12,7 +12,7 @@ import difflib
 import os
 import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import date
 from decimal import Decimal
 from functools import cache
@@ -23,7 +23,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from protocols.errors import InputError
-from protocols.shown import MASK, holds_secret
+from protocols.shown import MASK, holds_secret, is_secret
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
@@ -294,6 +294,40 @@ def parse_yaml(text: str, path: str | Path) -> Document:
         found = "nothing" if data is None else f"a {type(data).__name__}"
         raise InputError(path, "", None, f"holds {found} where a mapping (key: value) belongs")
     return Document(data, builder.written)
+
+
+def mask_secrets(text: str) -> str:
+    """YAML text with the values of secret keys masked, at any depth; the rest stays as it is."""
+    loader = _Loader(text)
+    try:
+        root = loader.get_single_node()
+    finally:
+        loader.dispose()
+    found = sorted(_secret_values(root), key=lambda node: -node.start_mark.index)
+    for node in found:
+        begin, end = node.start_mark.index, node.end_mark.index
+        line_end = "\n" if text[begin:end].endswith("\n") else ""
+        text = f'{text[:begin]}"{MASK}"{line_end}{text[end:]}'
+    return text
+
+
+def _secret_values(node: Any) -> Iterator[Any]:
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    for key, value in pairs:
+        if isinstance(key.value, str) and is_secret(key.value):
+            if value.value not in ("", MASK):
+                yield value
+        else:
+            yield from _secret_values(value)
+    for item in node.value if isinstance(node, yaml.SequenceNode) else []:
+        yield from _secret_values(item)
+
+
+def without_secrets(data: Any) -> Any:
+    """Plain data without the keys that hold secrets, at any depth."""
+    if isinstance(data, dict):
+        return {key: without_secrets(part) for key, part in data.items() if not is_secret(key)}
+    return [without_secrets(part) for part in data] if isinstance(data, list) else data
 
 
 def validate(model: type[ModelT], data: dict[str, Any], path: str | Path) -> ModelT:

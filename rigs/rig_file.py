@@ -14,8 +14,16 @@ from protocols.hashing import hash_text
 from protocols.plan import Plan
 from protocols.program import Move
 from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
+from protocols.shown import MASK
 from protocols.timing import Timing
-from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, validate
+from protocols.yaml_file import (
+    KeyedError,
+    StrictModel,
+    mask_secrets,
+    parse_yaml,
+    validate,
+    without_secrets,
+)
 from rigs.arms.settings import check_units
 from rigs.calibration import Calibration, without_taught
 from rigs.devices import DeviceSettings
@@ -239,6 +247,7 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
         if rig.devices is not None and not stored:
             try:
                 check_units(rig.devices.arm)
+                _check_password(rig)
             except KeyedError as error:
                 raise InputError(found.path, error.key, error.value, str(error)) from None
         return rig, found.text
@@ -246,20 +255,27 @@ def load_rig_file(path: Path, *, stored: bool = False) -> tuple[RigFile, str]:
         raise error.in_file(found.blame(error.key)) from None
 
 
+def _check_password(rig: RigFile) -> None:
+    arm = None if rig.devices is None else rig.devices.arm
+    if not rig.simulated and getattr(arm, "password", None) == MASK:
+        text = "is masked in a store's copy of a rig file: write the rig's own"
+        raise KeyedError("devices.arm.password", MASK, text)
+
+
 def rig_hash(text: str) -> str:
-    """Hash of a rig file's content, as `load_rig_file` gives it."""
-    return hash_text(text)
+    """Hash of a rig file's content, as `load_rig_file` gives it, whatever its passwords are."""
+    return hash_text(mask_secrets(text))
 
 
 def same_rig(one: str, other: str) -> bool:
     """Whether two contents of rig files describe one rig.
 
     The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
-    ended goes on without it. So does one whose plate was taught anew.
+    ended goes on without it. So does one whose plate was taught anew, or whose password is another.
     """
     if one == other:
         return True
-    first, second = (parse_yaml(text, "rig.yaml") for text in (one, other))
+    first, second = (without_secrets(parse_yaml(text, "rig.yaml")) for text in (one, other))
     for data in (first, second):
         if isinstance(data.get("mock"), dict):
             data["mock"].pop("faults", None)

@@ -18,7 +18,7 @@ from flows.labelling.label import label
 from flows.labelling.label_errors import CHECK, rules_compared
 from flows.planning.orders import Order, make_order
 from flows.running.campaigns import collected
-from protocols.yaml_file import parse_yaml
+from protocols.yaml_file import mask_secrets, parse_yaml
 from rigs.rig_inheritance import rig_yaml
 from storage.derived import Derived, make_key
 from storage.files import write_text
@@ -40,7 +40,7 @@ def video_order(order: Order, trials: int) -> Order:
         order: the study's own, of which something was collected.
     """
     folder = folder_of(order)
-    data = parse_yaml(order.rig_text, "rig file")
+    data = parse_yaml(mask_secrets(order.rig_text), "rig file")
     data["name"] = f"{order.rig.name}-video"
     data.setdefault("mock", {}).setdefault("frame_camera", {})["level"] = "video"
     rig = folder.with_suffix(".yaml")

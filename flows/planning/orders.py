@@ -12,7 +12,7 @@ from typing import Any
 from flows.planning.changes import told
 from flows.planning.estimate import check_space, plan_bytes
 from protocols import InputError, Plan, Trial, load_plan
-from protocols.yaml_file import parse_yaml, read_text
+from protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from rigs.levels import at_level, with_level
 from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
 from storage.decisions import skipped
@@ -136,7 +136,8 @@ def _changed(order: Order, campaign: Campaign) -> str:
 def _rig_changed(order: Order, campaign: Campaign) -> str:
     """What differs from the campaign's own copy of its rig file."""
     old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
-    changes = told(old, parse_yaml(order.rig_text, "rig file"))
+    new = parse_yaml(order.rig_text, "rig file")
+    changes = told(without_secrets(old), without_secrets(new))
     return f" What changed:{changes}" if changes else ""
 
 
@@ -196,7 +197,8 @@ def describe_campaign(store: Store, order: Order) -> Campaign:
         "scene_level": order.rig.scene.scene.level if order.rig.simulated else None,
         "enabled": list(order.enable),
     }
-    campaign.update(info, read_text(Path(order.plan.file), "protocol"), order.rig_text)
+    protocol_text = read_text(Path(order.plan.file), "protocol")
+    campaign.update(info, protocol_text, mask_secrets(order.rig_text))
     return campaign
 
 

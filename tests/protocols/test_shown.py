@@ -15,7 +15,9 @@ from pydantic import BaseModel
 from protocols.errors import InputError
 from protocols.model import Protocol
 from protocols.shown import MASK, is_secret, printable, shown, shown_key
+from protocols.yaml_file import mask_secrets, parse_yaml, without_secrets
 from rigs.rig_file import RigFile
+from tests.conftest import ROOT
 
 SECRETS = [
     "password", "passwrd", "pasword", "passord", "paswrd", "Passwort", "pass", "pwd", "passphrase",
@@ -107,3 +109,26 @@ def test_long_text_is_shown_at_once() -> None:
     for text in ("x" * 10**6, "a: " * 300_000, "://" * 300_000, "a" * 10**6 + ": b"):
         assert len(shown(text)) == 80
         assert len(shown_key(text)) <= 1000
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "hunter2", "'hunter2'", '"hunter2"', "|-\n    hunter2\n    hunter2", ">\n    hunter2",
+        "hunter2 hunter2", "!!str hunter2", "12345", "[hunter2, 1]", "{a: hunter2}", "&x hunter2",
+    ],
+)  # fmt: skip
+def test_a_file_without_its_secrets(value: str) -> None:
+    text = f"# a rig\narm:\n  passwrd: {value}\n  port: 5  # kept\nlist: [{{token: {'7' * 9}}}]\n"
+    assert mask_secrets(text) == (
+        f'# a rig\narm:\n  passwrd: "{MASK}"\n  port: 5  # kept\nlist: [{{token: "{MASK}"}}]\n'
+    ).replace("!", "")
+    assert mask_secrets(mask_secrets(text)) == mask_secrets(text)
+    read = without_secrets(parse_yaml(mask_secrets(text), "rig.yaml"))
+    assert read == {"arm": {"port": 5}, "list": [{}]}
+
+
+def test_a_file_without_secrets_stays_as_it_is() -> None:
+    for path in (*(ROOT / "rigs").glob("*.yaml"), *(ROOT / "protocols").glob("*.yaml")):
+        if path.stem != "irb120":
+            assert mask_secrets(path.read_text()) == path.read_text()

@@ -9,11 +9,15 @@ from pathlib import Path
 import pytest
 
 from flows.collecting.stretch import owned
+from flows.planning.orders import describe_campaign, make_order
 from flows.running import console
+from protocols import InputError
+from rigs.rig_file import load_rig_file, rig_hash
 from storage.files import read_json
 from storage.process import this_process
 from storage.secrets import MASK, masked
-from storage.store import Store
+from storage.store import Store, StoreError
+from tests.conftest import ROOT
 from tests.storage.trials import campaign, commit
 
 SECRET = "marked-secret-7f3a"
@@ -62,3 +66,53 @@ def test_nothing_of_it_stays_in_a_store(
     kept = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert kept
     assert not [path for path in kept if SECRET.encode() in path.read_bytes()]
+
+
+def abb(folder: Path, password: str, **more: str) -> Path:
+    """A rig file with a login of its own, and other values by what they replace."""
+    text = (ROOT / "rigs" / "irb120.yaml").read_text()
+    text = text.replace("extends: ur5.yaml", f"extends: {ROOT}/rigs/ur5.yaml")
+    text = text.replace("password: robotics", f"password: {password}  # of anna")
+    for new, old in more.items():
+        text = text.replace(old, f"{new}: x")
+    folder.mkdir(exist_ok=True)
+    path = folder / "rig.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
+    protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
+    order = make_order(protocol, abb(tmp_path / "lab", SECRET), store.folder)
+    assert SECRET in order.rig_text
+    assert order.rig.devices is not None
+    assert SECRET not in repr(order.rig)
+    where = describe_campaign(store, order)
+    kept = [path for path in tmp_path.rglob("*") if path.is_file() and "lab" not in path.parts]
+    assert len(kept) > 3
+    assert not [path for path in kept if SECRET.encode() in path.read_bytes()]
+    copy = where.folder / "rig.yaml"
+    known, text = load_rig_file(copy, stored=True)
+    assert known.model_copy(update={"devices": None}) == order.rig.model_copy(
+        update={"devices": None}
+    )
+    assert rig_hash(text) == where.info["rig_hash"]
+    with pytest.raises(InputError, match=r"arm\.password = \*\*\*\*: .* the rig's own"):
+        load_rig_file(copy)  # it would not log in
+
+
+def test_another_password_is_no_other_rig(tmp_path: Path) -> None:
+    protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
+    order = make_order(protocol, abb(tmp_path / "lab", SECRET), store.folder)
+    campaign = describe_campaign(store, order)
+    make_order(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
+    # a store of before, with the password in its copy
+    info = {**campaign.info, "rig_hash": "0" * 64}
+    campaign.update(info, protocol.read_text(), order.rig_text)
+    make_order(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
+    wrong = abb(tmp_path / "lab", "another-one", sensor="name: irb120 ")
+    with pytest.raises(StoreError) as caught:
+        make_order(protocol, wrong, store.folder)
+    assert "sensor: sensor-1 -> x" in str(caught.value)
+    assert SECRET not in str(caught.value)
+    assert "another-one" not in str(caught.value)

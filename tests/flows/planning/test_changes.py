@@ -115,3 +115,9 @@ def test_a_changed_rig_and_levels_that_are_gone_are_said(tmp_path: Path) -> None
         "collection.factors.direction.levels: [0, 60, 120, 180, 240, 300] -> "
         "[0, 60, 120, 180, 240]" in message
     )
+
+
+def test_a_changed_secret_is_masked() -> None:
+    old, new = ({"arm": {"password": word, "port": 1}} for word in ("hunter2", "hunter3"))
+    assert told(old, new) == "\n  arm.password: **** -> ****"
+    assert told({}, {"arm": new["arm"]}) == "\n  arm: not there -> {password: ****, port: 1}"
