@@ -102,14 +102,18 @@ def collect(
     store: StoreOption,
     enable: EnableOption = None,
     trials: Annotated[
-        int | None, typer.Option("--trials", min=1, help="Take so many of the missing, no more.")
+        int | None,
+        typer.Option(
+            "--trials", min=1, max=1_000_000, help="Take so many of the missing, no more."
+        ),
     ] = None,
     campaign: Annotated[
         str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
     ] = None,
     operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
     temperature: Annotated[
-        float | None, typer.Option("--temperature", help="Of the room, degrees Celsius.")
+        float | None,
+        typer.Option("--temperature", min=-50, max=100, help="Of the room, degrees Celsius."),
     ] = None,
     humidity: Annotated[
         float | None, typer.Option("--humidity", min=0, max=100, help="Relative, percent.")

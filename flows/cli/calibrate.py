@@ -37,7 +37,8 @@ SpeedOption = Annotated[
     float, typer.Option("--speed", min=0.01, max=1.0, help="Creeping speed, mm/s.")
 ]
 SearchOption = Annotated[
-    float, typer.Option("--search", min=0.1, help="Hard limit beyond the assumed plane, mm.")
+    float,
+    typer.Option("--search", min=0.1, max=50, help="Hard limit beyond the assumed plane, mm."),
 ]
 ClearanceOption = Annotated[
     float, typer.Option("--clearance", min=0.5, max=50, help="Where creeping begins, mm before it.")
@@ -45,8 +46,8 @@ ClearanceOption = Annotated[
 SquareOption = Annotated[
     float, typer.Option("--square", min=0.5, max=50, help="Side of a printed square, mm: measure.")
 ]
-ColumnsOption = Annotated[int, typer.Option("--columns", help="Squares across.")]
-RowsOption = Annotated[int, typer.Option("--rows", help="Squares down.")]
+ColumnsOption = Annotated[int, typer.Option("--columns", min=0, max=1000, help="Squares across.")]
+RowsOption = Annotated[int, typer.Option("--rows", min=0, max=1000, help="Squares down.")]
 
 
 class By(StrEnum):
@@ -68,7 +69,8 @@ def teach_plane(
     rig: RigOption,
     by: Annotated[By, typer.Option("--by", help="Touch off, or jog by hand.")] = By.EVENTS,
     span: Annotated[
-        float, typer.Option("--span", help="From the centre to each other point, mm.")
+        float,
+        typer.Option("--span", min=0, max=1000, help="From the centre to each other point, mm."),
     ] = 12.0,
     repeats: Annotated[int, typer.Option("--repeats", min=1, max=20, help="Touches a point.")] = 2,
     speed: SpeedOption = 0.5,
@@ -186,7 +188,7 @@ def calibrate_lens(
 @calibrate_app.command("crop")
 def calibrate_crop(
     rig: RigOption,
-    depth: Annotated[float, typer.Option("--depth", min=0.2, help="How deep, mm.")] = 2.4,
+    depth: Annotated[float, typer.Option("--depth", min=0.2, max=20, help="How deep, mm.")] = 2.4,
     radius: Annotated[
         float, typer.Option("--radius", min=0.1, max=3, help="Of the circle, mm.")
     ] = 1.0,

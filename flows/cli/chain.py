@@ -49,7 +49,11 @@ def study(
     ] = True,
     check_labels: Annotated[
         int,
-        typer.Option(min=0, help="Trials to take again with video, to check labels of tracks by."),
+        typer.Option(
+            min=0,
+            max=1_000_000,
+            help="Trials to take again with video, to check labels of tracks by.",
+        ),
     ] = LABELS_CHECKED,
     searches: Annotated[
         bool,

@@ -29,16 +29,18 @@ def detect(
         float, typer.Option("--hold", min=0, max=60, help="Stand and watch after a reflex, s.")
     ] = 1.0,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.1, help="Listen so long; else to Ctrl-C.")
+        float | None,
+        typer.Option("--seconds", min=0.1, max=1_000_000, help="Listen so long; else to Ctrl-C."),
     ] = None,
     stride: Annotated[
-        float | None, typer.Option("--stride", help="From window to window, ms; their length.")
+        float | None,
+        typer.Option("--stride", min=0, max=1000, help="From window to window, ms; their length."),
     ] = None,
     margin: Annotated[
-        float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
+        float | None, typer.Option("--margin", min=0, max=1e6, help="Spikes a winner must lead by.")
     ] = None,
     smoothing: Annotated[
-        int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
+        int | None, typer.Option("--smoothing", min=1, max=1000, help="Windows to average over.")
     ] = None,
     poll: Annotated[
         float, typer.Option("--poll", min=1, max=200, help="Read the streams so often, ms.")

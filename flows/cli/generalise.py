@@ -24,11 +24,14 @@ def generalise(
     ] = False,
     skins: Annotated[
         int | None,
-        typer.Option("--skins", min=0, help="Other skins of a simulated rig (5)."),
+        typer.Option("--skins", min=0, max=1000, help="Other skins of a simulated rig (5)."),
     ] = None,
-    trials: Annotated[int, typer.Option("--trials", min=1, help="On each other skin.")] = 36,
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, max=1_000_000, help="On each other skin.")
+    ] = 36,
     epochs: Annotated[
-        int | None, typer.Option("--epochs", min=1, help="Of each training; the protocol's.")
+        int | None,
+        typer.Option("--epochs", min=1, max=10_000, help="Of each training; the protocol's."),
     ] = None,
     campaign: CampaignOption = None,
     as_json: JsonOption = False,

@@ -17,7 +17,7 @@ def guesses(
         typer.Option("--guess", help="Only this number of the scene; may be given again."),
     ] = None,
     trials: Annotated[
-        int, typer.Option("--trials", min=2, help="Test trials of each campaign.")
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials of each campaign.")
     ] = 20,
     campaign: CampaignOption = None,
     as_json: JsonOption = False,

@@ -24,7 +24,10 @@ def export_model(
         bool, typer.Option("--onnx/--no-onnx", help="Write ONNX, checked against Sinabs.")
     ] = True,
     windows: Annotated[
-        int, typer.Option("--windows", min=1, help="Windows that the ONNX file is checked on.")
+        int,
+        typer.Option(
+            "--windows", min=1, max=1_000_000, help="Windows that the ONNX file is checked on."
+        ),
     ] = 256,
     as_json: JsonOption = False,
 ) -> None:

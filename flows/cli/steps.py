@@ -72,10 +72,10 @@ def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
     margin: Annotated[
-        float | None, typer.Option("--margin", min=0, help="Spikes a winner must lead by.")
+        float | None, typer.Option("--margin", min=0, max=1e6, help="Spikes a winner must lead by.")
     ] = None,
     smoothing: Annotated[
-        int | None, typer.Option("--smoothing", min=1, help="Windows to average over.")
+        int | None, typer.Option("--smoothing", min=1, max=1000, help="Windows to average over.")
     ] = None,
     reviewed: ReviewedOption = False,
     baselines: Annotated[

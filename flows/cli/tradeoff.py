@@ -34,6 +34,7 @@ def tradeoff(
         typer.Option(
             "--trials",
             min=1,
+            max=1_000_000,
             help="Trials to simulate (4); or validation and test trials to judge by (60 each).",
         ),
     ] = None,
@@ -46,28 +47,39 @@ def tradeoff(
     dask: DaskOption = None,
     samples: Annotated[
         int | None,
-        typer.Option("--samples", min=3, help="Detector: windows of each training (12000)."),
+        typer.Option(
+            "--samples",
+            min=3,
+            max=1_000_000_000,
+            help="Detector: windows of each training (12000).",
+        ),
     ] = None,
     epochs: Annotated[
-        int | None, typer.Option("--epochs", min=1, help="Detector: of each training (4).")
+        int | None,
+        typer.Option("--epochs", min=1, max=10_000, help="Detector: of each training (4)."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", min=1, help="Detector: of each setting (3).")
+        int | None, typer.Option("--seeds", min=1, max=1000, help="Detector: of each setting (3).")
     ] = None,
     stride: Annotated[
-        int | None, typer.Option("--stride", min=1, help="Detector: the finest stride, ms (10).")
+        int | None,
+        typer.Option("--stride", min=1, max=1000, help="Detector: the finest stride, ms (10)."),
     ] = None,
     length: Annotated[
-        list[int] | None, typer.Option("--length", help="Detector: a window length, ms; again.")
+        list[int] | None,
+        typer.Option("--length", min=0, max=10_000, help="Detector: a window length, ms; again."),
     ] = None,
     step: Annotated[
-        list[int] | None, typer.Option("--step", help="Detector: a step, ms; again.")
+        list[int] | None,
+        typer.Option("--step", min=0, max=10_000, help="Detector: a step, ms; again."),
     ] = None,
     pool: Annotated[
-        list[int] | None, typer.Option("--pool", help="Detector: a cell's side, px; again.")
+        list[int] | None,
+        typer.Option("--pool", min=0, max=10_000, help="Detector: a cell's side, px; again."),
     ] = None,
     width: Annotated[
-        list[float] | None, typer.Option("--width", help="Detector: a factor on channels; again.")
+        list[float] | None,
+        typer.Option("--width", min=0, max=1000, help="Detector: a factor on channels; again."),
     ] = None,
     full: Annotated[
         bool, typer.Option("--full", help="Detector: every value with every other.")
@@ -75,7 +87,10 @@ def tradeoff(
     minutes: Annotated[
         float | None,
         typer.Option(
-            "--minutes", min=0, help="Detector: begin no training after so many; 0: only the page."
+            "--minutes",
+            min=0,
+            max=100_000,
+            help="Detector: begin no training after so many; 0: only the page.",
         ),
     ] = None,
     dry_run: Annotated[

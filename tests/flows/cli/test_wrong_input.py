@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import pytest
+import typer
 
+from flows.cli.app import app
 from protocols.shown import MASK
 from tests.command_line import here
 from tests.conftest import ROOT
@@ -310,3 +313,69 @@ def test_a_wrong_rig_file(case: str, command: str, tmp_path: Path) -> None:
     assert right in line
     for secret in ("hunter2", "12345", "12.34", "12,34", "robotics"):
         assert secret not in line
+
+
+def _options() -> dict[str, tuple[Any, typer.models.ParameterInfo]]:
+    """Type and information of every numeric option of every command, by their names."""
+    groups = {
+        "": app,
+        **{f"{group.name} ": group.typer_instance for group in app.registered_groups},
+    }
+    found = {}
+    for prefix, group in groups.items():
+        assert group is not None
+        for command in group.registered_commands:
+            assert command.callback is not None
+            name = command.name or command.callback.__name__.replace("_", "-")
+            hints = get_type_hints(command.callback, include_extras=True)
+            for parameter, hint in hints.items():
+                plain, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+                leaves = {
+                    plain,
+                    *get_args(plain),
+                    *(x for y in get_args(plain) for x in get_args(y)),
+                }
+                info = [item for item in more if isinstance(item, typer.models.ParameterInfo)]
+                if leaves & {int, float} and info:
+                    found[f"{prefix}{name} {parameter}"] = (leaves, info[0])
+    return found
+
+
+OPTIONS = _options()
+
+
+def test_there_are_numeric_options() -> None:
+    assert len(OPTIONS) > 40
+    assert "evaluate margin" in OPTIONS
+    assert "collect temperature" in OPTIONS
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_numeric_options_are_bounded(option: str) -> None:
+    info = OPTIONS[option][1]
+    assert info.min is not None
+    assert info.max is not None
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "yes", "\N{MINUS SIGN}1"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("evaluate", "none", "--margin"),
+        ("evaluate", "none", "--smoothing"),
+        ("collect", "none.yaml", "--rig", "mock", "--store", "none", "--temperature"),
+        ("collect", "none.yaml", "--rig", "mock", "--store", "none", "--humidity"),
+        ("collect", "none.yaml", "--rig", "mock", "--store", "none", "--trials"),
+        ("tradeoff", "--detector", "none", "--width"),
+        ("tradeoff", "--detector", "none", "--length"),
+        ("tradeoff", "--detector", "none", "--minutes"),
+        ("detect", "--model", "none", "--rig", "mock", "--stride"),
+        ("detect", "--model", "none", "--rig", "mock", "--seconds"),
+        ("teach", "plane", "--rig", "mock", "--span"),
+        ("pause", "none", "--wait"),
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+def test_options_take_finite_numbers_alone(command: tuple[str, ...], value: str) -> None:
+    line = refused(*command, value)
+    assert f"{command[-1]} = {value}: " in line
