@@ -9,6 +9,7 @@ by a task on the controller, which stops the arm then (`abb_watchdog`, `docs/arm
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -200,7 +201,7 @@ class AbbArm:
                 run = Run(path)
                 self._watch = SegmentWatch(self._planned or begin, path)
                 self._run = run
-                self._may_move = True
+                self._began_s, self._may_move = math.inf, True  # no state tells of it until later
                 self._web.start(program)
             except WebError as error:
                 self._give_up()
@@ -215,7 +216,10 @@ class AbbArm:
         Raises:
             ArmFault: the path was given up for a reason that `state` does not tell.
         """
-        return self._run.progress(self.state())
+        run, state = self._run, self.state()
+        if run.error is not None and run.done and state is ArmState.DISCONNECTED:
+            raise run.error  # it says more than that the arm cannot be reached
+        return run.progress(state)
 
     def read_poses(self) -> PoseChunk:
         """Measured poses since the last call; the controller may send none between two paths."""
@@ -484,6 +488,8 @@ class AbbArm:
             try:
                 came = egm.read(MONITOR_S)
             except EgmFault as fault:
+                if not self._run.done:
+                    self._run.error = ArmFault("arm", f"{fault}; its path was given up")
                 self._lost = str(fault)
                 self._stream.wake()
                 return
@@ -566,11 +572,11 @@ class AbbArm:
         seen_s = max(self._began_s, last.host_ns / 1e9 if last is not None else 0.0)
         silent_s = time.monotonic() - seen_s
         if silent_s > (SILENCE_S if watch is not None and watch.begun else FIRST_POSE_S):
-            return f"sent no pose for {silent_s:.1f} s while it moved, so it was stopped"
+            return f"sent no pose for {silent_s:.1f} s while it moved; its path was given up"
         if status is not None and status.speed_percent != FULL_SPEED_PERCENT:
             return (
-                f"had its speed ratio set to {status.speed_percent:g} % while it moved, so it was "
-                "stopped: set it to 100 % at the pendant"
+                f"had its speed ratio set to {status.speed_percent:g} % while it moved; its path "
+                "was given up: set it to 100 % at the pendant"
             )
         return None
 

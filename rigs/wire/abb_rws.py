@@ -67,6 +67,7 @@ class AbbStandIn:
         speed_percent: the pendant's speed ratio, for moves that begin from now on.
         egm_on: whether it sends poses.
         web_on: whether its web services answer.
+        mute_after_start: whether they do so no more once the next program has started.
         watchdog_stops: how often the watchdog module has stopped the arm.
     """
 
@@ -94,6 +95,7 @@ class AbbStandIn:
         self.running = False
         self.speed_percent = 100.0
         self.egm_on = self.web_on = True
+        self.mute_after_start = False
         self._egm_time, self._answer_s = egm_time, answer_s
         self.watchdog_stops = 0
         self._signals = dict.fromkeys((BEAT, ECHO, LIMIT), 0.0) if watchdog else {}
@@ -304,7 +306,10 @@ class AbbStandIn:
             if path.startswith("fileservice/"):
                 return self._file(method, path, body)
             if method == "POST":
-                return self._post(path, query, dict(parse_qsl(body.decode())))
+                reply = self._post(path, query, dict(parse_qsl(body.decode())))
+                if self.running and self.mute_after_start:
+                    self.web_on = self.egm_on = False
+                return reply if self.web_on else None
             states = self._get(path, query)
             return Reply(404, None) if states is None else Reply(200, states)
 

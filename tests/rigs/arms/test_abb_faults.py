@@ -92,6 +92,15 @@ def test_a_stop_takes_a_new_connection_if_the_old_one_is_dead(abb_pair: MakeAbb)
     assert robot.watchdog_stops == 0
 
 
+def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
+    """The controller takes the start and is never heard of again."""
+    arm, robot = abb_pair(arm={"watchdog_s": None})
+    robot.mute_after_start = True
+    fails(lambda: arm.start(SLIDE), 25 * REQUEST_S, "did not take a path")
+    assert robot.running
+    fails(arm.stop, 8 * REQUEST_S, "cannot be reached to be stopped")
+
+
 @pytest.mark.parametrize("kind", [Kind.LINK_CUT, Kind.SILENCE])
 def test_the_controller_stops_the_arm_when_the_link_is_lost(abb_pair: MakeAbb, kind: Kind) -> None:
     arm, robot = abb_pair()
@@ -219,7 +228,8 @@ def test_a_clock_that_falls_back_ends_the_path(abb_pair: MakeAbb) -> None:
     robot.happen(Kind.CLOCK_BACK)
     until(lambda: arm.state() is ArmState.DISCONNECTED, BUSY_S)
     until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
-    assert arm.progress().finished == ()
+    until(lambda: arm._run.done, BUSY_S)
+    fails(arm.progress, 0.0, r"clock went back by .* its path was given up")
     fails(lambda: arm.start(SLIDE), 0.0, r"clock went back by (4\.9|5\.0)\d+ s")
     arm.recover()
     assert arm.state() is ArmState.READY
