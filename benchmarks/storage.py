@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.event_files import rivals
-from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, spread
+from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import many_events
 from rigs.scene.frames import FrameOptics, PlateView
 from rigs.scene.randomness import generator
+from storage.exchange.aedat4 import Aedat4File
 from storage.hdf5 import StreamFile, StreamReader
 from storage.streams import U8, EventChunk
 from storage.video import VideoWriter, read_frames
@@ -62,8 +63,10 @@ def _events(folder: Path, count: int, runs: int) -> Figures:
     for name, other in others.items():
         work[f"{name}_write"], work[f"{name}_read"] = other.write, other.read
         work[f"{name}_window"] = partial(other.window, middle, middle + WINDOW_US)
+    work["aedat4_own_read"] = lambda: _read_aedat4(others["aedat4"].path)
     with one_core():
         taken = alternate(runs, **work)
+    own, theirs = taken["aedat4_own_read"], taken["aedat4_read"]
     back = read()
     for column in ("x", "y", "p", "t_us"):
         if not np.array_equal(getattr(back, column), getattr(data, column)):
@@ -75,7 +78,14 @@ def _events(folder: Path, count: int, runs: int) -> Figures:
             figures |= rate(f"{name}{what}_m_events_per_s", count / 1e6, taken[name + what])
         figures |= spread(f"{name}window_30ms_ms", [v * 1e3 for v in taken[f"{name}window"]])
         figures[f"{name}bytes_per_event"] = path.stat().st_size / count
-    return figures
+    figures |= rate("aedat4_own_read_m_events_per_s", count / 1e6, own)
+    return figures | ratio("aedat4_own_read_ratio", theirs, own)
+
+
+def _read_aedat4(path: Path) -> list[EventChunk]:
+    """All events of the rival's file, as `sliplab import` reads them."""
+    with Aedat4File(path) as file:
+        return list(file.events(0))
 
 
 def noisy_frames(count: int, size: int, noise: float) -> U8:

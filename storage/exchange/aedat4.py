@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,9 +19,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
+from numba import njit
 
 from storage.exchange.dv_buffers import (
-    EVENT,
     GREY,
     events_buffer,
     frame_buffer,
@@ -28,7 +29,7 @@ from storage.exchange.dv_buffers import (
     triggers_buffer,
 )
 from storage.exchange.flatbuffer import Table
-from storage.exchange.foreign import LATEST_US, Triggers, Wrong, event_chunk
+from storage.exchange.foreign import LATEST_US, MOST_PX, Triggers, Wrong, event_chunk
 from storage.streams import U8, EventChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
@@ -38,6 +39,8 @@ _MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
 _PACKET_EVENTS = 1 << 16
 _PIECE = 1 << 20
 _ZSTD = 3
+_MOST_RATIO = 64
+"""Of a packet's content to its bytes, up to which the size in its header is believed."""
 _START_OF_EXPOSURE, _END_OF_EXPOSURE = 3, 4
 """Fields of a frame."""
 _COLOUR = {16: 3, 24: 4}
@@ -73,6 +76,7 @@ class Aedat4File:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._handle = path.open("rb")
+        self._buffer = bytearray(_PIECE)
         try:
             self._bytes = path.stat().st_size
             if (line := self._handle.read(len(LINE))) != LINE:
@@ -108,15 +112,32 @@ class Aedat4File:
         return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
 
     def events(self, number: int) -> Iterator[EventChunk]:
-        """The events of a stream, packet by packet."""
-        last = None
+        """The events of a stream, packets together up to `_PACKET_EVENTS` events.
+
+        A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
+        """
+        room = _empty(_PACKET_EVENTS)
+        filled = last = 0
         for data in self._packets(number):
-            rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], EVENT)
-            chunk = event_chunk(rows["x"], rows["y"], rows["p"] & 1, rows["t"])
-            if last is not None and len(chunk) and chunk.t_us[0] < last:
+            rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
+            count = len(rows) // 2
+            if filled and filled + count > len(room):
+                yield _part(room, 0, filled)
+                filled = 0
+                room = _empty(_PACKET_EVENTS)
+            if count > len(room):
+                room = _empty(count)
+            if not rows.flags.aligned:
+                rows = rows.copy()
+            rows.flags.writeable = False  # `_split_events` is compiled for such
+            new = _part(room, filled, filled + count)
+            last = _split_events(rows, new.x, new.y, new.p, new.t_us, last)
+            if last < 0:
+                event_chunk(new.x, new.y, new.p, new.t_us)
                 raise Wrong("holds events whose times run backwards")
-            last = int(chunk.t_us[-1]) if len(chunk) else last
-            yield chunk
+            filled += count
+        if filled:
+            yield _part(room, 0, filled)
 
     def triggers(self, number: int) -> Triggers:
         """All triggers of a stream."""
@@ -150,7 +171,7 @@ class Aedat4File:
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
     def _packets(self, number: int) -> Iterator[memoryview]:
-        """Unpacked packets of one stream; the others are passed over."""
+        """Unpacked packets of one stream, each gone with the next; the others are passed over."""
         self._handle.seek(self._begin)
         while (at := self._handle.tell()) < self._end:
             stream, size = struct.unpack("<ii", self._exactly(8))
@@ -160,11 +181,28 @@ class Aedat4File:
                 self._handle.seek(size, 1)
                 continue
             try:
-                yield memoryview(_unpacked(self._exactly(size), self._codec))
+                yield self._unpacked(self._exactly(size))
             except (pa.ArrowException, OSError) as error:
                 raise Wrong(
                     f"holds a packet that cannot be unpacked, at byte {at}: {error}"
                 ) from None
+
+    def _unpacked(self, data: bytes) -> memoryview:
+        """A packet's content, which may stand in a buffer that is used again."""
+        if self._codec is None:
+            return memoryview(data)
+        if self._codec == "zstd" and 0 < (size := _zstd_size(data)) <= _MOST_RATIO * len(data):
+            with suppress(pa.ArrowException, OSError):  # the stream below finds what is wrong
+                return memoryview(pa.decompress(data, size, "zstd"))
+        filled = 0
+        with pa.CompressedInputStream(pa.BufferReader(data), self._codec) as stream:
+            while part := stream.readinto(memoryview(self._buffer)[filled:]):
+                filled += part
+                if filled > _MOST_PACKET:
+                    raise Wrong("holds a packet that unpacks to too much")
+                if filled == len(self._buffer):  # room for what comes, not for what a header says
+                    self._buffer = self._buffer + bytearray(filled)
+        return memoryview(self._buffer)[:filled]
 
     def _exactly(self, count: int) -> bytes:
         found = self._handle.read(count)
@@ -187,6 +225,42 @@ def _middle_ns(frame: Table) -> int:
     return (start + end) * 500
 
 
+@njit(cache=True, nogil=True)
+def _split_events(words, x, y, p, t, last):  # type: ignore[no-untyped-def]
+    """Fill the columns of events from two 64-bit words each: time, and pixel with polarity.
+
+    Args:
+        last: the time of the event before, us.
+
+    Returns:
+        The time of the last event; -1 where a pixel is none, or a time earlier than the one before.
+    """
+    wrong: Any = False
+    for i in range(len(words) // 2):
+        now, place = np.int64(words[2 * i]), words[2 * i + 1]
+        x[i] = column = place & np.uint64(0xFFFF)
+        y[i] = row = place >> np.uint64(16) & np.uint64(0xFFFF)
+        p[i] = place >> np.uint64(32) & np.uint64(1)
+        t[i] = now
+        wrong |= now < last or column >= MOST_PX or row >= MOST_PX or now >= LATEST_US
+        last = now
+    return -1 if wrong else last
+
+
+def _empty(count: int) -> EventChunk:
+    return EventChunk(
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint8),
+        np.empty(count, np.int64),
+    )
+
+
+def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
+    part = slice(low, high)
+    return EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+
+
 def _length(data: bytes, most: int) -> int:
     count = int(struct.unpack("<I", data)[0])
     if count > most:
@@ -198,23 +272,19 @@ def _prefixed(data: bytes) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def _unpacked(data: bytes, codec: Any) -> bytes:
-    if codec is None:
-        return data
-    parts: list[bytes] = []  # as much is made room for as is asked for, whatever comes
-    left = _MOST_PACKET
-    with pa.CompressedInputStream(pa.BufferReader(data), codec) as stream:
-        while part := stream.read(_PIECE):
-            parts.append(part)
-            left -= len(part)
-            if left < 0:
-                raise Wrong("holds a packet that unpacks to too much")
-    return b"".join(parts)
+def _zstd_size(frame: bytes) -> int:
+    """The size of a zstd frame's content by its header (RFC 8878); 0 where it gives none."""
+    if len(frame) < 14 or frame[:4] != b"\x28\xb5\x2f\xfd":
+        return 0
+    single = frame[4] >> 5 & 1
+    at = 6 - single + (0, 1, 2, 4)[frame[4] & 3]
+    width = (single, 2, 4, 8)[frame[4] >> 6]
+    return int.from_bytes(frame[at : at + width], "little") + (256 if width == 2 else 0)
 
 
 def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
     if channels == 1:
-        return np.asarray(pixels, np.uint8).reshape(height, width)
+        return np.array(pixels, np.uint8).reshape(height, width)
     levels = pixels.reshape(height, width, channels)[..., :3].astype(np.uint32)  # blue, green, red
     weighed = levels @ np.array([114, 587, 299], np.uint32) + 500
     return np.asarray(weighed // 1000, np.uint8)
@@ -264,9 +334,7 @@ class Aedat4Writer:
     def events(self, number: int, chunk: EventChunk) -> None:
         """Append events; times must not run backwards, over all calls."""
         for start in range(0, len(chunk), _PACKET_EVENTS):
-            part = slice(start, start + _PACKET_EVENTS)
-            few = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
-            self._write(number, events_buffer(few))
+            self._write(number, events_buffer(_part(chunk, start, start + _PACKET_EVENTS)))
 
     def triggers(self, number: int, found: Triggers) -> None:
         """Append triggers."""

@@ -92,17 +92,21 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
         raise Wrong("holds columns of events that differ in length")
     if any(c.dtype.kind not in "iub" for c in columns):
         raise Wrong("holds events that are no integers")
+    times = np.ascontiguousarray(columns[3], np.int64)
+    ends = times[[0, -1]] if len(times) else times
     limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
-    for column, (what, most) in zip(columns, limits, strict=True):
-        if len(column) and (int(column.min()) < 0 or int(column.max()) >= most):
+    for column, (what, most) in zip([*columns[:3], ends], limits, strict=True):
+        if not len(column) or column.dtype.kind == "b":
+            continue
+        negative = column.dtype.kind == "i" and int(column.min()) < 0
+        if negative or int(column.max()) >= most:
             raise Wrong(f"holds an event whose {what} is {column.min()} or {column.max()}")
-    times = columns[3].astype(np.int64)
     if np.any(times[1:] < times[:-1]):
         raise Wrong("holds events whose times run backwards")
     return EventChunk(
-        columns[0].astype(np.uint16),
-        columns[1].astype(np.uint16),
-        columns[2].astype(np.uint8),
+        np.ascontiguousarray(columns[0], np.uint16),
+        np.ascontiguousarray(columns[1], np.uint16),
+        np.ascontiguousarray(columns[2], np.uint8),
         times,
     )
 

@@ -38,6 +38,7 @@ PROMISED = {
         "frames_per_s_800", "pickle_write_m_events_per_s", "pickle_read_m_events_per_s",
         "pickle_window_30ms_ms", "pickle_bytes_per_event", "aedat4_write_m_events_per_s",
         "aedat4_read_m_events_per_s", "aedat4_window_30ms_ms", "aedat4_bytes_per_event",
+        "aedat4_own_read_m_events_per_s", "aedat4_own_read_ratio",
     },
     "scene": {
         "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_frame_emulator",

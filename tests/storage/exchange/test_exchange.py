@@ -23,9 +23,9 @@ from storage.catalogue import catalogue
 from storage.derived import Derived
 from storage.exchange import lab_pickles as lab
 from storage.exchange.aedat4 import Aedat4File, Aedat4Writer, Stream
-from storage.exchange.dv_buffers import frame_buffer
+from storage.exchange.dv_buffers import events_buffer, frame_buffer
 from storage.exchange.find import kind_of, name_of, trials_in
-from storage.exchange.foreign import Triggers
+from storage.exchange.foreign import Triggers, Wrong
 from storage.exchange.hand_out import hand_out
 from storage.exchange.manifest import MANIFEST
 from storage.exchange.tables import label_table, write_table
@@ -236,6 +236,67 @@ def test_an_exposure_that_ends_before_it_starts_is_refused(tmp_path: Path) -> No
         file._write(1, made.replace(struct.pack("<5q", *(5 * [99])), times))
     with pytest.raises(InputError, match=r"bad\.aedat4.*exposure.* 60 .* 40 us"):
         _import(tmp_path / "store", path)
+
+
+def _packets(path: Path, whole: EventChunk, lengths: list[int]) -> None:
+    """Events in packets of such lengths, as cameras write them."""
+    with Aedat4Writer(path, {0: Stream("EVTS", "events", (640, 480), "camera")}) as file:
+        ends = np.cumsum(lengths).tolist()
+        for low, high in zip([0, *ends[:-1]], ends, strict=True):
+            columns = (whole.x, whole.y, whole.p, whole.t_us)
+            part = EventChunk(*(column[low:high] for column in columns))  # type: ignore[arg-type]
+            file._write(0, events_buffer(part))
+
+
+@pytest.mark.parametrize(
+    "lengths",
+    [[0, 70_000], [70_000, 0], [300] * 233 + [100], [1, 65_534, 1, 1, 4463], [69_999, 1]],
+    ids=str,
+)
+def test_packets_of_any_length(tmp_path: Path, lengths: list[int]) -> None:
+    events, _ = _aedat4(tmp_path / "a.aedat4")
+    _packets(tmp_path / "b.aedat4", events, lengths)
+    with Aedat4File(tmp_path / "b.aedat4") as file:
+        found = list(file.events(0))
+    assert all(len(chunk) for chunk in found)
+    for name in ("x", "y", "p", "t_us"):
+        joined = np.concatenate([getattr(chunk, name) for chunk in found])
+        np.testing.assert_array_equal(joined, getattr(events, name))
+
+
+@pytest.mark.parametrize("at", [0, 299, 300, 66_000, 69_999])
+@pytest.mark.parametrize(
+    ("column", "value", "says"),
+    [
+        ("x", -1, "column is .*65535"),
+        ("y", 20_000, "row is .*20000"),
+        ("t_us", -5, "time is -5|run backwards"),
+        ("t_us", 1 << 60, "time is .*1152921504606846976|run backwards"),
+    ],
+)
+def test_one_wrong_event_in_any_packet_is_found(
+    tmp_path: Path, at: int, column: str, value: int, says: str
+) -> None:
+    events, _ = _aedat4(tmp_path / "a.aedat4")
+    getattr(events, column)[at : at + 1] = np.array([value]).astype(getattr(events, column).dtype)
+    _packets(tmp_path / "b.aedat4", events, [300] * 233 + [100])
+    with Aedat4File(tmp_path / "b.aedat4") as file, pytest.raises(Wrong, match=says):
+        list(file.events(0))
+
+
+@pytest.mark.parametrize("size", [3, 300_000, 5 << 20])
+def test_zstd_frames_that_say_a_wrong_size(tmp_path: Path, size: int) -> None:
+    """The size in a frame's header is believed only where its content has it."""
+    path = tmp_path / "a.aedat4"
+    _aedat4(path)
+    data = bytearray(path.read_bytes())
+    frame = data.index(b"\x28\xb5\x2f\xfd")
+    assert data[frame + 4] >> 6 == 2  # the size has four bytes
+    at = frame + 6 - (data[frame + 4] >> 5 & 1)
+    data[at : at + 4] = struct.pack("<I", size)
+    path.write_bytes(data)
+    with Aedat4File(path) as file, pytest.raises(Wrong, match="unpacked"):
+        list(file.events(0))
 
 
 @pytest.mark.parametrize("later", [1_795_000_000_000_000, 3 * 86_400 * 10**6])
