@@ -17,6 +17,8 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
+from rigs.cameras.patience import STEP_S, Patience
+
 KILL_S = 2.0
 """How long a child that was asked to end, or killed, may take to be gone, s."""
 _SAID_BYTES = 2000
@@ -39,6 +41,8 @@ class LibraryProcess:
         arguments: what else it is given; each must be its own `repr`.
         start_s: how long the child may take until it has begun, s.
         error: what is raised.
+        patient: bounds count time that somebody watched: a computer that stood still for longer
+            than a bound has no child at fault.
 
     Raises:
         LibraryError: it was not ready within `start_s`; the child is gone.
@@ -51,8 +55,10 @@ class LibraryProcess:
         arguments: tuple[Any, ...],
         start_s: float,
         error: type[LibraryError] = LibraryError,
+        *,
+        patient: bool = False,
     ) -> None:
-        self._what, self._error = what, error
+        self._what, self._error, self._patient = what, error, patient
         self._owed = 1
         ours, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
@@ -125,7 +131,7 @@ class LibraryProcess:
         fine, result = False, None
         try:
             while self._owed:  # the answer to a call that Ctrl-C interrupted comes first
-                if not self._pipe.poll(within_s):
+                if not self._comes(within_s):
                     self.kill()
                     raise self._error(f"{name}: no answer within {within_s:g} s{self._said()}")
                 fine, result = self._pipe.recv()
@@ -136,6 +142,16 @@ class LibraryProcess:
         if not fine:
             raise self._error(f"{name}: {result}")
         return result
+
+    def _comes(self, within_s: float) -> bool:
+        """Whether there is an answer, after waiting for it."""
+        if not self._patient:
+            return self._pipe.poll(within_s)
+        patience = Patience()
+        while patience.waited_s(0) < within_s:
+            if self._pipe.poll(STEP_S):
+                return True
+        return False
 
     def _said(self) -> str:
         """The last line that the child wrote, for a person to read."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -24,8 +25,13 @@ OPEN_S = 20.0
 """The longest that the process may take to begin and to open a camera or streams, s."""
 ANSWER_S = 5.0
 """The library, which answers at once, must have answered by then, s."""
-_SELF_END_S = 2.0
-"""How much later than its parent's bound the child ends itself, s."""
+WAIT_S = 0.005
+"""A look that would find nothing waits for so long that something comes, s."""
+_LOOK_S = 0.001
+_SELF_END_S = 30.0
+"""How much later than its parent's bound the child ends itself, s: only where no parent is."""
+_CLOSE_S = 2.0
+"""How long the library may take to close the camera, s."""
 
 
 class EventProcess:
@@ -47,6 +53,7 @@ class EventProcess:
                 "rigs.cameras.event_process:serve",
                 (settings.model_dump_json(), OPEN_S),
                 OPEN_S,
+                patient=True,
             )
         )
         self.name: str
@@ -107,10 +114,16 @@ def serve(fd: int, settings_json: str, start_s: float) -> None:
             signal.setitimer(signal.ITIMER_REAL, within_s + _SELF_END_S)
             try:
                 answer = (True, getattr(source, name)(*arguments))
+                end = time.monotonic() + WAIT_S
+                # what comes next is worth a short wait here: it costs less than to be asked again
+                while name == "look" and answer[1].empty and answer[1].running:
+                    if time.monotonic() > end or pipe.poll(_LOOK_S):
+                        break
+                    answer = (True, source.look())
             except Exception as error:
                 answer = (False, str(error))
             pipe.send(answer)
-    signal.setitimer(signal.ITIMER_REAL, _SELF_END_S)
+    signal.setitimer(signal.ITIMER_REAL, _CLOSE_S)
     with suppress(Exception):
         source.run(False)
     del source  # the library closes what nobody holds any more

@@ -236,10 +236,10 @@ def _open_camera(settings: UsbCamera) -> EventSource:
     if not isinstance(camera, dv.io.camera.DVXplorer):
         raise RigError(DEVICE, f"{camera.getCameraName()} is no DVXplorer")
     configure(camera, settings)
+    found = in_force(camera)
+    check_taken(found, settings)
     width, height = camera.getEventResolution()
-    return EventSource(
-        camera, camera, camera, (width, height), camera.getCameraName(), in_force(camera)
-    )
+    return EventSource(camera, camera, camera, (width, height), camera.getCameraName(), found)
 
 
 def configure(camera: Any, settings: UsbCamera) -> None:
@@ -314,6 +314,23 @@ def in_force(camera: Any) -> Json:
             value = _plain(value)
         found[name] = value
     return found
+
+
+def check_taken(found: Json, settings: UsbCamera) -> None:
+    """Hold what is in force against what the rig file says: a camera may take another value.
+
+    Raises:
+        RigError: it did.
+    """
+    for key, name, asked in (
+        ("readout", "ReadoutFPS", settings.readout),
+        ("contrast_on", "ContrastThresholdOn", settings.contrast_on),
+        ("contrast_off", "ContrastThresholdOff", settings.contrast_off),
+    ):
+        if asked is not None and found[name] != asked:
+            raise RigError(
+                DEVICE, f"source.{key} = {asked}: the camera took {found[name]}; give what it takes"
+            )
 
 
 def _open_streams(settings: NetworkStream) -> EventSource:

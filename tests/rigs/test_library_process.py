@@ -63,6 +63,35 @@ def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None
     process.close()
 
 
+def test_a_computer_that_stood_still_is_no_fault_of_the_child(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, patient=True)
+    pipe, now_ns = process._pipe, time.monotonic_ns
+    late_ns = [0]
+
+    class StoodStill:
+        """A pipe during whose first wait a minute passes."""
+
+        closed = False
+        send, recv = staticmethod(pipe.send), staticmethod(pipe.recv)
+
+        def poll(self, within_s: float) -> bool:
+            if not late_ns[0]:
+                late_ns[0] = 60_000_000_000
+                return False
+            return pipe.poll(within_s)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "monotonic_ns", lambda: now_ns() + late_ns[0])
+        patch.setattr(process, "_pipe", StoodStill())
+        assert process.call("any", within_s=20.0) == "any"
+        assert late_ns[0]
+    with pytest.raises(LibraryError, match=r"late: no answer within 0\.3 s"):
+        process.call("late", 60.0, within_s=0.3)
+    process.close()
+
+
 def test_after_ctrl_c_an_answer_is_still_its_own_calls(
     process: LibraryProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 from functools import partial
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 from rigs.cameras.dvxplorer import DvxplorerCamera
-from rigs.cameras.event_source import EventSource, configure
+from rigs.cameras.event_source import EventSource, check_taken, configure, in_force
 from rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
 from rigs.capabilities import EventCamera, RigError
 from rigs.wire.dvxplorer import DvxplorerServer, Sent, arrays, scene
@@ -280,7 +282,8 @@ def test_a_camera_is_set_by_names_that_the_library_has() -> None:
             assert hasattr(dv.io.camera.DVXplorer, name)
             return lambda value: done.update({name: value})
 
-    configure(Recorder(), UsbCamera(contrast_on=12))
+    usb = UsbCamera(contrast_on=12)
+    configure(Recorder(), usb)
     assert done["setReadoutFPS"] == dv.io.camera.DVXplorer.ReadoutFPS.CONSTANT_1000
     assert done["setDetectorRisingEdges"] is True
     assert done["setContrastThresholdOn"] == 12
@@ -288,3 +291,52 @@ def test_a_camera_is_set_by_names_that_the_library_has() -> None:
     readouts = UsbCamera.model_fields["readout"].annotation
     for readout in readouts.__args__:  # type: ignore[union-attr]
         configure(Recorder(), UsbCamera(readout=readout))
+
+
+class Clamping:
+    """A DVXplorer that answers by the library's names, with thresholds up to 17."""
+
+    def __init__(self) -> None:
+        kinds = dv.io.camera.DVXplorer
+        self.values: dict[str, Any] = {
+            "SubSampleHorizontal": kinds.SubSample.EVERY_FOURTH,
+            "Flatten": kinds.Flatten.ON_ONLY,
+            "FlipHorizontal": True,
+            "CropArea": (10, 10, 100, 100),
+            "ContrastThresholdOn": 3,
+            "ContrastThresholdOff": 9,
+            "TimestampOffset": timedelta(seconds=2),
+        }
+
+    def getEventResolution(self) -> tuple[int, int]:
+        return 640, 480
+
+    def setContrastThresholdOn(self, value: int) -> None:
+        self.values["ContrastThresholdOn"] = min(value, 17)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        assert hasattr(dv.io.camera.DVXplorer, name)
+        if name.startswith("set"):
+            return lambda value: self.values.update({name.removeprefix("set"): value})
+        return lambda: self.values.get(name.removeprefix("get"))
+
+
+def test_what_was_left_in_the_camera_is_written_and_read_back() -> None:
+    camera = Clamping()
+    configure(camera, UsbCamera(contrast_on=12))
+    found = in_force(camera)
+    assert found["CropArea"] == [0, 0, 640, 480]
+    assert found["SubSampleHorizontal"] == "every pixel"
+    assert (found["Flatten"], found["FlipHorizontal"]) == ("none", False)
+    assert (found["ContrastThresholdOn"], found["ContrastThresholdOff"]) == (12, 9)
+    assert (found["ReadoutFPS"], found["TimeInterval"]) == ("constant 1000", 2000)
+    assert found["TimestampOffset"] == 2_000_000
+    assert json.loads(json.dumps(found)) == found
+    check_taken(found, UsbCamera(contrast_on=12))
+
+
+def test_a_threshold_that_the_camera_does_not_take_is_refused() -> None:
+    camera, usb = Clamping(), UsbCamera(contrast_on=40)
+    configure(camera, usb)
+    with pytest.raises(RigError, match=r"source.contrast_on = 40: the camera took 17"):
+        check_taken(in_force(camera), usb)
