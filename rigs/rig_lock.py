@@ -8,9 +8,11 @@ apart by this; the arm's own controller must.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -75,6 +77,10 @@ def _folder(locks: ExitStack) -> Path:
         pass
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     locks.callback(os.close, handle)
+    mode = os.fstat(handle).st_mode
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        text = "every user may delete the locks in it (chmod +t takes that away)"
+        raise OSError(errno.EPERM, text, str(folder))
     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # keeps the system from tidying it up
     return folder
 

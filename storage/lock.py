@@ -8,9 +8,11 @@ locks, or with locks that keep nobody out, is refused (docs/decisions/0070).
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
+import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -59,7 +61,8 @@ def exclusive(
     Args:
         what: what is locked, for the message.
         brief: the block is over at once; others may wait for that.
-        mode: of the file, if it is made.
+        mode: of the file, if it is made. In a folder for all users (0666) anybody may have put
+            something else there: then it must be a plain file with no other name.
         about: what else is said of the holder, such as its store.
 
     Raises:
@@ -69,6 +72,8 @@ def exclusive(
     """
     handle = _open(path, mode)
     try:
+        if mode & 0o002:
+            _check_plain(handle, path)
         _acquire(handle, path, what)
         if os.fstat(handle).st_nlink == 0:  # somebody cleaned the folder up in between
             raise Locked(f"{what}: the lock file {path} was deleted meanwhile; try again")
@@ -98,6 +103,13 @@ def _open(path: Path, mode: int) -> int:
         return os.open(path, flags)
     os.fchmod(handle, mode)  # whatever the user's mask takes away
     return handle
+
+
+def _check_plain(handle: int, path: Path) -> None:
+    """Refuse what is not made to be a lock: its content would be overwritten."""
+    found = os.fstat(handle)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        raise OSError(errno.EINVAL, "is no lock file of its own", str(path))
 
 
 def _acquire(handle: int, path: Path, what: str) -> None:

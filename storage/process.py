@@ -88,9 +88,13 @@ def send(who: Json, number: signal.Signals) -> bool:
 
 
 def named(who: Json) -> str:
-    """``pid 12 of anna on bench, `sliplab collect ...`, since ...`` for messages."""
+    """``pid 12 of anna on bench, `sliplab collect ...`, since ...`` for messages.
+
+    Another user may have written it: nothing in it reaches a terminal that is no plain text.
+    """
     if "pid" not in who:
         return "a program that did not say its name"
+    who = {key: _printable(value) for key, value in who.items()}
     text = f"pid {who['pid']}"
     for word, key in (("of", "user"), ("on", "host")):
         if who.get(key):
@@ -100,6 +104,11 @@ def named(who: Json) -> str:
     if who.get("store"):
         text += f", for the store {who['store']}"
     return text + (f", since {who['since']}" if who.get("since") else "")
+
+
+def _printable(value: object) -> str:
+    text = "" if value is None else str(value)[:_COMMAND_CHARACTERS]
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _boot() -> str:

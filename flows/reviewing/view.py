@@ -135,10 +135,15 @@ def show(subject: Subject) -> None:
             raise StoreError(f"Rerun's viewer ended with {viewer.returncode}")
 
 
+ALONE = ("--bind", "127.0.0.1", "--port", "auto")
+"""Options of Rerun's viewer. Its server listens on every network of the computer unless told
+otherwise, and hands the file to whatever listens on its usual port, maybe another user's."""
+
+
 @contextmanager
 def _viewer(path: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
     # what it prints is for people: standard output has nothing but the command's result
-    viewer = subprocess.Popen([program(), str(path)], env=environment, stdout=2)
+    viewer = subprocess.Popen([program(), *ALONE, str(path)], env=environment, stdout=2)
     try:
         yield viewer
     finally:

@@ -162,7 +162,7 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
     except (OSError, TimeoutError, ValueError) as error:
         raise ClusterError(
             f"--dask {address}: no scheduler answers there ({_short(error)}); start one with "
-            "`dask scheduler`"
+            "`dask scheduler --host HOST` (docs/scale.md)"
         ) from None
     try:
         yield Cluster(address, client, _look_at_all(client, address))
@@ -176,8 +176,8 @@ def _look_at_all(client: Any, address: str) -> int:
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError:
         raise ClusterError(
-            f"--dask {address}: has no worker; start some with `dask worker {address} "
-            "--nworkers N --nthreads 1`"
+            f"--dask {address}: has no worker; start some with `dask worker {address} --host HOST "
+            "--nworkers N --nthreads 1` (docs/scale.md)"
         ) from None
     _ask_all(client, same_program, this_program(), "install the same version on it")
     cores = client.nthreads()

@@ -16,6 +16,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 from flows.cli.chain import package_file
 from flows.running import console, run_records
@@ -34,6 +36,8 @@ PORT = 4200
 PASSWORD = "page-password"
 """The file in Prefect's home that has the password of the service's own page."""
 _PASSWORD = r"[!-~]{30,200}"
+ANSWER_S = 10.0
+"""How long a server is waited for when it is asked whether it has a password."""
 CONTROL_POLL_S = 1.0
 """How often the page is asked for pause, resume and stop."""
 
@@ -47,12 +51,14 @@ def page_server(port: int) -> Iterator[str]:
 
     Raises:
         ServerError: ours did not start; its port may be taken.
-        InputError: the password cannot be kept where only this user can read it.
+        InputError: the password cannot be kept where only this user can read it, or the server at
+            PREFECT_API_URL asks for none.
     """
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
     url = PREFECT_API_URL.value()
     if url is not None:
+        refuse_open(url)
         yield url
         return
     home = Path(os.environ["PREFECT_HOME"])
@@ -69,6 +75,25 @@ def page_server(port: int) -> Iterator[str]:
             os.environ.pop(name, None)
             os.environ.update({name: before[name]} if name in before else {})
         server.stop()
+
+
+def refuse_open(url: str) -> None:
+    """Check that a Prefect server asks for a password; one that does not answer is not looked at.
+
+    Raises:
+        InputError: it does not, and whoever reaches it can move the arm.
+    """
+    address = run_records.server_name(url)
+    try:
+        with urlopen(f"{address}{urlsplit(url).path}/admin/version", timeout=ANSWER_S):
+            pass
+    except OSError:  # 401 is one, too
+        return
+    raise InputError(
+        "PREFECT_API_URL", "", address,
+        "asks for no password, so that any web page in a browser that reaches it can move the arm; "
+        "set PREFECT_SERVER_API_AUTH_STRING for the server and PREFECT_API_AUTH_STRING here",
+    )  # fmt: skip
 
 
 def page_password(home: Path) -> str:

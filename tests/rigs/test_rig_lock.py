@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import subprocess
@@ -116,3 +117,42 @@ def test_a_link_in_place_of_a_lock_is_not_followed(folder: Path, tmp_path: Path)
     with pytest.raises(RigError, match="cannot be locked"):
         held(real()).__enter__()
     assert (tmp_path / "precious").read_text() == "thesis"
+
+
+@pytest.mark.parametrize("kind", ["hard link", "pipe", "folder"])
+def test_what_another_user_put_in_place_of_a_lock_is_not_written_to(
+    folder: Path, tmp_path: Path, kind: str
+) -> None:
+    (tmp_path / "precious").write_text("thesis")
+    with held(real()):
+        pass
+    for path in folder.iterdir():
+        path.unlink()
+        if kind == "hard link":
+            path.hardlink_to(tmp_path / "precious")
+        elif kind == "pipe":
+            os.mkfifo(path)
+        else:
+            path.mkdir()
+    with pytest.raises(RigError, match="cannot be locked"):
+        held(real()).__enter__()
+    assert (tmp_path / "precious").read_text() == "thesis"
+
+
+def test_a_folder_whose_locks_anybody_may_delete_is_refused(folder: Path) -> None:
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.raises(RigError, match=r"every user may delete the locks in it"):
+        held(real()).__enter__()
+    folder.chmod(0o1777)
+    with held(real()):
+        pass
+
+
+def test_a_holders_words_reach_no_terminal_as_commands(folder: Path) -> None:
+    with held(real()):
+        (arm,) = folder.glob("arm-*.lock")
+        arm.write_text(json.dumps({"pid": "\x1b]0;owned\x07", "user": ["\n"], "command": "a\x9bb"}))
+        with pytest.raises(Locked, match=r"pid \?\]0;owned\?") as error:
+            held(real()).__enter__()
+    assert str(error.value).isprintable()

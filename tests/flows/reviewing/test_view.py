@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from storage import review
 from storage.derived import Derived
 from storage.errors import StoreError
 from storage.review import Onsets
+from tests.flows.listening import listening
 from tests.flows.reviewable import (
     EVENTS,
     FRAMES,
@@ -193,6 +196,28 @@ def test_nothing_is_sent_home(
         assert json.loads(file.read_text())["analytics_enabled"] is False
     assert not own.exists()  # the user's own choice stays
     assert not file.exists()
+
+
+def test_the_viewer_is_reached_from_this_computer_only(
+    made: Reviewable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # the server of Rerun's own program, with the options that the viewer gets, and no window
+    file = tmp_path / "a.rrd"
+    view.save(view.find(made.store, made.ids[1]), file)
+    with view.silent() as environment:
+        server = subprocess.Popen(
+            [view.program(), *view.ALONE, "--serve-grpc", str(file)],
+            env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            found: set[str] = set()
+            end = time.monotonic() + 60
+            while not found and time.monotonic() < end and server.poll() is None:
+                found = listening(server.pid)
+        finally:
+            server.kill()
+            server.wait(30)
+    assert found == {"127.0.0.1"}
 
 
 def test_what_is_missing_is_said(

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import re
+import shlex
 import shutil
 import signal
+import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,7 +33,9 @@ from storage.mirror import open_mirror
 from storage.push import push
 from storage.remote import Remote
 from storage.store import Store
+from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
+from tests.flows.listening import listening
 from tests.storage.remotes import tree
 
 WAIT_S = 30.0
@@ -205,3 +212,30 @@ def test_what_cannot_be_used_is_said_at_once(
     ):
         pass
     assert not (taken / "derived" / "labels").exists()
+
+
+@pytest.mark.parametrize("page", ["docs/scale.md", "docs/howto/analyse-on-a-cluster.md"])
+def test_the_commands_of_the_docs_listen_on_this_computer_only(page: str) -> None:
+    text = (ROOT / page).read_text()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    started: list[subprocess.Popen[bytes]] = []
+    try:
+        for kind in ("scheduler", "worker"):
+            found = re.search(rf"^(?:\$ )?dask {kind} .*$", text, re.M)
+            assert found is not None
+            line = found[0].removeprefix("$ ").replace("8786", port).replace("8787", "0")
+            line = re.sub(r"--nworkers \d+", "--nworkers 1", line)
+            command = [sys.executable, "-m", "distributed.cli.dask_" + kind]
+            command += shlex.split(line, comments=True)[2:]
+            started.append(
+                subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            )
+        with distributed.Client(f"127.0.0.1:{port}", timeout="60s") as client:
+            client.wait_for_workers(1, timeout=60)
+        assert [listening(process.pid) for process in started] == [{"127.0.0.1"}] * 2
+    finally:
+        for process in reversed(started):
+            process.terminate()
+            process.wait(30)

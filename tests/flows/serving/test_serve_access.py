@@ -8,16 +8,21 @@ import json
 import os
 import socket
 import stat
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import pytest
 
+from flows.serving import serve
+from protocols import InputError
 from storage.store import Store
 from tests.conftest import ROOT
-from tests.flows.serving.serving import Page, serving
+from tests.flows.serving.serving import Page, serving, until
 
 EVIL = "http://evil.example"
 RUN = {"parameters": {"wanted": {"protocol": "pilot.yaml"}}, "state": {"type": "SCHEDULED"}}
@@ -205,6 +210,60 @@ def test_a_run_is_answered_nothing_of_files_elsewhere(service: Service) -> None:
     ended = service.page.ended(run["id"])
     assert ended["type"] == "FAILED"
     assert "protocol = /proc/self/environ: must be a file .yaml or .yml below " in ended["message"]
+
+
+def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Path) -> None:
+    serve.refuse_open(service.page.url)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    serve.refuse_open(f"http://127.0.0.1:{port}/api")  # nobody there: Prefect says so
+    own = {"PREFECT_HOME": str(tmp_path), "PREFECT__SERVER_EPHEMERAL": "1"}
+    factory = ("--factory", "prefect.server.api.server:create_app")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "uvicorn", *factory, "--port", str(port), "--log-level", "error"],
+        env={**os.environ, **own},
+    )
+    try:
+        health = f"http://127.0.0.1:{port}/api/health"
+        until("an open server", lambda: process.poll() is not None or _answers(health))
+        with pytest.raises(InputError, match=r"PREFECT_API_URL = .* asks for no password"):
+            serve.refuse_open(f"http://anna:secret@127.0.0.1:{port}/api")
+    finally:
+        process.kill()
+        process.wait(30)
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urlopen(url, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("before", ["readable", "link", "empty", "folder"])
+def test_a_password_that_others_could_know_is_made_anew(before: str, tmp_path: Path) -> None:
+    path = tmp_path / serve.PASSWORD
+    first = serve.page_password(tmp_path)
+    assert serve.page_password(tmp_path) == first
+    if before == "readable":
+        path.chmod(0o640)
+    elif before == "link":
+        path.rename(tmp_path / "moved")
+        path.symlink_to("moved")
+    elif before == "empty":
+        path.write_text("")
+    else:
+        path.unlink()
+        path.mkdir()
+        with pytest.raises(InputError, match="cannot be written"):
+            serve.page_password(tmp_path)
+        return
+    second = serve.page_password(tmp_path)
+    assert second != first
+    assert (path.read_text().strip(), path.is_symlink()) == (second, False)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def test_a_service_that_is_ended_at_once_ends(tmp_path: Path) -> None:

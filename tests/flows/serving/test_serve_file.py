@@ -146,7 +146,12 @@ def test_the_compose_file_binds_to_the_loopback_and_holds_no_secret() -> None:
     ports = [port for service in compose["services"].values() for port in service.get("ports", ())]
     assert ports
     assert all(str(port).startswith("127.0.0.1:") for port in ports)
-    assert compose["secrets"] == {"postgres-password": {"file": "./secrets/postgres-password"}}
+    names = ("postgres-password", "page-password")
+    assert compose["secrets"] == {name: {"file": f"./secrets/{name}"} for name in names}
     assert "/secrets/" in (ROOT / ".gitignore").read_text().split()
     environments = [service.get("environment", {}) for service in compose["services"].values()]
     assert "POSTGRES_PASSWORD" not in {name for each in environments for name in each}
+    prefect = compose["services"]["prefect"]
+    assert 'PREFECT_SERVER_API_AUTH_STRING="$$(cat' in prefect["command"][0]
+    assert prefect["environment"]["PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED"] == "true"
+    assert "*" not in prefect["environment"]["PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS"]
