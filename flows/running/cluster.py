@@ -165,9 +165,56 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
             "`dask scheduler --host HOST` (docs/scale.md)"
         ) from None
     try:
+        _import_ours_first(client)
         yield Cluster(address, client, _look_at_all(client, address))
     finally:
         client.close(timeout=CONNECT_S)
+
+
+def _import_ours_first(client: Any) -> None:
+    """Have each worker, one that joins later too, import our packages before anything else.
+
+    A worker puts its scratch folder first on its import path, and keeps a folder ``storage`` in it.
+    Where this program is installed with ``pip install -e``, its packages are found by a finder that
+    stands behind Python's own, which takes that folder for our package. So they are imported once
+    while the scratch folder is not on the path. The plugin goes there by value, not by its name in
+    this module, which such a worker cannot import.
+
+    Raises:
+        ClusterError: the workers do not answer.
+    """
+    from distributed.diagnostics.plugin import WorkerPlugin
+
+    packages = _PACKAGES
+
+    class ImportOursFirst(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            import importlib
+            import sys
+
+            for name in packages:
+                there = sys.modules.get(name)
+                if there is not None and there.__file__ is None:  # a folder was taken for it
+                    for part in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+                        del sys.modules[part]
+            before = list(sys.path)
+            sys.path[:] = [place for place in before if place != worker.local_directory]
+            try:
+                for name in packages:
+                    importlib.import_module(name)
+            except ImportError:
+                pass  # not installed: whoever looks at the worker says so
+            finally:
+                sys.path[:] = before
+
+    register = client._register_worker_plugin  # as `client.register_plugin`, which knows no limit
+    try:
+        client.sync(
+            register, plugin=ImportOursFirst(), name="sliplab packages", idempotent=False,
+            callback_timeout=ANSWER_S,
+        )  # fmt: skip
+    except (OSError, TimeoutError) as error:
+        raise ClusterError(f"the Dask workers do not answer ({_short(error)})") from None
 
 
 def _look_at_all(client: Any, address: str) -> int:
