@@ -51,6 +51,8 @@ def import_(
         result = take_in(opened, name, found, where, kind, lambda trial: console.say(trial))
     for text in result.get("warnings", ()):
         console.say(f"warning: {text}")
+    if not as_json:
+        result.pop("warnings", None)
     finish(result, f"imported into {store}", as_json)
 
 

@@ -30,7 +30,13 @@ class Collected:
 
     @cached_property
     def plan(self) -> Plan:
-        """The plan of the campaign."""
+        """The plan of the campaign.
+
+        Raises:
+            InputError: it was imported, or its protocol is damaged.
+        """
+        if IMPORTED in self.campaign.info:
+            raise InputError("CAMPAIGN", "", self.name, "was imported: it has no protocol")
         enabled = self.campaign.info.get("enabled", ())
         return load_plan(self.campaign.protocol_file, enabled, stored=True)
 

@@ -65,7 +65,6 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
 
     width, height = _guarded(lambda: stream().dimensions(), None, 0)
     known = (int(width), int(height)) if (width, height) != _NO_SIZE else None
-    unknown = () if known else ("sensor size",)
 
     def all_events() -> Iterator[EventChunk]:
         count = 0
@@ -77,7 +76,7 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
     return ForeignTrial(
         name, path.name, all_events, "the camera's own clock, us, from the file's beginning",
         lambda: known, about={"read_by": LIBRARY},
-        unknown=("sync grade", "poses", "motion", "condition", "frames", "triggers", *unknown),
+        unknown=("sync grade", "poses", "motion", "condition", "frames", "triggers"),
     )  # fmt: skip
 
 

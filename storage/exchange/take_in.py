@@ -206,7 +206,7 @@ def _record(
             "format": kind,
             "from": trial.source,
             "epoch": trial.epoch,
-            "unknown": list(trial.unknown),
+            "unknown": [*trial.unknown, *([] if event_px else ["sensor size"])],
             **trial.about,
         },
     }

@@ -211,3 +211,19 @@ def test_only_a_file_whose_index_ends_early_has_the_newer_format(tmp_path: Path)
         write(tmp_path / name, _sparse(times), 1)
     with h5py.File(tmp_path / "whole") as whole, h5py.File(tmp_path / "cut") as cut:
         assert (whole.attrs["format"], cut.attrs["format"]) == (2, 3)
+
+
+def test_a_long_file_with_the_full_index_of_older_versions_reads_the_same(tmp_path: Path) -> None:
+    whole = _sparse([0, 5, 2**32 - 700, 2**32 + 700, 2**32 + 1_000_000, 2**32 + 1_999_999])
+    write(tmp_path / "t.h5", whole, 1)
+    with h5py.File(tmp_path / "t.h5", "r+") as file:
+        marks = np.searchsorted(whole.t_us, np.arange(2**32 // 1000 + 2002) * 1000)
+        file["ms_to_idx"].resize(len(marks) + 1, 0)
+        file["ms_to_idx"][:] = [*marks, len(whole)]
+        file.attrs["format"] = 2
+    edges = sorted({t + d for t in whole.t_us.tolist() for d in (-1, 0, 1)})
+    with StreamReader(tmp_path / "t.h5") as reader:
+        for start in edges:
+            for end in edges:
+                mask = (whole.t_us >= start) & (whole.t_us < end)
+                assert np.array_equal(reader.events(start, end).t_us, whole.t_us[mask])

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -14,7 +15,9 @@ from flows.__main__ import _run
 from flows.planning.orders import make_order
 from flows.running.campaigns import collected
 from protocols import InputError
+from storage.exchange.aedat4 import Aedat4Writer, Stream
 from storage.store import Store, StoreError
+from storage.streams import EventChunk
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.exchange.files import lab_hdf5
@@ -55,6 +58,36 @@ def test_in_and_out(tmp_path: Path, sliplab: Any) -> None:
     assert (code, json.loads(told)["imported"]) == (0, ["slide"])
     assert not Store.open(store).simulated
     code, *_ = sliplab("export", store, "a", "--labels", "--output", tmp_path / "l.csv")
+    assert code == 0
+
+
+@pytest.mark.parametrize("command", ["view", "review"])
+def test_a_command_that_needs_a_protocol_says_that_there_is_none(
+    tmp_path: Path, sliplab: Any, command: str
+) -> None:
+    lab_hdf5(tmp_path / "slide.h5")
+    store = tmp_path / "store"
+    sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "a")
+    options = ("slide", "--save", tmp_path / "t.rrd") if command == "view" else ()
+    code, _, said = sliplab(command, store, *options)
+    assert code == 2
+    assert "CAMPAIGN = a: was imported: it has no protocol" in " ".join(said.split())
+
+
+def test_a_gap_of_years_is_said(tmp_path: Path, sliplab: Any) -> None:
+    column = np.arange(200, dtype=np.uint16)
+    times = np.concatenate([[0], 1_795_000_000_000_000 + np.arange(199)]).astype(np.int64)
+    path = tmp_path / "a.aedat4"
+    with Aedat4Writer(path, {0: Stream("EVTS", "events", (346, 260), "DAVIS346")}) as file:
+        file.events(0, EventChunk(column, column, column.astype(np.uint8) % 2, times))
+    store = tmp_path / "store"
+    code, told, said = sliplab("import", path, "--store", store, "--name", "a", "--json")
+    assert code == 0
+    assert len(json.loads(told)["warnings"]) == 1
+    assert "warning: a.aedat4: 498,611.1 hours without an event between 0 and" in " ".join(
+        said.split()
+    )
+    code, *_ = sliplab("verify", store)
     assert code == 0
 
 

@@ -157,6 +157,7 @@ def test_the_resolution_of_the_labs_streams(
     _stream(tmp_path / "a.h5", resolution, x, y)
     (found,) = _import(tmp_path / "store", tmp_path / "a.h5")
     assert found.record["geometry"]["event_px"] == size
+    assert ("sensor size" in found.record["imported"]["unknown"]) == (size is None)
     events = found.events()
     assert [events.p.tolist(), events.x.tolist(), events.y.tolist()] == [[1, 0], x, y]
 
