@@ -17,7 +17,7 @@ from protocols.factors import MAX_TRIALS, Factor, unknown_factor
 from protocols.phases import Phase
 from protocols.quantity import FactorRef
 from protocols.settings import AnalysisSettings
-from protocols.yaml_file import KeyedError, StrictModel
+from protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
@@ -171,7 +171,7 @@ class Protocol(StrictModel):
 
     protocol: Literal[1]
     """Version of the file format."""
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,47}$")]
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
     title: Annotated[str, Field(max_length=200)] = ""
     collection: Collection
     analysis: AnalysisSettings = AnalysisSettings()

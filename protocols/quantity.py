@@ -96,6 +96,7 @@ def parse(raw: object, unit: str) -> Decimal:
         ValueError: no number, no unit, or a unit of another kind; the text says what is right.
     """
     if isinstance(raw, (int, float, Decimal)) and not isinstance(raw, bool):
+        to_decimal(raw)
         raise ValueError(f"has no unit: write a number with a unit, such as '{raw} {unit}'")
     match = _PATTERN.fullmatch(raw) if isinstance(raw, str) else None
     if match is None:

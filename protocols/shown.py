@@ -99,7 +99,7 @@ def _yaml(value: object, key: str) -> str:
         return ".nan" if number.is_nan() else ".inf" if number > 0 else "-.inf"
     if isinstance(value, date):
         return value.isoformat()
-    return _without_secret(str(value))
+    return _without_secret(str(value)) or "''"
 
 
 def _without_secret(text: str) -> str:

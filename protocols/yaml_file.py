@@ -23,6 +23,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from protocols.errors import InputError
+from protocols.quantity import number_meant
 from protocols.shown import MASK, holds_secret, is_secret
 
 MAX_BYTES = 1 << 20
@@ -50,7 +51,7 @@ class StrictModel(BaseModel):
 
 
 _NOTHING: frozenset[Any] = frozenset()
-_NUMBERS: frozenset[Any] = frozenset({int, float, Decimal})
+_NUMBERS: frozenset[Any] = frozenset({int, float})  # decimals have readers of their own
 
 
 @cache
@@ -177,7 +178,7 @@ class _Builder:
         try:
             if kind == "null":
                 return None
-            if kind in {"str", "value"}:
+            if kind in {"str", "value", "merge"}:
                 return text
             if kind == "bool":
                 return self._loader.construct_yaml_bool(node)
@@ -374,17 +375,24 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
         tag = str(context.get("discriminator", "'kind'")).strip("'")
         found = value.get(tag) if isinstance(value, dict) else value
         return InputError(path, f"{key}.{tag}", found, f"must be one of {tags}")
+    message = re.sub("^Input should", "must", first["msg"])
+    expected = _EXPECTED.get(kind, message[0].lower() + message[1:])
+    if value is None:
+        return InputError(path, key, None, f"is empty; {expected}")
     if kind in _EXPECTED:
-        expected = _EXPECTED[kind]
-        if value is None:
-            return InputError(path, key, None, f"is empty; {expected}")
+        if isinstance(value, str) and (meant := number_meant(value)):
+            return InputError(path, key, value, meant)
         if kind == "string_type" and not isinstance(value, list | tuple | dict):
             reads = "a switch" if isinstance(value, bool) else "a day"
             reads = "a number" if isinstance(value, int | Decimal) and reads == "a day" else reads
             expected += f" and reads as {reads}: quote it"
-        return InputError(path, key, value, expected)
-    message = first["msg"]
-    return InputError(path, key, value, message[0].lower() + message[1:])
+    if context.get("pattern") == NAME_PATTERN:
+        expected = f"must be {NAME_WORDS} (pattern {NAME_PATTERN})"
+    return InputError(path, key, value, expected)
+
+
+NAME_PATTERN = "^[a-z][a-z0-9_-]{0,47}$"
+NAME_WORDS = "a small letter, then small letters, digits, '-' and '_', 48 characters at most"
 
 
 _LIST, _MAPPING = "must be a list ([a, b], or lines that begin with -)", "must be a mapping"

@@ -17,6 +17,7 @@ from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpe
 from protocols.shown import MASK
 from protocols.timing import Timing
 from protocols.yaml_file import (
+    NAME_PATTERN,
     KeyedError,
     StrictModel,
     mask_secrets,
@@ -102,7 +103,7 @@ class RigFile(StrictModel):
 
     rig: Literal[1]
     """Version of the file format."""
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,47}$")]
+    name: Annotated[str, Field(pattern=NAME_PATTERN)]
     driver: Literal["mock", "devices", "loopback"]
     """`mock`: simulated devices in this program, as fast as it goes. `devices`: the real ones.
     `loopback`: the real drivers in real time, with stand-ins that show the simulated scene."""

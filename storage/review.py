@@ -198,4 +198,6 @@ def _onsets(data: Json) -> Onsets:
     for name, value in values.items():
         if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
             raise ValueError(f"{name} = {value!r}: must be whole nanoseconds")
+        if value is not None and abs(value) >= 2**63:
+            raise ValueError(f"{name} = {value}: must be less than 2^63 ns in size")
     return Onsets(**values)

@@ -2,6 +2,7 @@
 
 import copy
 import os
+import re
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
@@ -9,8 +10,11 @@ from typing import Any
 
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from protocols import InputError, load_plan
+from protocols import InputError, Protocol, load_plan, make_plan
+from protocols.yaml_file import parse_yaml, validate
 from tests.conftest import ROOT
 
 Change = Callable[[dict[str, Any]], None]
@@ -497,3 +501,49 @@ def test_protocols_in_stores_are_held_to_the_rules_of_their_day(
         assert len(load_plan(path, stored=True)) > 0
         with pytest.raises(InputError):
             load_plan(path)
+
+
+PLACE = "a-place-for-text"
+TEXTS = [
+    "yes", "no", "~", "2026-11-23", "2026-02-30", "12:30", "0x10", "1e12", "1.0e+12", ".inf",
+    "-.inf", ".nan", "-1", "[]", "[2.5, {a: 0.5}]", "{a: 0.5}", "!include x", "!!set {a}", "*a",
+    "<<", "&a 5", '"\\e[31mred"', '"\\x9b31m"', '"\\u202Ered"', "2,5", "2,5 mm", "\u221210 mm",
+    "5 \u00b5m", "1,000 mm", "$sped", "$", "1 um", "''", "'a: b'", "99999999999999999999",
+    "1000000 m",
+]  # fmt: skip
+SHIPPED: dict[str, dict[str, Any]] = {
+    name: yaml.safe_load((ROOT / "protocols" / f"{name}.yaml").read_text())
+    for name in ("kinematic", "gravity", "disturbance")
+}
+
+
+def _leaves(data: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    if not isinstance(data, dict | list):
+        return [path]
+    pairs = data.items() if isinstance(data, dict) else enumerate(data)
+    return [path, *(leaf for key, part in pairs for leaf in _leaves(part, (*path, key)))][
+        0 if path else 1 :
+    ]
+
+
+LEAVES = [(name, path) for name, data in SHIPPED.items() for path in _leaves(data)]
+
+
+@settings(max_examples=600)
+@given(st.sampled_from(LEAVES), st.sampled_from(TEXTS))
+def test_whatever_stands_at_a_key_is_taken_or_named(where: Any, text: str) -> None:
+    """Any text at any key: a plan, or one message in one line that names a key of the file."""
+    name, path = where
+    data = copy.deepcopy(SHIPPED[name])
+    _set(*path, to=PLACE)(data)
+    written = yaml.safe_dump(data, sort_keys=False).replace(PLACE, text)
+    error = None
+    try:
+        make_plan(validate(Protocol, parse_yaml(written, "p.yaml"), "p.yaml"), "p.yaml")
+    except InputError as found:
+        error = found
+    if error is not None:
+        assert error.message.startswith("p.yaml: ")
+        assert not re.search(r"[\x00-\x1f\x7f-\x9f\u202e]|Decimal\(|datetime", error.message)
+        assert error.key.startswith((str(path[0]), "collection", "analysis")), error.message
+        assert error.expected

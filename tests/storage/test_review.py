@@ -118,3 +118,6 @@ def test_onsets_are_whole_nanoseconds(store: Store) -> None:
         path.write_text(good.replace('"incipient_ns": 110', f'"incipient_ns": {bad}'))
         with pytest.raises(StoreError, match="whole nanoseconds"):
             review.last(store, "c", "t")
+    path.write_text(good.replace('"incipient_ns": 110', f'"incipient_ns": {2**63}'))
+    with pytest.raises(StoreError, match="less than 2\\^63 ns"):
+        review.last(store, "c", "t")

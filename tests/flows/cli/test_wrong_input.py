@@ -379,3 +379,18 @@ def test_numeric_options_are_bounded(option: str) -> None:
 def test_options_take_finite_numbers_alone(command: tuple[str, ...], value: str) -> None:
     line = refused(*command, value)
     assert f"{command[-1]} = {value}: " in line
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("dept=2.4", "--enable = dept=2.4: unknown factor dept; defined factors: depth, speed, "),
+        ("", "--enable = '': unknown factor ; defined factors: depth, speed, direction"),
+        (f"direction={MINUS}90", f"= {MINUS}90: holds U+2212 MINUS SIGN: write '-90'"),
+        ("depth=2,4", "= 2,4: has a decimal comma: write '2.4'"),
+        ("depth=nan", "= nan: must be a finite number"),
+        ("depth=\x1b[31m", "= \\x1b[31m: must be a number"),
+    ],
+)
+def test_levels_to_be_enabled(given: str, message: str) -> None:
+    assert message in refused("plan", ROOT / "protocols" / "pilot.yaml", "--enable", given)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -94,3 +95,24 @@ def test_no_path_of_a_result_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "results", Console(file=out, width=80, color_system=None))
     console.print_pairs("report", {"page": path, "trials": 3})
     assert path in out.getvalue()
+
+
+def test_data_are_neither_control_codes_nor_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    text = "\x1b]0;title\x07 \x9b31m \u202e [red]x[/] [/no]"
+    with pytest.MonkeyPatch.context() as patch:
+        out = io.StringIO()
+        patch.setattr(console, "results", Console(file=out, width=500, highlight=False))
+        patch.setattr(console, "messages", Console(file=out, soft_wrap=True, highlight=False))
+        console.print_table(text, ["a", text], [[text, 1.5], [None, text]])
+        console.print_pairs(text, {text: text})
+        console.say(text)
+        with console.bar(text, 2) as bar:
+            bar.advance(note=text)
+        console.print_json({"a": text})
+    shown = out.getvalue()
+    assert shown.count("\\x1b]0;title\\x07 \\x9b31m \\u202e [red]x[/] [/no]") >= 7
+    written = capsys.readouterr().out
+    assert json.loads(written) == {"a": text}
+    for steers in "\x1b\x07\x9b\u202e":
+        assert steers not in shown
+        assert steers not in written
