@@ -18,7 +18,7 @@ from protocols.errors import InputError
 from storage import review
 from storage.derived import Derived
 from storage.errors import StoreError
-from storage.store import Store
+from storage.store import IMPORTED, Store
 from storage.streams import Json
 
 LabelState = Literal["fresh", "stale", "missing"]
@@ -158,7 +158,10 @@ class TrialList:
                 raise InputError(
                     "--campaign", "", name, f"is not in {self.store.folder}; there are {there}"
                 )
-        items = {name: Collected(found[name]) for name in (self._names or sorted(found))}
+        ours = sorted(name for name, item in found.items() if IMPORTED not in item.info)
+        # a store with nothing else is refused by the first imported campaign's own message
+        names = self._names or ours or sorted(found)
+        items = {name: Collected(found[name]) for name in names}
         rows: list[Row] = []
         for item in items.values():
             whole = item.campaign.committed()

@@ -16,9 +16,12 @@ from protocols.errors import InputError
 from storage import review
 from storage.derived import Derived
 from storage.errors import StoreError
+from storage.exchange.find import trials_in
+from storage.exchange.take_in import take_in
 from storage.recording import Recording
 from storage.review import Onsets, Verdict
 from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
+from tests.storage.exchange.files import lab_hdf5
 
 NEW = Onsets(300_000_000, 500_000_000)
 
@@ -126,6 +129,15 @@ def test_a_damaged_decision_stops_what_would_use_it(made: Reviewable) -> None:
         Labels(made.store, reviewed=True).key(made.item, recording(made, trial))
     assert Labels(made.store).key(made.item, recording(made, trial)) == made.keys[trial]
     assert "000001.json" in TrialList(made.store).rows[0].problem
+
+
+def test_imported_campaigns_beside_it_are_left_out(made: Reviewable, tmp_path: Path) -> None:
+    path = tmp_path / "slide.h5"
+    lab_hdf5(path)
+    take_in(made.store, "theirs", trials_in(path, "lab-hdf5"), path, "lab-hdf5")
+    assert [row.trial for row in TrialList(made.store).rows] == made.ids
+    with pytest.raises(InputError, match="theirs: was imported"):
+        TrialList(made.store, ["theirs"])
 
 
 def test_the_list_follows_the_store(made: Reviewable) -> None:
