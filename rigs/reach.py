@@ -7,8 +7,6 @@ import socket
 from collections.abc import Callable
 
 from rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
-from rigs.cameras.basler import look_for_camera
-from rigs.cameras.event_source import find_camera, greet
 from rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
 from rigs.capabilities import RigError
 from rigs.devices import DeviceSettings
@@ -59,6 +57,8 @@ def _listens(host: str, port: int) -> str | None:
 
 
 def _event_camera(settings: DvxplorerSettings) -> str | None:
+    from rigs.cameras.event_source import find_camera, greet
+
     source = settings.source
     if isinstance(source, NetworkStream):
         greet(source.host, source.events_port)
@@ -69,6 +69,8 @@ def _event_camera(settings: DvxplorerSettings) -> str | None:
 
 
 def _frame_camera(settings: BaslerSettings) -> str | None:
+    from rigs.cameras.basler import look_for_camera
+
     look_for_camera(settings.serial)
     return None
 
