@@ -1,42 +1,80 @@
-"""The program's entry: runs the command line, maps faults to messages and exit codes."""
+"""The program's entry: runs the command line, maps faults to messages and exit codes.
+
+Next to nothing is loaded before `main`: what fails while the rest is loaded, for
+want of memory or of open files, is said in one line as well.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 import sys
+from contextlib import suppress
 
-import typer
-
-from flows.cli import errors
-from flows.running import console, garbage, stopping
-from protocols.errors import InputError
+from flows.running.limits import exhausted
 
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
-    garbage.seldom()
-    with stopping.signals():
-        code = _run()
+    try:
+        from flows.running import garbage
+        from flows.running.standard_streams import OutputLost, guarded
+
+        garbage.seldom()
+        try:
+            with guarded():
+                code = _run()
+        except OutputLost as error:  # of what was left to be written
+            code = _fail(str(error), 1)
+    except KeyboardInterrupt:
+        code = _fail("interrupted", 130)
+    except (ImportError, MemoryError, OSError) as error:
+        code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
     sys.exit(code)
 
 
 def _run() -> int:
-    console.begin(as_json="--json" in sys.argv[1:])
-    try:
-        from flows.cli.app import app
+    from flows.running import console, stopping
 
-        code = app(standalone_mode=False)
-        if code == console.INTERRUPTED:
+    console.begin(as_json="--json" in sys.argv[1:])
+    with stopping.signals():
+        from flows.cli import errors
+
+        try:
+            from flows.cli.app import app
+
+            code = app(standalone_mode=False)
+            if code == console.INTERRUPTED:
+                return errors.interruption().report()
+            return code if isinstance(code, int) else console.DONE
+        except KeyboardInterrupt:
             return errors.interruption().report()
-        return code if isinstance(code, int) else console.DONE
-    except KeyboardInterrupt:
+        except Exception as error:
+            return _explain(error)
+
+
+def _explain(error: Exception) -> int:
+    """Say what ended the command; returns the exit code."""
+    from flows.cli import errors
+    from flows.running import stopping
+    from protocols.errors import InputError
+
+    if stopping.requested() and not isinstance(error, InputError):
         return errors.interruption().report()
-    except typer.Exit as ended:
-        return int(ended.exit_code)
-    except InputError as error:
-        return errors.failure(error).report()
-    except Exception as error:
-        stopped = stopping.requested()
-        return (errors.interruption() if stopped else errors.failure(error)).report()
+    return errors.failure(error).report()
+
+
+def _fail(message: str, code: int) -> int:
+    """Say in one line what ended the program before, or after, it could say more."""
+    said = message if code == 130 else f"error: {message}"
+    with suppress(OSError):
+        os.write(2, f"{said}\n".encode(errors="backslashreplace"))
+    console = sys.modules.get("flows.running.console")
+    if "--json" in sys.argv[1:] and not (console and console.printed()):
+        known = {"file": None, "key": None, "value": None, "message": message, "exit_code": code}
+        with suppress(OSError):
+            os.write(1, f"{json.dumps({'error': known})}\n".encode())
+    return code
 
 
 if __name__ == "__main__":

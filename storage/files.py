@@ -31,7 +31,7 @@ _NAME_BYTES = 200
 _FAULTS = {
     errno.ENOSPC: "is full",
     errno.EDQUOT: "has no room left for this user (quota)",
-    errno.EFBIG: "takes no larger file",
+    errno.EFBIG: "takes no larger file (see ulimit -f)",
     errno.EROFS: "is read-only",
     errno.EACCES: "may not be written to by this user",
     errno.EPERM: "may not be written to by this user",
@@ -40,6 +40,7 @@ _FAULTS = {
     errno.ENODEV: "is gone",
     errno.ESTALE: "is gone",
 }
+_OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
 _IN_WORDS = re.compile(r"errno = (\d+)")
 
 
@@ -62,6 +63,11 @@ def disk_fault(error: BaseException | None) -> str | None:
 def disk_full(error: BaseException | None) -> bool:
     """Whether `error`, or what caused it, is a disk or a quota without room."""
     return disk_fault(error) in {_FAULTS[errno.ENOSPC], _FAULTS[errno.EDQUOT]}
+
+
+def own_fault(error: Exception) -> bool:
+    """Whether a file could not be read for want of memory or open files: it is not damaged."""
+    return isinstance(error, OSError) and error.errno in _OWN_FAULTS
 
 
 def sync_folder(folder: Path) -> None:

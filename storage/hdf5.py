@@ -9,6 +9,7 @@ same data are the same bytes.
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_left
 from pathlib import Path
 from types import TracebackType
@@ -163,18 +164,37 @@ class StreamFile:
                 column.append(values)
 
     def finish(self) -> None:
-        """Write what is held back and the index, and close the file."""
-        if self._next_ms > INDEXED_MS:
-            self._file.attrs["format"] = INDEX_CUT_FORMAT
-        else:  # one more mark, so that the last millisecond has an end
-            self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
-        for column in self._columns.values():
-            column.flush()
-        self._file[OFFSET][()] = self._offset or 0
+        """Write what is held back and the index, and close the file, whatever happens."""
+        try:
+            if self._next_ms > INDEXED_MS:
+                self._file.attrs["format"] = INDEX_CUT_FORMAT
+            else:  # one more mark, so that the last millisecond has an end
+                self._append(INDEX, np.full(1, self._columns[TIMES].count, np.int64))
+            for column in self._columns.values():
+                column.flush()
+            self._file[OFFSET][()] = self._offset or 0
+            self._file.flush()
+        except BaseException:
+            self.abandon()
+            raise
         self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the file as far as its disk takes it.
+
+        HDF5 ends the program with a segmentation fault, at once or at its exit, if it cannot write
+        while it closes a file. What the disk does not take goes to /dev/null instead.
+        """
+        if not self._file:
+            return
+        try:
+            self._file.flush()
+        except (OSError, RuntimeError):
+            nothing = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+            try:
+                os.dup2(nothing, self._file.id.get_vfd_handle(), inheritable=False)
+            finally:
+                os.close(nothing)
         self._file.close()
 
 

@@ -12,7 +12,7 @@ from protocols.errors import InputError
 from protocols.yaml_file import parse_yaml
 from storage.columns import TIMING, TRACKS
 from storage.errors import StoreError
-from storage.files import read_json, temporary_files
+from storage.files import own_fault, read_json, temporary_files
 from storage.hdf5 import StreamReader
 from storage.record_shape import check_record
 from storage.recording import RECORD_FORMAT
@@ -115,12 +115,16 @@ def _trial(folder: Path) -> Found:
     try:
         read_json(folder / PROVENANCE)
     except (OSError, ValueError) as error:
+        if own_fault(error):
+            raise
         found.append((folder / PROVENANCE, f"cannot be read: {error}"))
     if found or any(to_fetch(folder / name) for name in sums):
         return found
     try:
         return _contents(folder)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        if own_fault(error):
+            raise
         return [(folder, f"cannot be read: {error}")]
 
 

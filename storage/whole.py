@@ -7,7 +7,7 @@ import re
 import stat
 from pathlib import Path
 
-from storage.files import read_json, sha256, write_json
+from storage.files import own_fault, read_json, sha256, write_json
 from storage.streams import Json
 from storage.writer import CHECKSUMS, DATA, RECORD
 
@@ -23,11 +23,14 @@ def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
     Raises:
         ValueError: missing, damaged, or without one of the files that are `needed`; the message
             names the file.
+        OSError: this program has no more memory or open files; nothing is known of the file.
     """
     path = folder / CHECKSUMS
     try:
         sums = read_json(path)
     except OSError as error:
+        if own_fault(error):
+            raise
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
     for name, said in sums.items():
         plain = (
@@ -47,7 +50,9 @@ def size_problem(path: Path, said: Json) -> str | None:
     """What is wrong with a file without reading it; None when it is there with all its bytes."""
     try:
         found = path.lstat()
-    except OSError:
+    except OSError as error:
+        if own_fault(error):
+            raise
         return "is missing"
     if not stat.S_ISREG(found.st_mode):
         return "is no plain file"
@@ -63,6 +68,8 @@ def byte_problem(path: Path, said: Json) -> str | None:
         try:
             return None if sha256(path) == said["sha256"] else "does not match its checksum"
         except OSError as error:
+            if own_fault(error):
+                raise
             return f"cannot be read: {error.strerror}"
     return problem
 

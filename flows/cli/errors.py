@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +19,16 @@ from pydantic import ValidationError
 from typer.exceptions import TyperException
 
 from flows.running import console
+from flows.running.limits import exhausted
+from flows.running.standard_streams import OutputLost
 from protocols.errors import InputError
 from storage.errors import StoreError, disk_error
+from storage.files import disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
-_EXPECTED = {"RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError"}
+_EXPECTED = {
+    "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError", "OutputLost"
+}  # fmt: skip
 """Errors whose message says all there is to say, by name: their modules take long to load."""
 _OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|TRIAL|URL")
 """An `InputError` about an option or an argument has its name where others have a file."""
@@ -53,7 +59,8 @@ class Failure:
         if self.message:
             console.say(self.message if self.interrupted else f"error: {self.message}")
         named = {"file": self.file, "key": self.key, "value": self.value}
-        console.print_error({**named, "message": self.message}, self.exit_code)
+        with suppress(OutputLost):  # it was said on standard error
+            console.print_error({**named, "message": self.message}, self.exit_code)
         return self.exit_code
 
     @property
@@ -69,14 +76,20 @@ def interruption() -> Failure:
 
 def failure(error: Exception) -> Failure:
     """Name what `error` is about, and choose the exit code."""
-    if isinstance(error, InputError):
-        return _wrong_input(error)
+    if isinstance(error, typer.Exit):
+        return Failure("", error.exit_code)
     if isinstance(error, typer.Abort):
         return interruption()
+    if known := exhausted(error):
+        return Failure(known, console.FAILED)
+    if isinstance(error, InputError):
+        return _wrong_input(error)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
     if isinstance(error, OSError) and error.filename:
         error = disk_error(Path(os.fsdecode(error.filename)), error) or error
+    elif isinstance(error, OSError) and (fault := disk_fault(error)):
+        return Failure(f"a file cannot be written: its disk {fault}", console.FAILED)
     if isinstance(error, StoreError):
         return Failure(str(error), console.FAILED, _place(str(error)))
     trace = ""

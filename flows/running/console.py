@@ -73,6 +73,11 @@ def begin(*, as_json: bool) -> None:
     _as_json, _printed = as_json, False
 
 
+def printed() -> bool:
+    """Whether the command has printed its one JSON object."""
+    return _printed
+
+
 def print_error(named: Mapping[str, str | None], exit_code: int) -> None:
     """The error as the one JSON object of a command that was asked for one and has none yet.
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM that cannot get lost.
+"""Ctrl-C, SIGTERM and SIGHUP that cannot get lost.
 
 Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
 reference's callback that exception is printed and dropped, and the program goes on, which an arm
@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from types import FrameType
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a request to end, and a terminal that was closed: the arm stops first on each."""
 _requested = threading.Event()
 
 
@@ -86,11 +88,13 @@ def wait(seconds: float) -> None:
 
 @contextmanager
 def signals() -> Iterator[None]:
-    """Answer SIGINT and SIGTERM while the block runs; only the main thread can, others pass."""
+    """Answer `SIGNALS` while the block runs; only the main thread can, others pass."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    if before[signal.SIGHUP] is signal.SIG_IGN:  # under nohup it is meant to outlive its terminal
+        del before[signal.SIGHUP]
     if before[signal.SIGINT] is not _handle:  # a request stands until the outermost block ends
         _requested.clear()
     for number in before:

@@ -17,7 +17,7 @@ from flows.running import console, stopping
 
 
 def test_a_signal_interrupts_and_is_remembered() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with stopping.signals():
             assert not stopping.requested()
             with pytest.raises(KeyboardInterrupt):
@@ -48,6 +48,16 @@ def test_handlers_are_put_back() -> None:
     with stopping.signals():
         assert signal.getsignal(signal.SIGINT) is not before
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_program_that_outlives_its_terminal_is_not_stopped_by_it() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        with stopping.signals():
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stopping.requested()
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture(autouse=True)

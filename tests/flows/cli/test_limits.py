@@ -1,0 +1,172 @@
+"""Limits of the system that a command runs into: one line, exit 1, and nothing called damaged."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flows.running.limits import exhausted
+from storage.errors import StoreError
+from storage.store import Store
+from storage.verify import verify
+from tests.command_line import here
+from tests.conftest import ROOT
+
+PLAN = (ROOT / "protocols" / "pilot.yaml",)
+
+
+STARTED = """
+import resource, sys
+from flows.__main__ import main
+which, limit = getattr(resource, sys.argv.pop(1)), int(sys.argv.pop(1))
+resource.setrlimit(which, (limit, limit))
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("which", "limit", "message"),
+    [
+        ("RLIMIT_AS", 40_000 << 10, "there is not enough memory (ulimit -v is 40000): "),
+        ("RLIMIT_AS", 60_000 << 10, "there is not enough memory (ulimit -v is 60000): "),
+        ("RLIMIT_NOFILE", 3, "too many files are open (ulimit -n is 3): "),
+    ],
+)
+def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STARTED, which, str(limit), "plan", *PLAN, "--json"], cwd=ROOT,
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    error = json.loads(done.stdout)["error"]
+    assert (done.returncode, error["exit_code"]) == (1, 1)
+    assert error["message"].startswith(message)
+    assert done.stderr.startswith(f"error: {message}")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("raised", "message"),
+    [
+        (MemoryError(), "there is not enough memory"),
+        (MemoryError("Unable to allocate 11.9 TiB for an array"), "there is not enough memory"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "there is not enough memory"),
+        (ImportError("libx.so: failed to map segment from shared object"), "not enough memory"),
+        (OSError(errno.EMFILE, "Too many open files", "x.json"), "too many files are open"),
+        (OSError(errno.ENFILE, "Too many open files in system"), "too many files are open"),
+        (BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"), "no more processes"),
+        (RuntimeError("can't start new thread"), "no more processes or threads can be started"),
+        (OSError(errno.EFBIG, "File too large"), "its disk takes no larger file"),
+        (OSError(errno.ENOSPC, "No space left on device"), "its disk is full"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("hidden", [False, True])
+def test_what_has_run_out_is_said(
+    raised: Exception, message: str, hidden: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the system's own error was replaced by one that names a file."""
+
+    def fail(*_: object) -> None:
+        if not hidden:
+            raise raised
+        try:
+            raise raised
+        except Exception as error:
+            raise StoreError(f"s/store.json: {error}; it is damaged") from None
+
+    monkeypatch.setattr("protocols.plan.load_plan", fail)
+    done = here("plan", *PLAN, "--json")
+    assert done.returncode == 1
+    if not hidden or exhausted(raised):
+        assert message in json.loads(done.stdout)["error"]["message"]
+    assert done.stderr.count("\n") == 1
+
+
+def test_without_processes_a_collection_ends_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fork(*_: object, **__: object) -> None:
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr("flows.running.orchestration._servers", {})
+    monkeypatch.setattr("flows.running.embedded_server.subprocess.Popen", fork)
+    words = (*PLAN, "--rig", "rehearsal", "--store", tmp_path / "s", "--trials", 1)
+    done = here("collect", *words, "--json")
+    error = json.loads(done.stdout)["error"]
+    assert done.returncode == 1
+    assert "no more processes or threads can be started" in error["message"]
+    assert "Traceback" not in done.stderr
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store with one committed trial."""
+    done = here(
+        "collect", *PLAN, "--rig", "rehearsal", "--store", tmp_path / "s", "--trials", 1
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return Store.open(tmp_path / "s")
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
+@pytest.mark.parametrize("place", ["storage.whole.read_json", "storage.whole.sha256"])
+def test_a_trial_that_cannot_be_read_now_is_not_damaged(
+    number: int, place: str, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sweeping and quarantine would move a whole trial away."""
+    (campaign,) = store.campaigns()
+    before = campaign.committed()
+
+    def fail(path: Path) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(place, fail)
+        with pytest.raises(OSError, match=os.strerror(number)):
+            verify(store)
+        if place.endswith("read_json"):
+            with pytest.raises(OSError, match=os.strerror(number)):
+                campaign.sweep()
+        done = here("verify", store.folder, "--quarantine", "--json")
+        assert done.returncode == 1
+        assert list(json.loads(done.stdout)) == ["error"]
+    assert campaign.committed() == before
+    assert campaign.quarantined() == []
+    assert verify(store) == []
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from storage.hdf5 import StreamFile
+from tests.storage.trials import events
+path = Path(sys.argv[1])
+file = StreamFile(path)
+most = path.stat().st_size + 30_000
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+file.add_events(events(200_000))
+try:
+    getattr(file, sys.argv[2])()
+    print("closed")
+except OSError as error:
+    print("refused", error.errno)
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "said"), [("finish", f"refused {errno.EFBIG}"), ("abandon", "closed")]
+)
+def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
+    how: str, said: str, tmp_path: Path
+) -> None:
+    """HDF5 crashed it at its exit: collect ended with a segmentation fault, not with exit 1."""
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, tmp_path / "data.h5", how], cwd=ROOT, text=True,
+        capture_output=True, timeout=120,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (0, f"{said}\n"), done.stderr
