@@ -97,11 +97,11 @@ class LibraryProcess:
         try:
             if self._pipe.closed or self._child.poll() is not None:
                 raise self._error(f"{name}: the {self._what} is gone")
+            self._owed += 1  # before it is sent: an answer too many would be taken for the next
             try:
                 self._pipe.send((name, arguments, within_s))
             except OSError:
                 raise self._error(f"{name}: the {self._what} is gone{self._said()}") from None
-            self._owed += 1
             return self._answer(name, within_s)
         finally:
             self._lock.release()

@@ -111,6 +111,8 @@ class Rig:
     ending: tuple[Callable[[], None], ...] = ()
     _reported: str = field(default="", init=False)
     """Why the arm could not be stopped, as somebody has been told already."""
+    _hangs: bool = field(default=False, init=False)
+    """The plate was let go and not caught: it hangs on the sensor, or falls."""
 
     def connect(self) -> None:
         """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
@@ -288,7 +290,9 @@ class Rig:
         if isinstance(step, PlateStep):
             if self.plate is None:
                 raise RigError("plate", f"this rig has no sliding plate to {step.action}")
+            self._hangs = step.action == "release" or self._hangs
             self.plate.act(step.action, step.seconds)
+            self._hangs = step.action == "release"
         self.wait(step.seconds, sink)
         return StepTimes(index, step.phase, start, self.arm.now_ns())
 
@@ -393,8 +397,8 @@ class Rig:
         """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
 
         A device that fails while it is stopped does not keep the others from being stopped. Then
-        what went wrong first is raised; but an arm that could not be stopped or moved clear is
-        always told of.
+        what went wrong first is raised; but an arm that could not be stopped or moved clear, and a
+        plate that nobody has caught, are always told of.
         """
         try:
             yield
@@ -407,11 +411,20 @@ class Rig:
                     with suppress(Exception):
                         device.stop()
             self._reported = str(fault or "")
-            if fault is None or str(fault) == str(error):
-                raise
-            if isinstance(error, RigError) and error.device == "arm":
-                raise ArmFault("arm", f"{_text(error)}. It {_text(fault)}") from error
-            raise fault from error
+            if fault is not None and str(fault) != str(error):
+                if isinstance(error, RigError) and error.device == "arm":
+                    fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
+                raise self._plate_noted(fault) from error
+            if self._hangs and isinstance(error, RigError):
+                raise self._plate_noted(error) from error
+            raise
+
+    def _plate_noted(self, error: RigError) -> RigError:
+        """The same error, with a word on a plate that nobody has caught."""
+        if not self._hangs:
+            return error
+        text = f"{_text(error)}. The plate was let go and nobody has caught it: catch it first"
+        return ArmFault("arm", text) if error.device == "arm" else RigError(error.device, text)
 
     def _stop_arm(self) -> RigError | None:
         """Stop the arm; why that could not be done or seen, None if it stands still.

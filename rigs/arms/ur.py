@@ -445,8 +445,9 @@ class UrArm:
                 if times is None:
                     break
                 run.finished.append(times)
-        except ArmFault as error:
-            run.error = error
+        except Exception as error:  # a thread that dies must not look like a stop from outside
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
             if not (self._ask_control_to_stop() and self._wait_still()):
                 self._end_program()
         finally:

@@ -12,6 +12,8 @@ import socket
 import time
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
+_LONGEST_LINE = 10_000
+"""Bytes; an answer has some 100."""
 
 
 class PortError(RuntimeError):
@@ -78,4 +80,6 @@ def _line(link: socket.socket, deadline: float) -> str:
         if not more:
             raise ConnectionError("the connection was closed")
         data += more
+        if len(data) > _LONGEST_LINE:
+            raise ConnectionError("what comes is no line")
     return data.decode(errors="replace").strip()

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from protocols import load_plan
 from rigs.capabilities import ArmFault, ArmState, RigError
+from tests.conftest import ROOT
 from tests.rigs.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
 
 STOPS = ["arm.stop", "events.stop", "frames.stop", "sync.stop"]
@@ -212,3 +214,22 @@ def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others() -> None:
     with pytest.raises(OSError, match="disk full"):
         run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
     assert notes == ["sync.stop"]
+
+
+@pytest.mark.parametrize("device", ["arm", "event_camera"])
+def test_a_plate_that_nobody_has_caught_is_told_of(device: str) -> None:
+    """It hangs on the sensor while the recording runs, and falls when the arm moves clear."""
+    plan = load_plan(ROOT / "protocols" / "pilot_gravity.yaml")
+    rig = make_rig(faults=[gone(device)])
+    assert rig.plate is not None
+    mass = plan.mass_kg(plan.trials[0])
+    rig.operator.ask("changeover", "Mount the plate.", f"{mass} kg")
+    with pytest.raises(RigError, match=r"does not answer .*\. The plate was let go .* catch it"):
+        run(rig, plan, Memory())
+
+
+def test_a_plate_that_was_caught_or_never_let_go_is_not_told_of() -> None:
+    rig = make_rig(faults=[gone("event_camera")])
+    with pytest.raises(RigError, match="does not answer") as caught:
+        run(rig, short_plan(), Memory())
+    assert "plate" not in str(caught.value)

@@ -6,11 +6,13 @@ measured. The client is the real ur_rtde throughout.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 
@@ -27,7 +29,7 @@ from rigs.capabilities import ArmFault, ArmState, Pose, Segment
 from rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
 from rigs.wire.ur import HOME
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
-from tests.rigs.loopback import until
+from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
 
@@ -356,6 +358,40 @@ def test_a_stop_after_close_still_stops(robot_of: MakeRobot, arm_on: MakeArm) ->
     arm.close()
     arm.stop()
     assert not robot.moving()
+
+
+def test_a_follower_that_fails_says_why_and_stops_the_arm(
+    robot_of: MakeRobot, arm_on: MakeArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = robot_of()
+    arm = arm_on(robot)
+
+    def broken(pose: Pose) -> bool:
+        raise TypeError("of whatever kind")
+
+    monkeypatch.setattr(arm, "_is_at", broken)
+    arm.start([Segment(Pose((400.0, 1.0, 300.0), HOME.rotvec_deg), 10.0), *SLIDE])
+    until(lambda: arm._run.done, 5.0)
+    fails(arm.progress, 0.0, "its path was given up: TypeError")
+    assert not robot.moving()
+
+
+def test_a_dashboard_that_sends_no_line_is_given_up() -> None:
+    """Such as a print server on that port."""
+    host = own_address()
+    with socket.create_server((host, ur_ports.DASHBOARD_PORT)) as door:
+        thread = threading.Thread(target=lambda: _flood(door))
+        thread.start()
+        with pytest.raises(ur_ports.PortError, match="no line"):
+            ur_ports.dashboard(host, "is in remote control", 5.0)
+        thread.join(5.0)
+
+
+def _flood(door: socket.socket) -> None:
+    link, _ = door.accept()
+    with link, contextlib.suppress(OSError):
+        for _ in range(1 << 14):
+            link.sendall(b"x" * 4096)
 
 
 DRIVES = """
