@@ -36,6 +36,8 @@ from rigs.arms.stream import PoseStream, Sample
 from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
 from storage.streams import Json, PoseChunk, PulseChunk
 
+ENTRY, MODULES = "motion_program_main", "motion_program"
+"""Where the task begins that runs motion programs, and what the names of its modules begin with."""
 MONITOR_S = 0.2
 """How often the web services are asked for the state: four requests each time, s."""
 FAILURES = 2
@@ -91,7 +93,7 @@ class AbbArm:
     def connect(self) -> None:
         """Reach the web services, start the pose stream, see that both tell the same place.
 
-        Takes at most (12 + `abb_rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `LOOK_S`.
+        Takes at most (14 + `abb_rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `LOOK_S`.
 
         Raises:
             ArmFault: no connection, no poses, no watchdog, or the arm may not move now.
@@ -385,6 +387,7 @@ class AbbArm:
         if self.state() is not ArmState.READY:
             raise self._fault(self.state(), "cannot connect")
         self._check_speed()
+        self._check_task()
         for work in (self._listen, self._monitor):
             self._threads.append(threading.Thread(target=work, daemon=True))
             self._threads[-1].start()
@@ -425,6 +428,27 @@ class AbbArm:
                 "docs/rapid/sliplab_watchdog.mod into its controller (docs/arms.md), or write "
                 "devices.arm.watchdog_s: null to do without",
             ) from None
+
+    def _check_task(self) -> None:
+        """Refuse to start or to end what is somebody else's. Raises ArmFault, WebError."""
+        assert self._web is not None
+        task = self._settings.task
+        entry = self._web.about(f"rw/rapid/tasks/{task}").get("prodentrypt", ENTRY)
+        if entry.lower() != ENTRY:
+            raise ArmFault(
+                "arm",
+                f"has a task {task} that begins with {entry}, so that starting it would run "
+                f"somebody else's program: it is to begin with {ENTRY} of abb-motion-program-exec",
+            )
+        # RobotWare's own spelling of the key, and the right one
+        pointer = self._web.about(f"rw/rapid/tasks/{task}/pcp")
+        module = pointer.get("modulemame", pointer.get("modulename", ""))
+        if module and not module.lower().startswith(MODULES):
+            raise ArmFault(
+                "arm",
+                f"has somebody else's program paused in module {module} of task {task}: let that "
+                "person end it (PP to Main at the pendant)",
+            )
 
     def _check_speed(self) -> None:
         status = self._status

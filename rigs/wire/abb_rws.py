@@ -67,6 +67,8 @@ class AbbStandIn:
         speed_percent: the pendant's speed ratio, for moves that begin from now on.
         egm_on: whether it sends poses.
         web_on: whether its web services answer.
+        entry: where its task begins.
+        pointer: module in which its program stands.
         mute_after_start: whether they do so no more once the next program has started.
         watchdog_stops: how often the watchdog module has stopped the arm.
     """
@@ -96,6 +98,7 @@ class AbbStandIn:
         self.speed_percent = 100.0
         self.egm_on = self.web_on = True
         self.mute_after_start = False
+        self.entry, self.pointer = "motion_program_main", "motion_program_exec"
         self._egm_time, self._answer_s = egm_time, answer_s
         self.watchdog_stops = 0
         self._signals = dict.fromkeys((BEAT, ECHO, LIMIT), 0.0) if watchdog else {}
@@ -380,6 +383,12 @@ class AbbStandIn:
                 "excstate": "ready",
                 "active": "On",
                 "motiontask": "TRUE",
+            },
+            "rw/rapid/tasks/T_ROB1": lambda: {"name": "T_ROB1", "prodentrypt": self.entry},
+            "rw/rapid/tasks/T_ROB1/pcp": lambda: {
+                "_title": "progpointer",
+                "modulemame": self.pointer,
+                "routinename": "main",
             },
             "rw/motionsystem/mechunits/ROB_1/robtarget": lambda: {
                 "_type": "ms-robtargets",

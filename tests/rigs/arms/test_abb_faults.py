@@ -263,6 +263,18 @@ def test_a_speed_ratio_changed_in_mid_motion_stops_the_arm(abb_pair: MakeAbb) ->
     until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
 
 
+def test_a_program_of_somebody_else_is_neither_run_nor_ended(abb_pair: MakeAbb) -> None:
+    arm, robot = abb_pair(connected=False)
+    robot.pointer = "palletising"
+    fails(arm.connect, 14 * REQUEST_S, "somebody else's program paused in module palletising")
+    robot.pointer, robot.entry = "motion_program_exec", "main"
+    fails(arm.connect, 14 * REQUEST_S, "task T_ROB1 that begins with main, so that starting it")
+    assert not robot.running
+    robot.entry = "Motion_Program_Main"
+    arm.connect()
+    assert arm.state() is ArmState.READY
+
+
 def test_motors_that_are_switched_off_end_the_path(abb_pair: MakeAbb) -> None:
     arm, robot = abb_pair()
     sliding(arm, robot)
