@@ -39,6 +39,8 @@ _HEADER_FAULTS = (
     ValueError, KeyError, TypeError, SyntaxError, TokenError, RecursionError, MemoryError,
 )  # fmt: skip
 NUMPY = np.lib.format.MAGIC_PREFIX
+_MOST_EVEN = 1 << 24
+"""Times of a `.npy` file with as many in every pixel, which few recordings have."""
 _PICKLES = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 _KNOWN = " or ".join(f"{width} x {height}" for height, width in SIZES)
 _RIGHT = f"the lab's files hold a list of times in ms for each pixel of {_KNOWN}"
@@ -188,6 +190,8 @@ def _from_numpy(data: bytes, path: Path) -> Any:
     # lists of one length: numpy makes them an array of numbers
     if dtype.kind not in "iuf" or len(shape) != 3 or not _is_camera(shape[:2]):
         raise Wrong(f"holds an array of {dtype} of shape {shape}; {_RIGHT}")
+    if math.prod(shape) > _MOST_EVEN:
+        raise Wrong(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
     if math.prod(shape) * dtype.itemsize != len(data) - at:
         raise Wrong(f"is cut short: {len(data) - at} bytes for an array of shape {shape}")
     numbers = np.frombuffer(data, dtype, offset=at).reshape(shape, order="F" if fortran else "C")

@@ -219,6 +219,10 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"2), }", b"2 , }")),
         r"a_on\.npy: has a damaged numpy header",
     ),
+    "npy of 20 million bytes": (
+        "a_on.npy", lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
+        r"a_on\.npy: holds 20160000 times, as many in every pixel",
+    ),
     "npy with another pickle in it": (
         "a_on.npy",
         lambda path: path.write_bytes(
