@@ -13,9 +13,11 @@ from itertools import pairwise
 
 from protocols.factors import Factor, unknown_factor
 from protocols.model import Collection, Protocol
+from protocols.motion import check_reference_limits
 from protocols.phases import PlateMotion, Retract, Slide
-from protocols.quantity import canonical
+from protocols.quantity import canonical, check_size
 from protocols.settings import Split
+from protocols.split import check_split
 from protocols.yaml_file import KeyedError
 
 FULL_TURN = 360
@@ -28,9 +30,10 @@ def check_consistency(protocol: Protocol) -> None:
         KeyedError: the first rule that is broken.
     """
     _check_strata(protocol.analysis.split, protocol.collection.factors)
-    _check_held_out(protocol.analysis.split)
+    _check_held_out(check_split(protocol.analysis.split, protocol.collection.factors))
     _check_directions(protocol.collection)
     _check_plate(protocol.collection)
+    _check_references(protocol.collection)
 
 
 def _check_strata(split: Split, factors: Mapping[str, Factor]) -> None:
@@ -52,10 +55,11 @@ def _check_held_out(split: Split) -> None:
             key = f"analysis.split.{part}.{name}"
             if not levels:
                 raise KeyedError(key, "[]", "must name at least one level")
-            if part == "validation_levels":
-                for level in levels:
-                    if level in split.test_levels.get(name, ()):
-                        raise KeyedError(key, level, "is held out for the test already")
+            for index, level in enumerate(levels):
+                if level in levels[:index]:
+                    raise KeyedError(f"{key}[{index}]", level, "is held out twice")
+                if part == "validation_levels" and level in split.test_levels.get(name, ()):
+                    raise KeyedError(key, level, "is held out for the test already")
 
 
 def _check_directions(collection: Collection) -> None:
@@ -73,6 +77,20 @@ def _check_directions(collection: Collection) -> None:
                     level,
                     f"{canonical(level)} deg is the same direction as {canonical(known)} deg",
                 )
+
+
+def _check_references(collection: Collection) -> None:
+    """Reference trials obey the limits as all others do."""
+    given = {} if collection.references is None else collection.references.condition
+    for name, level in given.items():
+        unit = collection.factors[name].unit
+        if unit is not None and not isinstance(level, str):
+            try:
+                check_size(level, unit)
+            except ValueError as error:
+                key = f"collection.references.condition.{name}"
+                raise KeyedError(key, level, str(error)) from None
+    check_reference_limits(collection)
 
 
 def _check_plate(collection: Collection) -> None:

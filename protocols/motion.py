@@ -121,7 +121,27 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
     Raises:
         KeyedError: the first limit broken, with the key of the level that breaks it.
     """
-    collection = protocol.collection
+    factors = protocol.collection.factors
+    written = {
+        name: [
+            (level, f"collection.factors.{name}.{factors[name].place(level)}") for level in levels
+        ]
+        for name, levels in enabled.items()
+    }
+    _check_written(protocol.collection, written)
+
+
+def check_reference_limits(collection: Collection) -> None:
+    """Hold the condition of reference trials against the protocol's limits, as `check_limits`."""
+    if collection.references is not None:
+        condition = collection.references.condition
+        key = "collection.references.condition"
+        written = {name: [(level, f"{key}.{name}")] for name, level in condition.items()}
+        _check_written(collection, written)
+
+
+def _check_written(collection: Collection, written: Mapping[str, list[tuple[Level, str]]]) -> None:
+    """Hold levels, each with the key it is written under, against the limits."""
     limits = collection.limits
 
     def levels(field: Any, key: str) -> Iterator[tuple[Any, str]]:
@@ -129,9 +149,7 @@ def check_limits(protocol: Protocol, enabled: Mapping[str, tuple[Level, ...]]) -
         if not isinstance(field, FactorRef):
             yield field, key
             return
-        written = collection.factors[field.factor]
-        for level in enabled[field.factor]:
-            yield level, f"collection.factors.{field.factor}.{written.place(level)}"
+        yield from written[field.factor]
 
     def at_most(field: Any, key: str, limit: Decimal, name: str, unit: str) -> None:
         for value, where in levels(field, key):

@@ -204,13 +204,13 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
-    plan = make_plan(load(Protocol, path, "protocol"), str(path), enable)
+    protocol = load(Protocol, path, "protocol")
     if not stored:
         try:
-            check_consistency(plan.protocol)
+            check_consistency(protocol)
         except KeyedError as error:
             raise InputError(path, error.key, error.value, str(error)) from None
-    return plan
+    return make_plan(protocol, str(path), enable)
 
 
 def make_plan(protocol: Protocol, file: str, enable: Iterable[str] = ()) -> Plan:

@@ -306,7 +306,6 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
     Raises:
         InputError: the first move that the rig may not make.
     """
-    limits = rig.limits
     most_us = 1e6 / 4 / plan.protocol.collection.recording.sync_rate
     for name in ("event_camera", "frame_camera", "arm_controller"):
         jitter_us = getattr(rig.timing, name).jitter_us
@@ -331,19 +330,28 @@ def check_plan(rig: RigFile, plan: Plan, file: str) -> None:
             )
     for trial in plan:
         for step in plan.program(trial).steps:
-            if not isinstance(step, Move):
-                continue
-            reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
-            for what, value, limit, unit in (
-                ("depth", step.to.depth_mm, float(limits.depth), "mm"),
-                ("speed", step.speed_mm_s, float(limits.speed), "mm/s"),
-                ("reach", reach, float(limits.reach), "mm"),
-            ):
-                if value > limit + 1e-9:
-                    raise InputError(
-                        file,
-                        f"limits.{what}",
-                        f"{limit:g} {unit}",
-                        f"trial {trial.id} of {plan.file} needs {value:g} {unit} "
-                        f"in its phase '{step.phase}'",
-                    )
+            if isinstance(step, Move):
+                reach = (step.to.x_mm**2 + step.to.y_mm**2) ** 0.5
+                who = f"trial {trial.id} of {plan.file}", f"in its phase '{step.phase}'"
+                _check_limit(rig, file, who, "depth", step.to.depth_mm)
+                _check_limit(rig, file, who, "speed", step.speed_mm_s)
+                _check_limit(rig, file, who, "reach", reach)
+    upkeep = plan.protocol.collection.maintenance
+    if upkeep.warm_up is not None:
+        who = plan.file, "in collection.maintenance.warm_up"
+        _check_limit(rig, file, who, "depth", float(upkeep.warm_up.depth))
+        _check_limit(rig, file, who, "speed", float(upkeep.warm_up.speed))
+    if upkeep.rezero is not None:
+        who = plan.file, "in collection.maintenance.rezero"
+        _check_limit(rig, file, who, "depth", float(upkeep.rezero.search))
+        _check_limit(rig, file, who, "speed", float(upkeep.rezero.speed))
+
+
+def _check_limit(
+    rig: RigFile, file: str, who: tuple[str, str], name: Literal["depth", "speed", "reach"],
+    value: float,
+) -> None:  # fmt: skip
+    limit, unit = float(getattr(rig.limits, name)), "mm/s" if name == "speed" else "mm"
+    if value > limit + 1e-9:
+        text = f"{who[0]} needs {value:g} {unit} {who[1]}"
+        raise InputError(file, f"limits.{name}", f"{limit:g} {unit}", text)

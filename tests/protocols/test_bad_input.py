@@ -258,6 +258,15 @@ CASES: dict[str, tuple[Change, str, str]] = {
         "collection.references.condition.sped",
         "unknown factor sped; defined factors: depth, speed, direction",
     ),
+    "a level held out twice in two units": (
+        _set(
+            "analysis",
+            "split",
+            to={**LEFT_OUT, "test_levels": {"depth": ["2.4 mm", "2400 um"]}},
+        ),
+        "analysis.split.test_levels.depth[1]",
+        "is held out twice",
+    ),
     "one direction twice": (
         _set(COLLECTION, "factors", "direction", "values", to=[0, 90, 360]),
         "collection.factors.direction.values[2]",
@@ -547,3 +556,41 @@ def test_whatever_stands_at_a_key_is_taken_or_named(where: Any, text: str) -> No
         assert not re.search(r"[\x00-\x1f\x7f-\x9f\u202e]|Decimal\(|datetime", error.message)
         assert error.key.startswith((str(path[0]), "collection", "analysis")), error.message
         assert error.expected
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "says"),
+    [
+        ("depth", 30, "is over collection.limits.depth = 3.6 mm"),
+        ("depth", -1, "must be more than 0"),
+        ("depth", 0, "must be more than 0"),
+        ("speed", 900, "is over collection.limits.speed = 50 mm/s"),
+        ("speed", 0, "must be more than 0"),
+        ("direction", 1e6, "must be from -360 to 360 deg"),
+    ],
+)
+def test_reference_trials_obey_the_limits(
+    name: str, level: float, says: str, small: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "wrong.yaml"
+    condition = {"depth": 2.8, "speed": 1, "direction": 0}
+    small[COLLECTION]["references"] = {"every": 5, "condition": condition}
+    path.write_text(yaml.safe_dump(small))
+    assert len(load_plan(path)) == 44
+    condition[name] = level
+    path.write_text(yaml.safe_dump(small))
+    with pytest.raises(InputError, match=re.escape(says)) as caught:
+        load_plan(path)
+    assert caught.value.key == f"collection.references.condition.{name}"
+
+
+def test_a_reference_slide_stays_in_the_workspace(small: dict[str, Any], tmp_path: Path) -> None:
+    small[COLLECTION]["factors"]["distance"] = {"unit": "mm", "values": [9]}
+    small[COLLECTION]["motion"][3]["distance"] = "$distance"
+    condition = {"depth": 2.8, "speed": 1, "direction": 0, "distance": 25}
+    small[COLLECTION]["references"] = {"every": 5, "condition": condition}
+    path = tmp_path / "wrong.yaml"
+    path.write_text(yaml.safe_dump(small))
+    with pytest.raises(InputError, match=r"outside collection\.limits\.workspace\.x") as caught:
+        load_plan(path)
+    assert caught.value.key == "collection.references.condition.distance"

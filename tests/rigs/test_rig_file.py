@@ -174,3 +174,29 @@ def test_a_plan_beyond_the_rig_is_refused(tmp_path: Path) -> None:
     plan = load_plan(ROOT / "protocols" / "pilot.yaml")
     with pytest.raises(InputError, match=r"needs 3.4 mm in its phase 'press'"):
         check_plan(rig, plan, str(path))
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "says"),
+    [
+        ("warm_up", "depth", "3.5 mm", "limits.depth = 3.4 mm: .* needs 3.5 mm in .*warm_up"),
+        ("warm_up", "speed", "21 mm/s", "limits.speed = 20 mm/s: .* needs 21 mm/s in .*warm_up"),
+        ("rezero", "search", "3.5 mm", "limits.depth = 3.4 mm: .* needs 3.5 mm in .*rezero"),
+        ("rezero", "speed", "21 mm/s", "limits.speed = 20 mm/s: .* needs 21 mm/s in .*rezero"),
+    ],
+)
+def test_maintenance_beyond_the_rig_is_refused(
+    section: str, key: str, value: str, says: str, small: dict[str, Any], tmp_path: Path
+) -> None:
+    rig_path, path = tmp_path / "rig.yaml", tmp_path / "protocol.yaml"
+    text = MOCK.replace("depth: 4 mm", "depth: 3.4 mm")
+    data = yaml.safe_load(text)
+    data["limits"]["speed"] = "20 mm/s"
+    rig_path.write_text(yaml.safe_dump(data))
+    rig, _ = load_rig_file(rig_path)
+    path.write_text(yaml.safe_dump(small))
+    check_plan(rig, load_plan(path), str(rig_path))
+    small["collection"]["maintenance"][section][key] = value
+    path.write_text(yaml.safe_dump(small))
+    with pytest.raises(InputError, match=says):
+        check_plan(rig, load_plan(path), str(rig_path))
