@@ -581,8 +581,9 @@ class AbbArm:
                 self._finish(run)
             elif self._lost is not None and not run.cancelled:
                 self._give_up()
-        except ArmFault as error:
-            run.error = error
+        except Exception as error:  # a thread that dies must not look like a stop from outside
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
             self._give_up()
         finally:
             run.done = True

@@ -238,8 +238,9 @@ class AbbSocketArm:
                 at = segment.to
             else:
                 self._may_move = False
-        except ArmFault as error:
-            run.error = error
+        except Exception as error:  # a thread that dies must not look like a stop from outside
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
         finally:
             run.done = True
             self._stream.wake()

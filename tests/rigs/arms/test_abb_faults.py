@@ -92,6 +92,17 @@ def test_a_stop_takes_a_new_connection_if_the_old_one_is_dead(abb_pair: MakeAbb)
     assert robot.watchdog_stops == 0
 
 
+def test_a_path_thread_that_fails_says_so_and_stops_the_arm(
+    abb_pair: MakeAbb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm, robot = abb_pair()
+    sliding(arm, robot)
+    monkeypatch.setattr(arm, "_why_given_up", lambda: 1 / 0)
+    until(lambda: arm._run.done, BUSY_S)
+    fails(arm.progress, 0.0, "its path was given up: ZeroDivisionError")
+    until(lambda: not robot.moving(), driver.STOPPED_S + BUSY_S)
+
+
 def test_a_path_whose_start_was_not_answered_may_run(abb_pair: MakeAbb) -> None:
     """The controller takes the start and is never heard of again."""
     arm, robot = abb_pair(arm={"watchdog_s": None})

@@ -204,6 +204,16 @@ threading.Event().wait()
 """
 
 
+def test_a_path_thread_that_fails_says_so(pair: MakePair, monkeypatch: pytest.MonkeyPatch) -> None:
+    arm, robot = pair()
+    monkeypatch.setattr(driver, "between", lambda *_: 1 / 0)
+    arm.start(SLIDE)
+    until(lambda: arm._run.done, BUSY_S)
+    fails(arm.progress, 0.0, "its path was given up: ZeroDivisionError")
+    arm.stop()
+    assert not robot.moving()
+
+
 def test_an_arm_stands_a_piece_after_the_program_was_killed(pair: MakePair) -> None:
     _, robot = pair(connected=False)
     given = settings(robot.host).model_dump_json()
