@@ -139,8 +139,13 @@ class EmbeddedServer:
 
     @property
     def alive(self) -> bool:
-        """Whether it answers, or has not been waited for yet."""
-        return self._process.poll() is None and (not self._answers or self._healthy())
+        """Whether its process runs."""
+        return self._process.poll() is None
+
+    @property
+    def answers(self) -> bool:
+        """Whether it answers within 5 s."""
+        return self.alive and self._healthy()
 
     def _wait_until_healthy(self) -> None:
         end = time.monotonic() + START_LIMIT_S

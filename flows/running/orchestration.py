@@ -82,9 +82,11 @@ def begin() -> None:
 
 
 def embedded() -> EmbeddedServer:
-    """Return the embedded server of Prefect's home; start it if there is none that answers."""
+    """Return the embedded server of Prefect's home; start it if there is none, or it was lost."""
     home = os.environ["PREFECT_HOME"]
-    if home in _servers and not _servers[home].alive:
+    there = _servers.get(home)
+    doubtful = server_calls.was_lost(run_records.EMBEDDED)  # one that is slow is left alone
+    if there is not None and (not there.alive or (doubtful and not there.answers)):
         from flows.running import run_events
 
         _servers.pop(home).stop()

@@ -50,6 +50,11 @@ def lose(reason: str) -> None:
         _current.lose(reason)
 
 
+def was_lost(server: str) -> bool:
+    """Whether a server was lost and has not answered since."""
+    return server in _said
+
+
 def forget(server: str) -> None:
     """Note that a server answers, or is another one now."""
     _said.discard(server)

@@ -12,8 +12,9 @@ import os
 import re
 import signal
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,9 +22,10 @@ from urllib.request import urlopen
 
 from flows.cli.chain import package_file
 from flows.running import console, run_records
-from flows.running.embedded_server import EmbeddedServer, new_password
+from flows.running.embedded_server import new_password
 from flows.serving.serve_control import answer_page
 from flows.serving.serve_file import Scheduled
+from flows.serving.serve_watch import PageServer, ask_on, watch
 from flows.serving.service import Service
 from protocols import InputError
 from storage.files import write_bytes
@@ -43,7 +45,7 @@ CONTROL_POLL_S = 1.0
 
 
 @contextmanager
-def page_server(port: int) -> Iterator[str]:
+def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
     """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
 
     Ours asks for a password, which the processes of the runs find in their environment and people
@@ -59,22 +61,22 @@ def page_server(port: int) -> Iterator[str]:
     url = PREFECT_API_URL.value()
     if url is not None:
         refuse_open(url)
-        yield url
+        yield url, None
         return
     home = Path(os.environ["PREFECT_HOME"])
-    server = EmbeddedServer(home, port, page=True, password=page_password(home))
+    page = PageServer(home, port, page_password(home))
     before = dict(os.environ)
     try:
-        settings = server.settings()
+        settings = page.server.settings()
         os.environ.update({setting.name: value for setting, value in settings.items()})
         with temporary_settings(updates=settings):
             console.say(f"the page's password is in {home / PASSWORD}, which you alone can read")
-            yield server.url
+            yield page.server.url, page
     finally:
         for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
             os.environ.pop(name, None)
             os.environ.update({name: before[name]} if name in before else {})
-        server.stop()
+        page.server.stop()
 
 
 def refuse_open(url: str) -> None:
@@ -157,17 +159,24 @@ def serve(
     ours = PREFECT_API_URL.value() is None
     with ExitStack() as stack:
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
-        url = stack.enter_context(page_server(port))
+        url, page = stack.enter_context(page_server(port))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
         Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols).tell()
         for item in run_records.close_dead(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
-        asyncio.run(_serve(store, rig, name, schedules, url, poll_s))
+        looking = partial(watch, page, store.folder, server)
+        asyncio.run(_serve(store, rig, name, schedules, url, poll_s, looking))
 
 
 async def _serve(
-    store: Store, rig: str, name: str, schedules: Sequence[Scheduled], url: str, poll_s: float
+    store: Store,
+    rig: str,
+    name: str,
+    schedules: Sequence[Scheduled],
+    url: str,
+    poll_s: float,
+    looking: Callable[[asyncio.Event], Coroutine[Any, Any, None]],
 ) -> None:
     from prefect.runner import Runner
 
@@ -182,6 +191,7 @@ async def _serve(
         def handle_sigterm(self, *args: Any, **kwargs: Any) -> None:
             loop.call_soon_threadsafe(stopped.set)
 
+    ask_on()
     rig_runner = Ours(f"{name} rig", query_seconds=poll_s, limit=1, pause_on_shutdown=False)
     control: dict[Any, Any] = {}
     for flow in (*ON_RIG, *CONTROL):
@@ -199,6 +209,7 @@ async def _serve(
     running = asyncio.create_task(rig_runner.start())
     answering = asyncio.create_task(answer_page(control, min(poll_s, CONTROL_POLL_S), stopped))
     ending = asyncio.create_task(stopped.wait())
+    watching = asyncio.create_task(looking(stopped))
     console.say(f"serving {store.folder} on the rig {rig}: deployments */{name}")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
     await asyncio.wait([ending, running, answering], return_when=asyncio.FIRST_COMPLETED)
@@ -208,7 +219,9 @@ async def _serve(
         await rig_runner.astop()
     else:
         running.cancel()  # one that is still starting cannot be stopped otherwise
-    for outcome in await asyncio.gather(running, answering, ending, return_exceptions=True):
+    for outcome in await asyncio.gather(
+        running, answering, ending, watching, return_exceptions=True
+    ):
         if isinstance(outcome, Exception):
             raise outcome
 

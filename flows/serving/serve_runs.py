@@ -15,7 +15,7 @@ from typing import Any
 
 from flows.collecting.stops import CampaignStopped, WindowOver
 from flows.planning.orders import Order
-from flows.running import console, run_records, stopping
+from flows.running import console, run_records, server_calls, stopping
 from flows.running.embedded_server import die_with
 from flows.serving.serve_parameters import OnRig
 from flows.serving.serve_windows import window_end
@@ -43,10 +43,14 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     from prefect.context import FlowRunContext
     from prefect.states import Cancelled, Completed, Failed
 
+    from flows.running import run_events
+
     context = FlowRunContext.get()
     if context is None or context.flow_run is None or context.flow is None:
         raise RuntimeError("is no flow run")
     run, here, name = context.flow_run, service(), context.flow.name
+    server_calls.Calls(here.server, here.folder, run).through(context.client)
+    run_events.bound_exit()
     run_records.begin(here.folder, str(run.id), name, here.server, here.name)
     state: Any
     try:
