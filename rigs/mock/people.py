@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 from protocols.program import PlateAction
-from rigs.capabilities import ArmState
+from rigs.capabilities import ArmState, RigError
 from rigs.mock.jogging import hold_board, jog
 from rigs.mock.world import World
 from rigs.people import mass_of
+
+_TRACELESS = {"clean", "warm_up", "rezero"}
+_LONGEST_S = 3600.0
 
 
 class VirtualClock:
@@ -38,7 +42,13 @@ class MockPlate:
         self._world = world
 
     def act(self, action: PlateAction, seconds: float) -> None:
-        """Raise and hold, release over `seconds`, or catch."""
+        """Raise and hold, release over `seconds`, or catch.
+
+        Raises:
+            RigError: another action, or a time that cannot be.
+        """
+        if action not in get_args(PlateAction) or not 0.0 <= seconds < _LONGEST_S:
+            raise RigError("plate", f"'{action}' over {seconds} s is not simulated")
         self._world.act(action, seconds)
 
     def mass_kg(self) -> float:
@@ -60,7 +70,7 @@ class SimulatedOperator:
 
     `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
     stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before
-    the camera (`rigs.mock.jogging`). Everything else is only confirmed.
+    the camera (`rigs.mock.jogging`). What leaves no trace in the simulation is only confirmed.
     """
 
     def __init__(self, world: World) -> None:
@@ -71,7 +81,8 @@ class SimulatedOperator:
         """Do it, and confirm.
 
         Raises:
-            RigError: a changeover whose expected mass cannot be read.
+            RigError: a changeover whose expected mass cannot be read, or a task that is not
+                simulated.
         """
         self.asked.append(Asked(task, prompt, expected))
         if task == "changeover":
@@ -82,4 +93,6 @@ class SimulatedOperator:
             return jog(self._world, expected)
         elif task == "board":
             hold_board(self._world, expected)
+        elif task not in _TRACELESS:
+            raise RigError("operator", f"task '{task}' is not simulated")
         return True

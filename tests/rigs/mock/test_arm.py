@@ -1,5 +1,7 @@
 """The simulated arm and the person beside it: segments as they end, refusals, a changed mass."""
 
+from typing import Any
+
 import pytest
 
 from rigs.capabilities import ArmFault, ArmState, RigError, Segment
@@ -63,3 +65,17 @@ def test_the_operator_mounts_a_mass_and_clears_a_stop() -> None:
     with pytest.raises(RigError, match="expected such as"):
         devices.operator.ask("changeover", "Mount the plate.", "heavy")
     assert [asked.task for asked in devices.operator.asked] == ["changeover", "clean", "changeover"]
+
+
+@pytest.mark.parametrize(
+    ("action", "seconds"), [("drop", 1.0), ("release", -1.0), ("catch", float("nan"))]
+)
+def test_the_plate_does_nothing_that_is_not_simulated(action: Any, seconds: float) -> None:
+    devices = build_mock(SMALL)
+    with pytest.raises(RigError, match="is not simulated"):
+        devices.plate.act(action, seconds)
+
+
+def test_a_task_that_is_not_simulated_is_not_confirmed() -> None:
+    with pytest.raises(RigError, match="task 'sweep the floor' is not simulated"):
+        build_mock(SMALL).operator.ask("sweep the floor", "Sweep the floor.", "done")
