@@ -1,8 +1,8 @@
 """Serves the review page on this computer only, until somebody ends it.
 
 Whoever can reach the page can decide, so: it listens on the loopback address, stands under a path
-that nobody can guess, is listed nowhere, and answers no other page's scripts (the Origin of the
-connection that carries everything is checked).
+that nobody can guess, is listed nowhere, and answers neither another page's scripts nor a foreign
+host name (`flows.running.same_origin`, for pages and for the connection that carries everything).
 """
 
 from __future__ import annotations
@@ -10,18 +10,22 @@ from __future__ import annotations
 import asyncio
 import secrets
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
+from bokeh.server.auth_provider import AuthProvider
 from bokeh.server.server import Server
 from tornado.ioloop import IOLoop
+from tornado.web import HTTPError
 
 from flows.reviewing.review_list import TrialList
 from flows.reviewing.review_page import Page
+from flows.running.same_origin import own_hosts, refusal
 from protocols.errors import InputError
 from storage.process import user_name
 from storage.store import Store
@@ -63,20 +67,50 @@ def serving(
             server.unlisten()
 
 
+class _OwnPage(AuthProvider):
+    """Bokeh's hook before every page and connection: whoever knows the path is let in.
+
+    Attributes:
+        port: that the server listens on.
+    """
+
+    port = 0
+
+    @property
+    def get_user_async(self) -> Callable[[Any], Awaitable[str]]:
+        """The check of one request; it raises what is answered."""
+        return self._check
+
+    async def _check(self, handler: Any) -> str:
+        headers = handler.request.headers
+        found = headers.get_list("Host"), headers.get_list("Origin")
+        status, text = refusal(*found, own_hosts(self.port))
+        if status:
+            raise HTTPError(status, reason=text.strip())
+        return "here"
+
+    @property
+    def login_url(self) -> str:
+        """Nobody logs in; Bokeh asks for one."""
+        return "/"
+
+
 def _server(path: str, make: Callable[[Document], None], port: int) -> Server:
     application = Application(FunctionHandler(make, trap_exceptions=True))
+    own = _OwnPage()
     try:
         # looked at before: the server does not close a socket that it could not bind
         with socket.socket() as trial:
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind((HOST, port))
-        return Server(
+        server = Server(
             {path: application},
             io_loop=IOLoop.current(),
             address=HOST,
             port=port,
             # Bokeh puts the port that was taken in place of 0
             allow_websocket_origin=[f"{HOST}:{port}"],
+            auth_provider=own,
             use_index=False,
             redirect_root=False,
             generate_session_ids=True,
@@ -85,6 +119,8 @@ def _server(path: str, make: Callable[[Document], None], port: int) -> Server:
         )
     except OSError as error:
         raise InputError("--port", "", port, f"cannot be listened on: {error.strerror}") from None
+    own.port = server.port
+    return server
 
 
 def serve(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _NAMES = ("127.0.0.1", "localhost", "[::1]")
+_KINDS = ("http", "ws")
 _HTTP_PORT = 80
 """The port that a browser leaves out of `Host` and `Origin`."""
 
@@ -24,10 +25,25 @@ def own_hosts(port: int) -> frozenset[str]:
     return frozenset(hosts | set(_NAMES) if port == _HTTP_PORT else hosts)
 
 
+def refusal(hosts: list[str], origins: list[str], own: frozenset[str]) -> tuple[int, str]:
+    """Status and text for a request that is refused; status 0 for one that is not.
+
+    Args:
+        hosts: the values of its `Host`; origins: those of its `Origin`.
+        own: the server's `own_hosts`.
+    """
+    if len(hosts) != 1 or hosts[0].lower() not in own:
+        return 421, "this server is reached by its own address only\n"
+    if any(origin.removeprefix("http://") not in own for origin in origins):
+        return 403, "this server answers no other page\n"
+    return 0, ""
+
+
 class SameOrigin:
     """An ASGI application that refuses foreign hosts (421) and foreign origins (403).
 
-    It covers every method, path and websocket before `app` sees them, and no page may frame it.
+    It covers every method, path and websocket before `app` sees them. No page may frame its pages,
+    and their scripts reach this server only: Prefect's would report to others.
 
     Args:
         port: the one that the server listens on.
@@ -36,16 +52,24 @@ class SameOrigin:
     def __init__(self, app: ASGIApp, port: int) -> None:
         self._app = app
         self._hosts = own_hosts(port)
-        self._origins = frozenset(f"http://{host}" for host in self._hosts)
+        reached = " ".join(
+            f"{kind}://{host}" for host in sorted(self._hosts) for kind in _KINDS if "[" not in host
+        )
+        policy = f"connect-src 'self' {reached}; frame-ancestors 'none'"
+        self._headers = [
+            (b"content-security-policy", policy.encode()),
+            (b"x-frame-options", b"DENY"),
+        ]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
-        status, text = self._refusal(scope)
+        hosts, origins = _values(scope, b"host"), _values(scope, b"origin")
+        status, text = refusal(hosts, origins, self._hosts)
         if not status:
-            await self._app(scope, receive, _unframed(send))
+            await self._app(scope, receive, _with(send, self._headers))
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008, "reason": text})
         else:
@@ -53,26 +77,17 @@ class SameOrigin:
             await send({"type": "http.response.start", "status": status, "headers": kind})
             await send({"type": "http.response.body", "body": text.encode()})
 
-    def _refusal(self, scope: Scope) -> tuple[int, str]:
-        """Status and text for a request that is refused; 0 for one that is not."""
-        hosts = _values(scope, b"host")
-        if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
-            return 421, "this server is reached by its own address only\n"
-        if any(origin not in self._origins for origin in _values(scope, b"origin")):
-            return 403, "this server answers no other page\n"
-        return 0, ""
-
 
 def _values(scope: Scope, name: bytes) -> list[str]:
     return [value.decode("latin-1") for key, value in scope["headers"] if key == name]
 
 
-def _unframed(send: Send) -> Send:
-    """`send` with the header that keeps a page out of every other page's frames."""
+def _with(send: Send, headers: list[tuple[bytes, bytes]]) -> Send:
+    """`send`, with headers added to every answer."""
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", ()), (b"x-frame-options", b"DENY")]
+            message["headers"] = [*message.get("headers", ()), *headers]
         await send(message)
 
     return sending

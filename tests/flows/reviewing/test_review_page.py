@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import pytest
 
@@ -300,6 +300,17 @@ def test_nobody_else_gets_in(served: Served) -> None:
     with socket.create_connection((parts.hostname, parts.port), timeout=10) as line:
         line.sendall(ask.encode())
         assert line.recv(100).decode().split()[1] == "403"
+    for wrong, status in (
+        ({"Host": f"evil.example:{parts.port}"}, 421),  # a name that was pointed here
+        ({"Host": "127.0.0.1:1"}, 421),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+    ):
+        for path in ("", "/ws", "/metadata", "/autoload.js?bokeh-autoload-element=1"):
+            with pytest.raises(HTTPError) as error:
+                urlopen(Request(f"{root}{parts.path}{path}", headers=wrong), timeout=10)
+            assert (path, error.value.code) == (path, status)
+            error.value.close()
     inside = socket.gethostbyname(socket.gethostname())
     if not inside.startswith("127."):
         with pytest.raises(ConnectionRefusedError):

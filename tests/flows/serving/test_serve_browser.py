@@ -1,0 +1,95 @@
+"""Prefect's page of a service in a real browser: a person logs in, a foreign page gets nothing."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.flows.serving.serving import Page, serving, until
+
+CHROMIUM = "/usr/bin/chromium"
+ARGUMENTS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+PATIENCE_MS = 30_000
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = pytest.mark.skipif(
+    not (Path(CHROMIUM).exists() and shutil.which(CHROMIUM)),
+    reason=f"no browser at {CHROMIUM} (Debian's package chromium)",
+)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A service with its own server."""
+    folder = tmp_path_factory.mktemp("browser")
+    rig = ROOT / "rigs" / "rehearsal.yaml"
+    with serving(folder / "store", rig, "browser", None, folder / "serve.log") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, which finds nobody outside this computer."""
+    with sync_api.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        yield found
+        found.close()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str) -> None:
+    expect = sync_api.expect
+    expect.set_options(timeout=PATIENCE_MS)
+    with browser.new_context() as context:
+        tab = context.new_page()
+        tab.set_default_timeout(PATIENCE_MS)
+        outside: list[str] = []  # what the browser tried to look up, and was not kept from
+        tab.on(
+            "requestfailed",
+            lambda r: outside.append(r.url) if "ERR_NAME_NOT_RESOLVED" in r.failure else None,
+        )
+        root = page.url.removesuffix("/api").replace("127.0.0.1", host)
+        tab.goto(root)
+        box = tab.get_by_role("textbox")
+        box.fill("sliplab:guess")
+        box.press("Enter")
+        expect(tab.get_by_role("link", name="Deployments")).to_have_count(0)
+        box.fill(page.password)
+        box.press("Enter")
+        expect(tab.get_by_role("link", name="Deployments").first).to_be_visible()
+        before = len(page.call("/flow_runs/filter", {}))
+        tab.goto(f"{root}/v2/deployments/deployment/{page.deployment('label')['id']}")
+        tab.get_by_role("button", name="Run", exact=True).click()
+        tab.get_by_role("menuitem", name="Quick run").click()
+        until("the run", lambda: len(page.call("/flow_runs/filter", {})) == before + 1)
+        assert outside == []
+
+
+def test_a_foreign_page_starts_nothing(page: Page, browser: Any) -> None:
+    before = len(page.call("/flow_runs/filter", {}))
+    run = f"{page.url}/deployments/{page.deployment('label')['id']}/create_flow_run"
+    script = """async (url) => {
+        const said = [];
+        for (const kind of ["application/json", "text/plain"])
+            for (const mode of ["cors", "no-cors"])
+                try {
+                    const headers = {"content-type": kind}, body = "{}";
+                    said.push((await fetch(url, {method: "POST", mode, headers, body})).status);
+                } catch (error) { said.push("refused"); }
+        return said; }"""
+    with browser.new_context() as context:
+        tab = context.new_page()
+        tab.route(
+            "http://evil.example/*",
+            lambda route: route.fulfill(body="<html></html>", content_type="text/html"),
+        )
+        tab.goto("http://evil.example/")
+        assert set(tab.evaluate(script, run)) <= {"refused", 0}  # 0: an answer that is not shown
+    assert len(page.call("/flow_runs/filter", {})) == before
