@@ -5,15 +5,21 @@ Loads nothing but Python's own modules: the command line reads it where nothing 
 
 from __future__ import annotations
 
+import ctypes
 import errno
+import os
 import re
 import resource
+import signal
+import sys
 
 _MEMORY = re.compile(
     r"annot allocate memory|failed to map segment|Unable to allocate|not enough memory|bad_alloc"
 )
 _FILES = re.compile(r"Too many open files")
 _PROCESSES = re.compile(r"can't start new thread|Resource temporarily unavailable")
+_RAISE = "end other programs or raise the limit"
+_PR_SET_PDEATHSIG = 1
 _GO_ON = "then run the same command to go on; every committed trial is kept"
 
 
@@ -27,7 +33,7 @@ def exhausted(error: BaseException | None) -> str | None:
         text = str(error)
         if isinstance(error, MemoryError) or number == errno.ENOMEM or _MEMORY.search(text):
             given = _limit(resource.RLIMIT_AS, "-v", 1024)
-            return f"there is not enough memory{given}: end other programs, {_GO_ON}"
+            return f"there is not enough memory{given}: {_RAISE}, {_GO_ON}"
         if number in {errno.EMFILE, errno.ENFILE} or _FILES.search(text):
             return (
                 f"too many files are open{_limit(resource.RLIMIT_NOFILE, '-n')}: raise it, {_GO_ON}"
@@ -43,3 +49,47 @@ def _limit(kind: int, option: str, unit: int = 1) -> str:
     """Return the limit that this process has, as its shell calls it; empty without one."""
     found = resource.getrlimit(kind)[0]
     return "" if found == resource.RLIM_INFINITY else f" (ulimit {option} is {found // unit})"
+
+
+def run_in_child() -> str | None:
+    """Go on in a child process where memory is limited: there libraries crash instead of failing.
+
+    The parent passes signals on to the child, which ends with it. In a program that has loaded
+    libraries already nothing is done.
+
+    Returns:
+        None in the process that is to go on. The parent ends with its child's exit code, or gets
+        the reason here if the child crashed.
+    """
+    if (
+        resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
+        or "numpy" in sys.modules
+    ):
+        return None
+    passed = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, passed | {signal.SIGCHLD})
+    parent = os.getpid()
+    child = os.fork()
+    if child == 0:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return None
+    while True:  # as long as the child runs
+        came = signal.sigwaitinfo(passed | {signal.SIGCHLD})
+        if came.si_signo != signal.SIGCHLD:
+            if came.si_pid:  # Ctrl-C in a terminal, which has no sender, reached the child, too
+                os.kill(child, came.si_signo)
+            continue
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+    code = os.waitstatus_to_exitcode(status)
+    if code >= 0:
+        sys.exit(code)
+    given = _limit(resource.RLIMIT_AS, "-v", 1024)
+    name = signal.strsignal(-code)
+    return (
+        f"a library crashed ({name}), as it does without enough memory{given}: {_RAISE}, {_GO_ON}"
+    )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import select
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -170,3 +172,64 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
         capture_output=True, timeout=120,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, f"{said}\n"), done.stderr
+
+
+CRASH = """
+import os, signal, sys, time
+from flows.running import limits
+import resource
+resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
+from flows import __main__ as program
+def run():
+    print(os.getpid(), flush=True)
+    if sys.argv[1] == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if sys.argv[1] == "wait":
+        try:
+            signal.sigtimedwait([], 60)
+        except KeyboardInterrupt:
+            return 130
+    return 7
+program._run = run
+program.main()
+"""
+
+
+def limited(how: str) -> subprocess.Popen[str]:
+    """Run a command that crashes, waits or ends, under a limit of memory."""
+    return subprocess.Popen(
+        [sys.executable, "-c", CRASH, how, "--json"], cwd=ROOT, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def test_a_library_that_crashes_for_want_of_memory_ends_in_one_line() -> None:
+    process = limited("crash")
+    out, said = process.communicate(timeout=60)
+    _, line = out.splitlines()
+    assert process.returncode == json.loads(line)["error"]["exit_code"] == 1
+    assert said.startswith("error: a library crashed (Segmentation fault), as it does without")
+    assert said.count("\n") == 1
+    process = limited("end")
+    process.communicate(timeout=60)
+    assert process.returncode == 7
+
+
+def test_a_program_with_limited_memory_can_be_stopped() -> None:
+    with limited("wait") as process:
+        assert process.stdout is not None
+        child = int(process.stdout.readline())
+        assert child != process.pid
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+
+
+def test_a_child_ends_with_its_killed_parent() -> None:
+    with limited("wait") as process:
+        assert process.stdout is not None
+        watched = os.pidfd_open(int(process.stdout.readline()))
+        try:
+            process.kill()
+            assert select.select([watched], [], [], 60)[0] == [watched]
+        finally:
+            os.close(watched)
