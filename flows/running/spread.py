@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,10 @@ Piece = Callable[[Any], Any]
 Done = Callable[[int, Any], None]
 
 
+class WorkerKilled(RuntimeError):
+    """A worker process was killed; what it and the others had handed over is kept."""
+
+
 def spread(
     name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluster: Cluster | None = None
 ) -> None:
@@ -43,6 +48,7 @@ def spread(
 
     Raises:
         KeyboardInterrupt: a stop was requested; what nobody had begun is not begun.
+        WorkerKilled: a process of this machine that did the work was killed.
     """
     if not jobs:
         return
@@ -57,6 +63,11 @@ def spread(
         try:
             for start in range(0, len(jobs), CHUNK):
                 local(Parcel((piece, jobs[start : start + CHUNK], start, pool, done)))
+        except BrokenProcessPool:
+            raise WorkerKilled(
+                f"{name}: a worker process was killed, perhaps because memory was short; what was "
+                "made is kept; run the same command to go on"
+            ) from None
         except BaseException:
             for worker in active_children():
                 worker.terminate()  # what a worker had not handed over is simply made again
