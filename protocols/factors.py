@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from protocols.quantity import UNITS, canonical, check_size, number_meant, to_decimal
+from protocols.shown import foreign_character
 from protocols.yaml_file import KeyedError, StrictModel
 
 MAX_TRIALS = 1_000_000
@@ -168,4 +169,6 @@ class Factor(StrictModel):
 
 def unknown_factor(name: str, factors: Iterable[str]) -> str:
     """The message for a `name` that is none of the defined `factors`."""
-    return f"unknown factor {name}; defined factors: {', '.join(factors)}"
+    foreign = foreign_character(name)
+    hint = f" (holds {foreign})" if foreign else ""
+    return f"unknown factor {name}{hint}; defined factors: {', '.join(factors)}"

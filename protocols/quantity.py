@@ -16,6 +16,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
+from protocols.shown import foreign_character
+
 # unit -> (canonical unit of its kind, factor to it); all factors are exact decimals
 UNITS: dict[str, tuple[str, Decimal]] = {
     "mm": ("mm", Decimal(1)),
@@ -115,7 +117,6 @@ def parse(raw: object, unit: str) -> Decimal:
 
 def number_meant(raw: str) -> str | None:
     """The message for a number in characters that are not read: a minus sign, a decimal comma."""
-    odd = next((character for character in raw if not character.isascii()), "")
     plain = unicodedata.normalize("NFKC", raw).translate(_PLAIN).strip()
     numbers = [plain]
     if re.search(r"\d,\d", plain):
@@ -123,8 +124,8 @@ def number_meant(raw: str) -> str | None:
         numbers = [plain.replace(",", "")] * whole + [plain.replace(",", ".")]
     if numbers == [raw.strip()] or not all(_NUMBER.fullmatch(number) for number in numbers):
         return None
-    if odd:
-        found = f"holds U+{ord(odd):04X} {unicodedata.name(odd, 'a character without a name')}"
+    if foreign := foreign_character(raw):
+        found = f"holds {foreign}"
     else:
         found = "has a comma" if len(numbers) > 1 else "has a decimal comma"
     return f"{found}: write {' or '.join(repr(number) for number in numbers)}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from datetime import date
 from decimal import Decimal
 
@@ -56,6 +57,14 @@ def password_in(url: str) -> str | None:
 def without_passwords(text: str) -> str:
     """`text` with the passwords of its addresses masked."""
     return _URL.sub(rf"\1{MASK}", text) if "://" in text else text
+
+
+def foreign_character(text: str) -> str:
+    """``U+0435 CYRILLIC SMALL LETTER IE``: the first character beyond ASCII; empty without one."""
+    for character in text:
+        if not character.isascii():
+            return f"U+{ord(character):04X} {unicodedata.name(character, 'without a name')}"
+    return ""
 
 
 def printable(text: str) -> str:

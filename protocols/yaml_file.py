@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from protocols.errors import InputError
 from protocols.quantity import number_meant
-from protocols.shown import MASK, holds_secret, is_secret
+from protocols.shown import MASK, foreign_character, holds_secret, is_secret
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
@@ -365,6 +365,8 @@ def _explain(model: type[BaseModel], error: ValidationError, path: str | Path) -
         close = difflib.get_close_matches(str(loc[-1]), names, n=1)
         hint = f"; did you mean '{close[0]}'?" if close else ""
         known = f" (known here: {', '.join(names)})" if names else ""
+        foreign = foreign_character(str(loc[-1]))
+        hint = (f" (holds {foreign})" if foreign else "") + hint
         return InputError(path, key, value, f"unknown key{hint}{known}")
     if kind == "missing":
         return InputError(path, key, None, "is missing")

@@ -148,7 +148,7 @@ def _chain(
     argmax = summary["kinematic"]["accuracy"]["argmax"]
     rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
     console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
-    console.results.print(f"Report{simulated}: {page.resolve()}", soft_wrap=True)
+    console.show(f"Report{simulated}: {page.resolve()}")
 
 
 def register(app: typer.Typer) -> None:

@@ -141,7 +141,7 @@ def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
         found = [outcome.as_json() for outcome in outcomes]
         console.print_json(found[0] if len(found) == 1 else {"done": done, "requests": found})
     elif done:
-        console.results.print(words, markup=False, soft_wrap=True)
+        console.show(words)
     if not done:
         kind = outcomes[0].request.kind
         console.say(

@@ -139,7 +139,7 @@ def verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.results.print(f"{trials} trials, all as they were committed")
+        console.show(f"{trials} trials, all as they were committed")
     if problems:
         raise typer.Exit(console.FAILED)
 

@@ -40,7 +40,7 @@ def review(
             console.print_json(told)
         else:
             console.say(f"{len(trials.rows)} trials, {waiting} to decide. Ctrl-C ends the page:")
-            console.results.print(address, soft_wrap=True)
+            console.show(address)
 
     serve(Store.open(store), campaign or (), port, who, ready)
 

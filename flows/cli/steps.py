@@ -39,12 +39,12 @@ def sync(
 
     for title, rows in tables(result):
         console.print_table(title, COLUMNS, rows)
-    console.results.print(
+    console.show(
         "Median and worst: uncertainty of events against the device, both clocks together; "
         "of events that of their own clock."
     )
     simulated = " (simulated)" if result["simulated"] else ""
-    console.results.print(f"Page{simulated}: {Path(result['page']).resolve()}", soft_wrap=True)
+    console.show(f"Page{simulated}: {Path(result['page']).resolve()}")
 
 
 def label(
@@ -124,7 +124,7 @@ def report(
         else:
             title = "Two reports" + (" (simulated)" if any(compared["simulated"].values()) else "")
             console.print_table(title, *report_against_page.short_table(compared["figures"]))
-            console.results.print(f"Page: {compared['page']}", soft_wrap=True)
+            console.show(f"Page: {compared['page']}")
     finish(result, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")
 

@@ -119,7 +119,7 @@ def verify(
         rows = [[item.path, item.what] for item in problems]
         console.print_table(f"{len(problems)} problems", ["where", "what is wrong"], rows)
     else:
-        console.results.print(f"{total} trials, all as they were committed")
+        console.show(f"{total} trials, all as they were committed")
     if problems:
         raise typer.Exit(console.FAILED)
 
@@ -145,9 +145,9 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     if as_json:
         console.print_json({"format": opened.format, "from": passed, "copies": copies})
     elif passed:
-        console.results.print(f"format {passed[0]} to {opened.format}; copies: {copies}")
+        console.show(f"format {passed[0]} to {opened.format}; copies: {copies}")
     else:
-        console.results.print(f"nothing to do: format {opened.format} is the newest")
+        console.show(f"nothing to do: format {opened.format} is the newest")
 
 
 def register(app: typer.Typer) -> None:

@@ -151,7 +151,7 @@ def _scene(
     title = f"Cost and error of the scene of {result['protocol']} (simulated)"
     console.print_table(title, *short_table(result))
     console.print_pairs("The level that the protocol needs", choice_pairs(result))
-    console.results.print(f"Page (simulated): {(out / steps.PAGE).resolve()}", soft_wrap=True)
+    console.show(f"Page (simulated): {(out / steps.PAGE).resolve()}")
 
 
 def _detector(
@@ -191,8 +191,8 @@ def _detector(
     console.print_table(
         f"The quickest detectors by false early trials{simulated}", *short_table(result)
     )
-    console.results.print("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
-    console.results.print(f"Page{simulated}: {(target / steps.PAGE).resolve()}", soft_wrap=True)
+    console.show("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
+    console.show(f"Page{simulated}: {(target / steps.PAGE).resolve()}")
 
 
 def register(app: typer.Typer) -> None:

@@ -64,6 +64,11 @@ def say(text: str) -> None:
     messages.print(_clean(text), markup=False)
 
 
+def show(text: str) -> None:
+    """A line of a command's result, for people."""
+    results.print(_clean(text), markup=False, soft_wrap=True)
+
+
 _as_json = _printed = False
 
 

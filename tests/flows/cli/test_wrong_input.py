@@ -146,6 +146,24 @@ PROTOCOLS: dict[str, tuple[str, str, str, str]] = {
         "collection.repetitions",
         "the key stands twice (line 15)",
     ),
+    "a letter of another alphabet": (
+        "speed: $speed",
+        "speed: $sp\N{CYRILLIC SMALL LETTER IE}ed",
+        "collection.motion[3].speed = $sp\N{CYRILLIC SMALL LETTER IE}ed",
+        "must be a factor's name after '$'",
+    ),
+    "a stratum in another alphabet": (
+        "strata: [depth, speed]",
+        "strata: [d\N{CYRILLIC SMALL LETTER IE}pth, speed]",
+        "analysis.split.strata[0] = d\N{CYRILLIC SMALL LETTER IE}pth",
+        "(holds U+0435 CYRILLIC SMALL LETTER IE); defined factors: depth, speed, direction",
+    ),
+    "a key in another alphabet": (
+        "  repetitions: 1",
+        "  rep\N{CYRILLIC SMALL LETTER IE}titions: 1",
+        "collection.rep\N{CYRILLIC SMALL LETTER IE}titions = 1",
+        "unknown key (holds U+0435 CYRILLIC SMALL LETTER IE); did you mean 'repetitions'?",
+    ),
     "strata": (
         "strata: [depth, speed]",
         "strata: [depht, speed]",
