@@ -55,6 +55,9 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> float:
         (Kind.PROTECTIVE_STOP, ArmState.PROTECTIVE_STOP),
         (Kind.EMERGENCY_STOP, ArmState.EMERGENCY_STOP),
         (Kind.REMOTE_OFF, ArmState.NOT_RUNNING),
+        (Kind.SAFEGUARD_STOP, ArmState.PROTECTIVE_STOP),
+        (Kind.PROGRAM_PAUSED, ArmState.NOT_RUNNING),
+        (Kind.POWER_OFF, ArmState.NOT_RUNNING),
     ],
 )
 def test_a_stop_while_sliding_ends_the_path(
