@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import traceback
-from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +26,6 @@ from storage.errors import StoreError, disk_error
 from storage.files import disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
-WORKER_GONE = (
-    "a worker process was ended from outside, perhaps by the system for want of memory: what was "
-    "made is kept; run the same command to go on"
-)
 _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError", "OutputLost",
     "WorkerKilled"
@@ -90,8 +85,6 @@ def failure(error: Exception) -> Failure:
         return Failure(known, console.FAILED)
     if isinstance(error, InputError):
         return _wrong_input(error)
-    if isinstance(error, BrokenExecutor):
-        return Failure(WORKER_GONE, console.FAILED)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
     if isinstance(error, OSError) and error.filename:
