@@ -27,8 +27,8 @@ from storage.files import disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
 _EXPECTED = {
-    "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError", "OutputLost",
-    "WorkerKilled"
+    "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
+    "OutputLost", "WorkerKilled",
 }  # fmt: skip
 """Errors whose message says all there is to say, by name: their modules take long to load."""
 _OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|TRIAL|URL")
