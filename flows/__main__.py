@@ -30,7 +30,7 @@ def main() -> None:
             code = _fail(str(error), 1)
     except KeyboardInterrupt:
         code = _fail("interrupted", 130)
-    except (ImportError, MemoryError, OSError) as error:
+    except (ImportError, MemoryError, OSError, SystemError) as error:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
     sys.exit(code)
 

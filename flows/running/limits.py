@@ -15,6 +15,7 @@ import sys
 
 _MEMORY = re.compile(
     r"annot allocate memory|failed to map segment|Unable to allocate|not enough memory|bad_alloc"
+    r"|error return without exception set"  # Python's own words where even the error has no room
 )
 _FILES = re.compile(r"Too many open files")
 _PROCESSES = re.compile(r"can't start new thread|Resource temporarily unavailable")

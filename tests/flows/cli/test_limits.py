@@ -58,6 +58,7 @@ def test_a_program_that_cannot_be_loaded(which: str, limit: int, message: str) -
         (MemoryError(), "there is not enough memory"),
         (MemoryError("Unable to allocate 11.9 TiB for an array"), "there is not enough memory"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "there is not enough memory"),
+        (SystemError("error return without exception set"), "there is not enough memory"),
         (ImportError("libx.so: failed to map segment from shared object"), "not enough memory"),
         (OSError(errno.EMFILE, "Too many open files", "x.json"), "too many files are open"),
         (OSError(errno.ENFILE, "Too many open files in system"), "too many files are open"),
