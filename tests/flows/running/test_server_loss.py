@@ -249,7 +249,8 @@ def test_closed_standard_streams_do_not_matter(tmp_path: Path) -> None:
             ["/bin/sh", "-c", f"exec {command} --store {store} {closed}"],
             cwd=ROOT, env=environment, text=True, stderr=subprocess.PIPE, timeout=120, check=False,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
+        # the result has nowhere to go where standard output is closed, which is said as a failure
+        assert done.returncode == (1 if ">&-" in closed else 0), done.stderr
         assert LOST not in done.stderr
         assert states(store / ".prefect" / "prefect.db") == [("collect", "COMPLETED")]
 
