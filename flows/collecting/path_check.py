@@ -1,7 +1,7 @@
-"""The motion of a trial against what the arm was told: its place across and its speed along.
+"""Check a recorded motion against the commanded one: place across the path, speed along it.
 
-Everything comes from the poses that were stored, so it holds for every arm, whoever planned the
-motion: a controller that slows a move down and calls it done is seen here.
+Everything comes from the stored poses, so the check is the same for every arm. It finds a
+controller that slows a move down and still reports it as done.
 """
 
 from __future__ import annotations

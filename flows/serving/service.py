@@ -86,5 +86,5 @@ def service() -> Service:
     text = os.environ.get(ENVIRONMENT)
     if text is None:
         raise RuntimeError("this flow runs under `sliplab serve` only")
-    told = json.loads(text)
-    return Service(**{**told, "protocols": tuple(told["protocols"])})
+    given = json.loads(text)
+    return Service(**{**given, "protocols": tuple(given["protocols"])})
