@@ -61,7 +61,7 @@ def _explain(error: Exception) -> int:
     from flows.running import stopping
     from protocols.errors import InputError
 
-    if stopping.requested() and not isinstance(error, InputError):
+    if stopping.requested() and not (isinstance(error, InputError) or errors.is_arm_fault(error)):
         return errors.interruption().report()
     return errors.failure(error).report()
 

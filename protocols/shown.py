@@ -27,7 +27,8 @@ _MISSPELT = ("password", "passwd", "passphrase", "secret", "token", "credentials
 _CLOSE = 0.85
 _WRITTEN = re.compile(r"(?<![\w-])([\w-]+)\s*[:=]\s*(?=[^\s*])")
 _URL = re.compile(r"(://[^\s/@:\"']*:)([^\s/@\"']+)(?=@)")
-_LONGEST = 80
+_LONGEST = 200
+"""Characters of a value; paths are to be seen whole."""
 _LOOKED_AT = 1000
 """Characters of a text or a name that are searched: a file may hold a million."""
 
@@ -73,7 +74,7 @@ def printable(text: str) -> str:
 
 
 def shown(value: object, key: str = "") -> str:
-    """A value in one line of at most 80 characters, as YAML would write it.
+    """A value in one line of at most 200 characters, as YAML would write it.
 
     Args:
         key: where it stands; values of secret keys are masked, at any depth.

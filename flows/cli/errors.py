@@ -75,6 +75,11 @@ def interruption() -> Failure:
     return Failure(INTERRUPTED, console.INTERRUPTED)
 
 
+def is_arm_fault(error: Exception) -> bool:
+    """Whether an arm failed, or could not be stopped: Ctrl-C must not hide that."""
+    return type(error).__name__ == "ArmFault"  # its module takes long to load
+
+
 def failure(error: Exception) -> Failure:
     """Name what `error` is about, and choose the exit code."""
     if isinstance(error, typer.Exit):

@@ -101,6 +101,10 @@ def signals() -> Iterator[None]:
         signal.signal(number, _handle)
     try:
         yield
+    except SystemError as error:  # a compiled function makes one of an exception that meets it
+        if _requested.is_set():
+            raise KeyboardInterrupt from error
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -68,7 +68,7 @@ def test_no_other_key_of_our_files_counts_as_a_secret() -> None:
         ("password: hunter2", f"password: {MASK}"),
         ("user=a password=hunter2", f"user=a password={MASK}"),
         ("http://anna:hunter2@host/x", f"http://anna:{MASK}@host/x"),
-        ("x" * 100, "x" * 77 + "..."),
+        ("x" * 201, "x" * 197 + "..."),
     ],
 )
 def test_values_as_yaml_writes_them(value: object, text: str) -> None:
@@ -107,7 +107,7 @@ def test_a_secret_in_a_key_is_masked(name: str, secret: str, sign: str) -> None:
 
 def test_long_text_is_shown_at_once() -> None:
     for text in ("x" * 10**6, "a: " * 300_000, "://" * 300_000, "a" * 10**6 + ": b"):
-        assert len(shown(text)) == 80
+        assert len(shown(text)) == 200
         assert len(shown_key(text)) <= 1000
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import typer
 from flows.cli.app import app
 from flows.running import stopping
 from flows.running.cluster import ClusterError
+from rigs.capabilities import ArmFault
 from storage.errors import StoreError
 from storage.store import Store
 from tests.command_line import SECRET, here
@@ -202,6 +204,21 @@ def test_whatever_ends_a_command_is_an_object(
     plain = here("plan", ROOT / "protocols" / "pilot.yaml")
     assert (plain.returncode, plain.stdout) == (code, "")
     assert not stopping.requested()
+
+
+def test_an_arm_that_does_not_stop_is_said_to_whoever_pressed_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object) -> None:
+        with suppress(KeyboardInterrupt):
+            stopping.stop()
+        raise ArmFault("arm", "does not stop: press its emergency stop")
+
+    monkeypatch.setattr("protocols.plan.load_plan", interrupted)
+    done = here("plan", ROOT / "protocols" / "pilot.yaml", "--json")
+    assert done.returncode == 1
+    assert "press its emergency stop" in done.stderr
+    assert "press its emergency stop" in json.loads(done.stdout)["error"]["message"]
 
 
 def test_a_missing_file_of_a_store_is_named(tmp_path: Path) -> None:

@@ -178,6 +178,7 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
 CRASH = """
 import os, signal, sys, time
 from flows.running import limits
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
 from flows import __main__ as program

@@ -43,6 +43,20 @@ def test_a_signal_that_python_drops_is_remembered() -> None:
             bar.advance()
 
 
+def test_a_signal_that_a_compiled_function_meets_is_an_interruption() -> None:
+    """Numba returns a SystemError in place of what its caller's signal handler raised."""
+
+    def compiled() -> None:
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        raise SystemError("returned a result with an exception set")
+
+    with pytest.raises(KeyboardInterrupt), stopping.signals():
+        compiled()
+    with pytest.raises(SystemError), stopping.signals():
+        raise SystemError("a fault of its own")
+
+
 def test_handlers_are_put_back() -> None:
     before = signal.getsignal(signal.SIGINT)
     with stopping.signals():
