@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -128,11 +129,11 @@ def show(subject: Subject) -> None:
     with tempfile.TemporaryDirectory(prefix="sliplab-view-") as folder:
         path = Path(folder) / f"{subject.item.name}.rrd"
         save(subject, path)
-        with silent() as environment, _viewer(path, environment) as viewer:
-            while viewer.poll() is None:
+        with silent() as environment, viewer(str(path), environment=environment) as window:
+            while window.poll() is None:
                 stopping.wait(0.2)
-        if viewer.returncode:
-            raise StoreError(f"Rerun's viewer ended with {viewer.returncode}")
+        if window.returncode:
+            raise StoreError(f"Rerun's viewer ended with {window.returncode}")
 
 
 ALONE = ("--bind", "127.0.0.1", "--port", "auto")
@@ -141,19 +142,25 @@ otherwise, and hands the file to whatever listens on its usual port, maybe anoth
 
 
 @contextmanager
-def _viewer(path: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Rerun's program while the block runs; nothing of it is left afterwards.
+
+    It has a session of its own, because it starts another program, which outlives it otherwise.
+    """
     # what it prints is for people: standard output has nothing but the command's result
-    viewer = subprocess.Popen([program(), *ALONE, str(path)], env=environment, stdout=2)
+    process = subprocess.Popen(
+        [program(), *ALONE, *arguments], env=environment, stdout=2, start_new_session=True
+    )
     try:
-        yield viewer
+        yield process
     finally:
-        if viewer.poll() is None:
-            viewer.terminate()
-        try:
-            viewer.wait(10)
-        except subprocess.TimeoutExpired:
-            viewer.kill()
-            viewer.wait(10)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(10)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(10)
 
 
 def program() -> str:

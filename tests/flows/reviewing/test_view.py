@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -198,26 +197,33 @@ def test_nothing_is_sent_home(
     assert not file.exists()
 
 
+def gone(group: int) -> bool:
+    """Whether no process of a group is left, within 20 s."""
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+    return False
+
+
 def test_the_viewer_is_reached_from_this_computer_only(
     made: Reviewable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # the server of Rerun's own program, with the options that the viewer gets, and no window
     file = tmp_path / "a.rrd"
     view.save(view.find(made.store, made.ids[1]), file)
-    with view.silent() as environment:
-        server = subprocess.Popen(
-            [view.program(), *view.ALONE, "--serve-grpc", str(file)],
-            env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
-        try:
-            found: set[str] = set()
-            end = time.monotonic() + 60
-            while not found and time.monotonic() < end and server.poll() is None:
-                found = listening(server.pid)
-        finally:
-            server.kill()
-            server.wait(30)
+    found: set[str] = set()
+    with (
+        view.silent() as environment,
+        view.viewer("--serve-grpc", str(file), environment=environment) as server,
+    ):
+        end = time.monotonic() + 60
+        while not found and time.monotonic() < end and server.poll() is None:
+            found = listening(server.pid)
     assert found == {"127.0.0.1"}
+    assert gone(server.pid)
 
 
 def test_what_is_missing_is_said(
