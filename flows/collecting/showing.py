@@ -26,7 +26,7 @@ from storage.streams import Json
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0
 """How long the end of a collection waits for its page, while the server answers."""
-STOP_LIMIT_S = 1.0
+STOP_LIMIT_S = 0.5
 """How long it does when a stop was requested."""
 ANSWER_S = 5.0
 """How long one answer of the server is waited for."""

@@ -29,7 +29,7 @@ BEGIN_S = 15.0
 """How long the begin of a run waits for an answer; no arm moves yet."""
 END_S = 5.0
 """How long its end does."""
-LOST_S = 1.0
+LOST_S = 0.5
 """How long each does once the server was lost, or when a stop was requested."""
 NOWHERE = "http://127.0.0.1:9/api"
 """The address that Prefect has where no server could be started; it is never called."""
@@ -148,7 +148,7 @@ class Calls:
             found = outcome.result(limit_s)
         except TimeoutError:
             given_up.set()
-            self.lose(f"nothing came in {limit_s:.0f} s")
+            self.lose(f"nothing came in {limit_s:g} s")
         except Exception as error:
             self.lose(reason_of(error))
         else:
