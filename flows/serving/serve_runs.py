@@ -18,6 +18,7 @@ from flows.planning.orders import Order
 from flows.running import console, run_records, server_calls, stopping
 from flows.running.embedded_server import die_with
 from flows.serving.serve_parameters import OnRig
+from flows.serving.serve_watch import ask_on
 from flows.serving.serve_windows import window_end
 from flows.serving.service import Service, service
 from protocols import InputError
@@ -51,6 +52,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     run, here, name = context.flow_run, service(), context.flow.name
     server_calls.Calls(here.server, here.folder, run).through(context.client)
     run_events.bound_exit()
+    ask_on()
     run_records.begin(here.folder, str(run.id), name, here.server, here.name)
     state: Any
     try:

@@ -85,7 +85,7 @@ async def _answers() -> bool:
 
 
 def ask_on() -> None:
-    """Have Prefect's runner ask on while its server does not answer.
+    """Have Prefect's runner and its runs ask on while their server does not answer.
 
     Its second way to learn of a cancelled run, used once its connection for events was
     lost, is refused by the server (422). That is no reason to print a traceback: `stop/NAME` acts.

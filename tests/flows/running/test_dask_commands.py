@@ -83,7 +83,9 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     return folder / "store"
 
 
-@pytest.mark.parametrize("installed", ["by a path", "by a finder"])
+@pytest.mark.parametrize(
+    "installed", [pytest.param("by a path", marks=pytest.mark.long), "by a finder"]
+)
 def test_the_documented_commands_make_the_same_bytes(
     taken: Path, tmp_path: Path, installed: str
 ) -> None:
