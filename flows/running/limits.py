@@ -72,6 +72,8 @@ def run_in_child() -> str | None:
     parent = os.getpid()
     child = os.fork()
     if child == 0:
+        # OpenBLAS waits for ever for the memory of a thread that it does not get
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if os.getppid() != parent:
