@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from protocols.presets import COMPARED, PAPER, Value, at, expanded
 from protocols.yaml_file import KeyedError, StrictModel
 
 Scale = Annotated[float, Field(ge=0, le=1e6)]
@@ -107,11 +108,18 @@ class Network(StrictModel):
     outputs_per_class: int = Field(default=4, ge=1, le=64)
     """Output neurons of each class, whose spikes are counted together: with one, as in the paper,
     a window of 30 steps has 31 counts to tell classes apart by, and more ties."""
+    biases: bool = True
+    """Biases in the full layers: without them nothing can say "no events" (docs/network.md)."""
     conv1_kernel: Literal[1, 3, 5, 7] = 5
     conv2_kernel: Literal[1, 3, 5, 7] = 3
     """Side of the square kernels, cells."""
     weight_scale: tuple[Scale, Scale, Scale, Scale] = (4.0, 3.0, 4.0, 3.0)
     """Factors on the default initial weights; without them the deep layers stay silent."""
+
+    @property
+    def margin(self) -> float:
+        """The paper's lead of a winner, in spikes of a class: two for each of its neurons."""
+        return 2.0 * self.outputs_per_class
 
 
 _DEVICE = r"^(cpu|cuda(:\d+)?)$"
@@ -224,6 +232,12 @@ class Detection(StrictModel):
 class AnalysisSettings(StrictModel):
     """The whole `analysis:` section."""
 
+    preset: Literal["paper"] | None = None
+    """``paper``: network, training and rule of the paper (docs/network.md). Keys that stand beside
+    it go before its values."""
+    also: Literal["paper"] | None = None
+    """A preset whose network is trained and judged as well, on the same windows and labels, with
+    the first seed; its figures stand beside the others in the report."""
     labelling: Labelling = Labelling()
     windows: Windows = Windows()
     samples: Samples = Samples()
@@ -231,6 +245,11 @@ class AnalysisSettings(StrictModel):
     network: Network = Network()
     training: Training = Training()
     detection: Detection = Detection()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, data: Any) -> Any:
+        return expanded(data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _spikes(self) -> AnalysisSettings:
@@ -243,14 +262,16 @@ class AnalysisSettings(StrictModel):
                 "detection",
                 self.detection,
                 {
-                    "margin": rule.margin * factor,
+                    "margin": self.network.margin,
                     "margin_grid": tuple(each * factor for each in rule.margin_grid),
                 },
             ),
         )
         for name, part, wanted in changes:
             left = {key: wanted[key] for key in wanted.keys() - part.model_fields_set}
-            object.__setattr__(self, name, part.model_copy(update=left))  # frozen for all others
+            found = part.model_copy(update=left)
+            found.model_fields_set.difference_update(left)  # nobody said them: see `rule_for`
+            object.__setattr__(self, name, found)  # frozen for all others
         return self
 
     @model_validator(mode="after")
@@ -270,6 +291,44 @@ class AnalysisSettings(StrictModel):
                 f"must divide length_ms = {length}, and be whole steps of {self.windows.step_ms}",
             )
         return self
+
+    @property
+    def overrides(self) -> tuple[tuple[Value, Any], ...]:
+        """Settings in which this differs from the paper's preset, with the values here."""
+        found = ((each, at(self, each.key)) for each in PAPER)
+        return tuple((each, value) for each, value in found if value != each.value)
+
+    def beside(self) -> AnalysisSettings | None:
+        """The settings of the network that `also` asks for; None without one.
+
+        Network, training and rule are the preset's; epochs, batch, patience and device of the
+        training, and all else, are those here.
+        """
+        if self.also is None or self.also == self.preset:
+            return None
+        data = self.model_dump()
+        for section in COMPARED:
+            data[section] |= {
+                each.key.split(".")[1]: each.value
+                for each in PAPER
+                if each.key.startswith(f"{section}.")
+            }
+        data["training"]["seeds"] = self.training.seeds[:1]
+        data["detection"]["compare"] = None
+        return AnalysisSettings.model_validate({**data, "preset": self.also, "also": None})
+
+    def rule_for(self, model: AnalysisSettings) -> Detection:
+        """The rule of detection here, in the spikes that another protocol's network gives.
+
+        Gravity trials are judged by the network of the kinematic campaign. A margin that is said
+        here is a lead by so many spikes of as many neurons as stand here; one that is not said is
+        the network's own.
+        """
+        factor = model.network.outputs_per_class / self.network.outputs_per_class
+        said = "margin" in self.detection.model_fields_set
+        margin = self.detection.margin * factor if said else model.detection.margin
+        grid = tuple(each * factor for each in self.detection.margin_grid)
+        return self.detection.model_copy(update={"margin": margin, "margin_grid": grid})
 
     @property
     def stride_ms(self) -> int:

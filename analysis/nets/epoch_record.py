@@ -53,9 +53,10 @@ def epoch_record(
     val_y: metrics.IntArray,
     rates: dict[str, float],
     gain: float,
+    margin: float,
 ) -> EpochRecord:
     """The record of an epoch from the output spikes (n, 3) and classes of both parts."""
-    val = metrics.accuracy(val_counts, val_y)
+    val = metrics.accuracy(val_counts, val_y, margin)
     train = metrics.accuracy(train_counts, train_y)
     log_p = log_softmax(gain * val_counts, axis=1)
     return EpochRecord(

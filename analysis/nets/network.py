@@ -26,7 +26,8 @@ WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 """Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""
 
 BIASED = ("fc1", "fc2")
-"""Those of them with a bias as well: a current that their neurons get in every step."""
+"""Those of them with a bias as well, unless the settings leave it out: a current that their neurons
+get in every step."""
 
 FIRST_BIAS = (-0.5, 0.5)
 """Between which values the hidden neurons' biases begin, in thresholds a step: half of them fire by
@@ -50,7 +51,8 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
     and give (n * steps, outputs) spikes; output j is of class j % 3 (`by_class`). Weights are
     torch's default draw times ``settings.weight_scale``; hidden neurons' biases are drawn from
     `FIRST_BIAS`, outputs begin at `FIRST_DRIVE`, and convolutions have no biases
-    (docs/decisions/0054, 0056, 0059). torch's global random state is left as it was.
+    (docs/decisions/0054, 0056, 0059); with ``settings.biases`` off no layer has. torch's global
+    random state is left as it was.
 
     Args:
         settings: channels, kernels, hidden neurons, outputs, weight scale.
@@ -72,14 +74,17 @@ def build(settings: Network, windows: Windows, seed: int) -> nn.Sequential:
             padding=k2 // 2,
             bias=False,
         )
-        fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden)
-        fc2 = nn.Linear(settings.hidden, len(CLASSES) * settings.outputs_per_class)
-        nn.init.uniform_(fc1.bias, *FIRST_BIAS)
+        biases, outputs = settings.biases, len(CLASSES) * settings.outputs_per_class
+        fc1 = nn.Linear(settings.conv2_channels * side * side, settings.hidden, bias=biases)
+        fc2 = nn.Linear(settings.hidden, outputs, bias=biases)
+        if biases:
+            nn.init.uniform_(fc1.bias, *FIRST_BIAS)
     layers: tuple[Any, ...] = (conv1, conv2, fc1, fc2)
     with torch.no_grad():
         for layer, scale in zip(layers, settings.weight_scale, strict=True):
             layer.weight.mul_(scale)
-        fc2.bias.copy_(FIRST_DRIVE - fc2.weight @ rates_alone(fc1.bias, windows.steps))
+        if biases:
+            fc2.bias.copy_(FIRST_DRIVE - fc2.weight @ rates_alone(fc1.bias, windows.steps))
     return nn.Sequential(
         OrderedDict(
             conv1=conv1,
@@ -122,7 +127,7 @@ def parameters(net: nn.Sequential) -> dict[str, nn.Parameter]:
         f"{layer}.{kind}": getattr(getattr(net, layer), kind)
         for layer in WEIGHTED
         for kind in ("weight", "bias")
-        if kind == "weight" or layer in BIASED
+        if getattr(getattr(net, layer), kind) is not None
     }
 
 
@@ -209,14 +214,17 @@ EXACT = 2**24
 def matrices(net: nn.Sequential) -> list[npt.NDArray[np.float32]]:
     """Copies of each layer's weights in torch's shape, a bias as one column more.
 
-    A bias is the weight of a source that fires in every step.
+    A bias is the weight of a source that fires in every step; a layer of `BIASED` without one has
+    zeros there.
     """
     found = []
     for name in WEIGHTED:
         layer = getattr(net, name)
         value = layer.weight.detach().numpy()
         if name in BIASED:
-            value = np.column_stack([value, layer.bias.detach().numpy()])
+            none = np.zeros(len(value), np.float32)
+            bias = none if layer.bias is None else layer.bias.detach().numpy()
+            value = np.column_stack([value, bias])
         found.append(np.array(value, np.float32))
     return found
 
@@ -231,6 +239,12 @@ def by_parameter(values: list[npt.NDArray[np.float32]]) -> dict[str, torch.Tenso
         else:
             found[f"{name}.weight"] = torch.from_numpy(value)
     return found
+
+
+def set_matrices(net: nn.Sequential, values: list[npt.NDArray[np.float32]]) -> None:
+    """Put `matrices` into a network of their shape; biases that it has not are left out."""
+    wanted = parameters(net)
+    set_weights(net, {name: w for name, w in by_parameter(values).items() if name in wanted})
 
 
 def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float32]]:

@@ -182,7 +182,7 @@ def _step_nodes(helper: Any, layers: dict[str, Any]) -> list[Any]:
             if len(nodes) and weighted == "fc1":
                 nodes.append(helper.make_node("Flatten", [at], ["flat"], axis=1))
                 at = "flat"
-            given = [at, weight, f"{weighted}.bias"]
+            given = [at, weight, *([] if layer.bias is None else [f"{weighted}.bias"])]
             nodes.append(helper.make_node("Gemm", given, [f"{weighted}.current"], transB=1))
         u, fired, at = f"{spiking}.u", f"{spiking}.fired", f"{spiking}.spikes"
         nodes += [

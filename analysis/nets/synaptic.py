@@ -18,7 +18,7 @@ import numpy.typing as npt
 from torch import nn
 
 from analysis.nets.metrics import CLASSES
-from analysis.nets.network import BIASED, SPIKING, WEIGHTED
+from analysis.nets.network import SPIKING, WEIGHTED
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.spiking import Trainer, side_by_side
 from analysis.nets.spiking_gradients import forward_kept
@@ -131,8 +131,10 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | N
     operations = done.sum(axis=0)
     operations[0] = int((synapses[0][x.cell] * x.count).sum())
     spikes, n = fired.sum(axis=0), len(x)
-    biases = {name: trainer.layout.neurons[WEIGHTED.index(name)] for name in BIASED}
-    always = {name: biases.get(name, 0) * trainer.steps for name in WEIGHTED}
+    always = {
+        name: 0 if getattr(net, name).bias is None else neurons * trainer.steps
+        for name, neurons in zip(WEIGHTED, trainer.layout.neurons, strict=True)
+    }
     return Work(
         synaptic={name: int(operations[k]) / n + always[name] for k, name in enumerate(WEIGHTED)},
         dense={

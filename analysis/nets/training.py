@@ -121,8 +121,9 @@ def fit(
             loss, counts, rates = run.one_epoch(seen, train_y, order, pool)
             val_counts = Engine(run.trained, windows.cells).counts(val)
             record = epoch_record(
-                epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain
-            )
+                epoch, loss, counts, train_y, val_counts, val_y, rates, training.gain,
+                network.margin,
+            )  # fmt: skip
             run.keep(record)
             run.seconds.append(time.perf_counter() - started)
             if on_epoch is not None:

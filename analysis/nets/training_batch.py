@@ -22,7 +22,8 @@ class Batch:
         loss: summed over windows.
         counts: output spikes int64 (n, 3).
         fired: of each spiking layer, spikes per neuron and step, summed over windows.
-        gradients: of the summed loss, float32, by parameter.
+        gradients: of the summed loss, float32, by parameter; biases that the network has not may
+            be among them.
     """
 
     loss: float

@@ -24,10 +24,9 @@ from analysis.nets.metrics import IntArray
 from analysis.nets.network import (
     SPIKING,
     by_class,
-    by_parameter,
     parameters,
     reset_states,
-    set_weights,
+    set_matrices,
 )
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.training_batch import Batch
@@ -87,7 +86,7 @@ class OnDevice:
 
     def take(self, weights: list[npt.NDArray[np.float32]]) -> None:
         """Use these from now on."""
-        set_weights(self._net, by_parameter(weights))
+        set_matrices(self._net, weights)
 
     def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
         """The whole batch at once; the pool has nothing to do."""

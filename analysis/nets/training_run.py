@@ -17,10 +17,10 @@ from analysis.nets.learning_rate import learning_rate
 from analysis.nets.network import (
     SPIKING,
     build,
-    by_parameter,
     matrices,
     on_grid,
     parameters,
+    set_matrices,
     set_weights,
     weights,
 )
@@ -55,7 +55,7 @@ class Run:
 
     def settle(self) -> None:
         """Let `trained` have the weights that the spikes are of."""
-        set_weights(self.trained, by_parameter(on_grid(matrices(self.fine))))
+        set_matrices(self.trained, on_grid(matrices(self.fine)))
 
     @property
     def ended(self) -> bool:
@@ -81,8 +81,8 @@ class Run:
             counts[chosen] = found.counts
             for name, rate in found.fired.items():
                 fired[name] += rate
-            for name, gradient in found.gradients.items():
-                self.parameters[name].grad = gradient / len(chosen)
+            for name, parameter in self.parameters.items():
+                parameter.grad = found.gradients[name] / len(chosen)
             for group in self.optimizer.param_groups:
                 group["lr"] = learning_rate(self.training, len(self.history), start // batch, steps)
             self.optimizer.step()

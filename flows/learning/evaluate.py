@@ -92,7 +92,8 @@ def make_job(
     labels = Labels(store, reviewed)
     models = wanted_models(store, campaigns, reviewed)
     model = choose_model(models)
-    windows = training_settings(campaigns).windows.model_dump(mode="json")
+    settings = training_settings(campaigns)
+    windows = settings.windows.model_dump(mode="json")
     change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
     change = {name: value for name, value in change.items() if value is not None}
     if change:
@@ -100,7 +101,7 @@ def make_job(
     detection, trials, inputs = {}, [], [key_inputs(models, campaigns)]
     for item in campaigns:
         detection[item.name] = Detection.model_validate(
-            {**item.settings.detection.model_dump(), **change}
+            {**item.settings.rule_for(settings).model_dump(), **change}
         )
         for trial, recording in item.trials:
             if trial.split != "test":
@@ -145,12 +146,12 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
     settings = training_settings(job.campaigns)
     choices = job.detectors.choices(job.store, job.detection)
     detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
-    ours = job.detection[training_campaigns(job.campaigns)[0].name]
+    kinematic = training_campaigns(job.campaigns)[0].name
     rows = _score_trials(job, detection)
     result = {
         "format": FORMAT,
         "seed": job.model.seed,
-        "windows": score_windows(job, train, test),
+        "windows": score_windows(job, train, test, detection[kinematic].margin),
         "trials": rows,
         "experiments": summaries(rows),
         "label_error_ms": label_errors(job.store, job.campaigns),
@@ -158,7 +159,7 @@ def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
         "reviewed": job.labels.states(job.campaigns),
         "detection": {n: d.model_dump(mode="json") for n, d in detection.items()},
         "choices": {n: None if c is None else asdict(c) for n, c in choices.items()},
-        "detectors": job.detectors.compare(job.store, settings, ours),
+        "detectors": job.detectors.compare(job.store, settings, job.detection[kinematic]),
     }
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 

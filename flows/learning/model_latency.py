@@ -11,6 +11,7 @@ from analysis.nets import dataset, training
 from analysis.nets.quantised import Quantised, chip_run, quantised_net
 from analysis.nets.training import Fitted
 from flows.labelling.reviewed import Labels
+from flows.learning.train import training_settings
 from flows.running.campaigns import Collected
 
 Latency = dict[str, Any]
@@ -29,10 +30,11 @@ def latencies(
     Args:
         on_trial: called before each of them; some thousand windows take a second.
     """
+    model = training_settings(campaigns)
     fast, chip = training.engine(fitted), quantised_net(fitted, whole)
     found: tuple[dict[str, list[Any]], ...] = ({}, {})
     for item in campaigns:
-        rule = item.settings.detection
+        rule = item.settings.rule_for(model)
         for _, recording in item.of_split("test"):
             on_trial()
             label = labels.read(item, recording)

@@ -90,6 +90,8 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
         name: getattr(settings, name).model_dump(mode="json")
         for name in ("windows", "samples", "network")
     }
+    if settings.network.biases:
+        del parameters["network"]["biases"]  # models of before it could be left out stay fresh
     parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
     models = []
     for seed in settings.training.seeds:

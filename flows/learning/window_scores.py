@@ -29,17 +29,20 @@ if TYPE_CHECKING:
     from flows.labelling.reviewed import Labels
     from flows.learning.evaluate import Job
 
-VERSION = 2
+VERSION = 3
 STEP = "windows"
 """The network's counts of the test windows are kept under it, for what is compared later."""
 NAME = "test"
 
 
-def score_windows(job: Job, train: SampleSet, test: SampleSet) -> dict[str, Any]:
-    """All figures of the test windows; see docs/metrics.md."""
+def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) -> dict[str, Any]:
+    """All figures of the test windows; see docs/metrics.md.
+
+    Args:
+        margin: the lead in spikes by which windows and trials are judged alike.
+    """
     settings = training_settings(job.campaigns)
     fitted = model_file.load(job.model.path)
-    margin = settings.detection.margin
     validation = load_samples(job.labels, job.campaigns, "validation")
     counts = training.predict_counts(fitted, test.windows)
     known, trial = split_trials(job.campaigns, "test"), test.trial

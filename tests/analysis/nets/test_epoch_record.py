@@ -14,7 +14,9 @@ RECORD = EpochRecord(1, 0.5, 0.9, 0.25, 0.9, 0.8, 0.7, RATES)
 def test_a_record_of_counts() -> None:
     train = np.array([[3, 0, 0], [0, 3, 3]])
     val = np.array([[4, 0, 0], [0, 4, 0], [2, 2, 2], [0, 0, 1]])
-    found = epoch_record(2, 0.5, train, np.array([0, 0]), val, np.array([0, 1, 2, 0]), RATES, 0.5)
+    found = epoch_record(
+        2, 0.5, train, np.array([0, 0]), val, np.array([0, 1, 2, 0]), RATES, 0.5, 2.0
+    )
     assert (found.epoch, found.loss, found.rates) == (2, 0.5, RATES)
     assert found.train_argmax == 0.5
     assert found.val_strict == 0.5

@@ -54,6 +54,7 @@ def fitted(network: Network = SMALL, windows: Windows = TINY, seed: int = 0) -> 
         (Network(), FULL),
         (SMALL, TINY),
         (Network(conv1_kernel=3, conv2_kernel=5, hidden=5), TINY),
+        (Network(biases=False, outputs_per_class=1), TINY),
         (SMALL, Windows(length_ms=8, step_ms=2, crop_px=100, pool_px=20, polarity="both")),
     ],
 )

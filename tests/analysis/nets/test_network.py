@@ -71,6 +71,8 @@ def test_default_sizes_fit_the_chip() -> None:
         "fc2.bias": (12,),
     }
     assert [n for n in WEIGHTED if getattr(net, n).bias is not None] == list(BIASED)
+    plain = weights(build(Network(biases=False, outputs_per_class=1), Windows(), 0))
+    assert list(plain) == [f"{name}.weight" for name in WEIGHTED]
     # on the chip a fully connected layer is a convolution over all of its input
     for ins, outs, kernel, stride, padding, side in (
         (1, 8, 5, 1, 2, 20), (8, 16, 3, 2, 1, 20), (16, 32, 10, 1, 0, 10), (32, 3, 1, 1, 0, 1),

@@ -16,12 +16,11 @@ from analysis.nets.network import (
     SPIKING,
     build,
     by_class,
-    by_parameter,
     exact,
     matrices,
     on_grid,
     reset_states,
-    set_weights,
+    set_matrices,
     spike_counts,
 )
 from analysis.nets.sparse import SparseWindows
@@ -36,7 +35,7 @@ FULL = Windows()
 
 
 def put(net: nn.Sequential, values: list[np.ndarray]) -> nn.Sequential:
-    set_weights(net, by_parameter(values))
+    set_matrices(net, values)
     return net
 
 
@@ -90,6 +89,7 @@ def test_every_shape_of_network(polarity: str, k1: int, k2: int, outputs: int, c
         conv1_channels=3,
         conv2_channels=5,
         hidden=9,
+        biases=outputs != 2,
         outputs_per_class=outputs,
         conv1_kernel=k1,
         conv2_kernel=k2,

@@ -9,11 +9,12 @@ from analysis.nets.network import (
     SPIKING,
     WEIGHTED,
     build,
-    by_parameter,
     matrices,
     on_grid,
     reset_states,
+    set_matrices,
     set_weights,
+    weights,
 )
 from analysis.nets.sparse import SparseWindows
 from analysis.nets.synaptic import count_work, reached
@@ -28,8 +29,8 @@ def untrained(network: Network, windows: Windows) -> Fitted:
     values = matrices(net)
     for value in values[2:]:
         value[:, -1] = np.random.default_rng(0).normal(0.02, 0.05, len(value))
-    state = by_parameter(on_grid(values))
-    return Fitted(state, network, windows, Training(), 3, (), 1, ())
+    set_matrices(net, on_grid(values))
+    return Fitted(weights(net), network, windows, Training(), 3, (), 1, ())
 
 
 @pytest.mark.parametrize("kernel", [1, 3, 5, 7])
@@ -43,8 +44,9 @@ def test_reach_is_the_column_sum_of_torchs_convolution(kernel: int, stride: int,
     assert reached(side, kernel, stride).tolist() == line.grad.flatten().tolist()
 
 
-def test_operations_are_those_of_sinabs_spikes_followed_one_by_one() -> None:
-    network = Network(conv1_channels=3, conv2_channels=4, hidden=5, conv1_kernel=5)
+@pytest.mark.parametrize("biases", [True, False])
+def test_operations_are_those_of_sinabs_spikes_followed_one_by_one(biases: bool) -> None:
+    network = Network(conv1_channels=3, conv2_channels=4, hidden=5, conv1_kernel=5, biases=biases)
     fitted = untrained(network, WINDOWS)
     rng = np.random.default_rng(0)
     x = rng.poisson(0.4, (70, 8, 2, 7, 7)).astype(np.uint8)  # more than a thread takes at a time

@@ -10,7 +10,7 @@ import torch
 
 from analysis.nets import metrics
 from analysis.nets.model_file import FORMAT, load, save
-from analysis.nets.network import GRID, build, exact, matrices, spike_counts, weights
+from analysis.nets.network import GRID, WEIGHTED, build, exact, matrices, spike_counts, weights
 from analysis.nets.training import (
     EpochRecord,
     Fitted,
@@ -60,6 +60,22 @@ def run(seed: int = 0, **changes: object) -> Fitted:
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
     return run()
+
+
+def test_a_network_without_biases_learns_and_has_none(tmp_path: Path) -> None:
+    network = NETWORK.model_copy(update={"biases": False, "outputs_per_class": 1})
+    found = fit(*windows_like(600, 3), *VAL, network, WINDOWS, TRAINING, 0)
+    assert list(found.state_dict) == [f"{name}.weight" for name in WEIGHTED]
+    counts = predict_counts(found, TEST[0])
+    np.testing.assert_array_equal(counts, spike_counts(restore(found), TEST[0]))
+    score = metrics.accuracy(counts, TEST[1])
+    assert score.strict is not None
+    assert score.strict > 0.8
+    # the margin in the record is the network's: two spikes for one output neuron
+    record, val = found.chosen, predict_counts(found, VAL[0])
+    assert record.val_margin == metrics.accuracy(val, VAL[1], 2.0).margin
+    save(tmp_path / "a.pt", found)
+    assert load(tmp_path / "a.pt").network == network
 
 
 def test_every_seed_learns() -> None:

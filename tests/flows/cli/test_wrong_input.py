@@ -29,8 +29,8 @@ PROTOCOLS: dict[str, tuple[str, str, str, str]] = {
         "write 2.5 mm/s",
     ),
     "decimal comma without a unit": (
-        "margin: 8,",
-        "margin: 8,5, ",
+        "{smoothing: 4,",
+        "{margin: 8,5, ",
         "analysis.detection.margin = 8,5",
         "write 8.5",
     ),
@@ -177,7 +177,7 @@ PROTOCOLS: dict[str, tuple[str, str, str, str]] = {
         "analysis.detection.false_early_ms = .inf",
         "must be a finite number",
     ),
-    "margin": ("margin: 8", "margin: .inf", "analysis.detection.margin = .inf", "finite number"),
+    "margin": ("smoothing: 4", "margin: .inf", "analysis.detection.margin = .inf", "finite number"),
     "a count": (
         "frames_lost: 0",
         "frames_lost: 1000000000000",

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.nets import metrics
 from flows.collecting.collect import collect
 from flows.labelling.label import label
 from flows.labelling.reviewed import Labels
@@ -66,6 +67,21 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
         assert ours == rows.get((item.name, trial.id), 0)
         onset = labels.read(item, recording)["incipient_ns"]
         assert (onset is None) == (ours == 0)
+
+
+@pytest.mark.parametrize("margin", [0.0, 2.0])
+def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) -> None:
+    """Another margin once changed the detections, and not the margin accuracy beside them."""
+    assert evaluate(two, collected(two), margin=margin, reviewed=True)["done"] == 1
+    key, found = evaluation_of(two)
+    assert {rule["margin"] for rule in found["detection"].values()} == {margin}
+    kept = kept_counts(two, key)
+    assert kept is not None
+    expected = metrics.accuracy(kept["counts"], kept["y"], margin).margin
+    assert found["windows"]["accuracy"]["margin"] == expected
+    (seed,) = found["windows"]["seeds"]["each"]
+    assert seed["margin"] == expected
+    assert expected != metrics.accuracy(kept["counts"], kept["y"], 8.0).margin
 
 
 def test_each_sample_says_its_trial(two: Store) -> None:
