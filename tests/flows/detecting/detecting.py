@@ -27,18 +27,19 @@ MANY = 300
 """Events of a 30 ms window that only a moving sensor gives."""
 
 
-def untrained(seed: int = 0) -> Fitted:
+def untrained(seed: int = 0, outputs: int = 4) -> Fitted:
     """A network as it is before training; it spikes, and knows nothing."""
-    network, windows, training = Network(), Windows(), Training(epochs=1)
+    network = Network(outputs_per_class=outputs)
+    windows, training = Windows(), Training(epochs=1)
     record = EpochRecord(1, 1.0, 0.3, 1.0, 0.3, 0.3, 0.3, dict.fromkeys(SPIKING, 0.1))
     state = weights(build(network, windows, seed))
     return Fitted(state, network, windows, training, seed, (record,), 1, ())
 
 
-def model_in(folder: Path) -> Path:
+def model_in(folder: Path, outputs: int = 4) -> Path:
     """A model file."""
     path = folder / "model.pt"
-    model_file.save(path, untrained())
+    model_file.save(path, untrained(outputs=outputs))
     return path
 
 

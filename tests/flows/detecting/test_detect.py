@@ -27,10 +27,12 @@ from rigs.rig import Rig
 from rigs.rig_file import RigFile
 from storage.recording import Recording
 from storage.store import Store
+from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detecting.detecting import (
     RIG,
     keeping,
+    model_in,
     ordered,
     short_slide,
     slip_when_busy,
@@ -52,6 +54,15 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     take_all(Session(order.plan, order.rig, rig, campaign))
     (recording,) = campaign.recordings()
     return recording
+
+
+@pytest.mark.parametrize(("outputs", "margin"), [(1, 2.0), (4, 8.0)])
+def test_the_margin_is_in_spikes_of_the_model(outputs: int, margin: float, tmp_path: Path) -> None:
+    model, pilot = model_in(tmp_path, outputs), ROOT / "protocols" / "pilot.yaml"
+    listening = make_detect_order(RIG, model, seconds=1.0)
+    trial = "depth=2.4mm,speed=1.6mmps,direction=0deg"
+    moving = make_detect_order(RIG, model, protocol=pilot, trial=trial)
+    assert listening.detection.margin == moving.detection.margin == margin
 
 
 # -- the same windows and decisions as offline -----------------------------------------------
