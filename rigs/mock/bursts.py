@@ -8,6 +8,7 @@ import numpy.typing as npt
 from rigs.mock.fault_settings import EventBurst
 from rigs.mock.world import World
 from rigs.scene.randomness import generator
+from rigs.scene.readout import Scans
 
 I64 = npt.NDArray[np.int64]
 U16 = npt.NDArray[np.uint16]
@@ -24,32 +25,33 @@ class Bursts:
     def __init__(self, world: World, width: int, height: int) -> None:
         self._world, self._width, self._height = world, width, height
 
-    def into(self, events: Events, begin_ns: int, end_ns: int, scans: tuple[int, int]) -> Events:
+    def into(self, events: Events, begin_ns: int, end_ns: int, scans: Scans) -> Events:
         """`events` of the time from `begin_ns` (left out) to `end_ns`, with the burst's among them.
 
         Args:
-            scans: time between two scans of the read-out, and when one begins, true ns; 0 where
-                every event has its own time. The burst's events carry the times of scans, too.
+            scans: of the read-out; the burst's events carry the times of its columns, too.
         """
         if not self._world.faults.of(EventBurst):
             return events
         burst = self.between(begin_ns, end_ns, scans)
         return _merge([events, burst]) if len(burst[0]) else events
 
-    def between(self, begin_ns: int, end_ns: int, scans: tuple[int, int]) -> Events:
+    def between(self, begin_ns: int, end_ns: int, scans: Scans) -> Events:
         """The burst's events alone; in whatever pieces they are asked for."""
-        period_ns, phase_ns = scans
+        # a scan is handed over when its last column has been read
+        begin_ns, end_ns = begin_ns - scans.reading_ns, end_ns - scans.reading_ns
         parts = [_none()]
         for index, (fault, first_ns, last_ns) in enumerate(self._world.faults.spans(EventBurst)):
-            low, high = max(begin_ns - period_ns, first_ns), min(end_ns, last_ns)
+            low, high = max(begin_ns - scans.period_ns, first_ns), min(end_ns, last_ns)
             mean = fault.million_per_s * 1e6 * _BIN_NS * 1e-9
             for number in range(low // _BIN_NS, high // _BIN_NS + 1 if high >= low else 0):
                 t_ns, x, y, p = self._bin(index, number, mean)
                 kept = (t_ns >= first_ns) & (t_ns < last_ns)
-                if period_ns:
-                    t_ns = phase_ns - (phase_ns - t_ns) // period_ns * period_ns
+                if scans.period_ns:
+                    t_ns = scans.begin(t_ns)
                 kept &= (t_ns > begin_ns) & (t_ns <= end_ns)
-                parts.append((t_ns[kept], x[kept], y[kept], p[kept]))
+                t_ns, x, y, p = t_ns[kept], x[kept], y[kept], p[kept]
+                parts.append((scans.stamp(t_ns, x), x, y, p))
         return _merge(parts)
 
     def _bin(self, index: int, number: int, mean: float) -> Events:

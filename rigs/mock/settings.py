@@ -160,9 +160,13 @@ class EventCamera(StrictModel):
     """Pixels that fire all the time; the rig's seed chooses them."""
     hot_hz: Annotated[float, Field(ge=0, le=1000)] = 10.0
     """Mean rate of each of them, always positive."""
-    readout_hz: Annotated[float, Field(ge=0, le=10_000)] = 1000.0
-    """Scans a second: an event has the time of the next scan, and in one scan a pixel sends one
-    event at most. At least 1000; 0: every event has its own time."""
+    readout_hz: Annotated[float, Field(ge=0, le=10_000)] = 5000.0
+    """Scans a second: an event is read in the next scan, and in one scan a pixel sends one event at
+    most. At least 1000; 0: every event has its own time."""
+    scan_us: Annotated[float, Field(ge=0, le=1000)] = 192.0
+    """Time in which a scan reads its columns from left to right; an event has the time at which its
+    column is read. At most the time from scan to scan, where that is less; 0: all events of a scan
+    have the time at which it begins."""
     block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
     """What the camera sends together: its latency."""
     path: Literal["cubic", "chord"] = "cubic"

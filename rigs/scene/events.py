@@ -21,7 +21,7 @@ from rigs.scene.edges import CUT, dark_pixels, darken, see_discs
 from rigs.scene.marker_path import markers_in_image
 from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
 from rigs.scene.randomness import generator
-from rigs.scene.readout import NEVER_NS
+from rigs.scene.readout import NEVER_NS, Scans
 from rigs.scene.trace import trace
 from rigs.scene.watch import REACH_PX
 
@@ -30,7 +30,7 @@ I64 = npt.NDArray[np.int64]
 U16 = npt.NDArray[np.uint16]
 U8 = npt.NDArray[np.uint8]
 Events = tuple[I64, U16, U16, U8]
-"""True time in ns of the event or of the scan that reads it, column, row, polarity; (n,) each."""
+"""True time in ns of the event or of its reading, column, row, polarity; (n,) each."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class EventOptics:
     leak_share: float = 0.5
     hot_pixels: int = 8
     hot_hz: float = 10.0
-    readout_hz: float = 1000.0
+    readout_hz: float = 5000.0
+    scan_us: float = 192.0
     block_ms: int = 32
     path: Literal["cubic", "chord"] = "cubic"
 
@@ -65,6 +66,11 @@ class EventOptics:
     def period_ns(self) -> int:
         """Time between two scans of the read-out; 0 where every event has its own time."""
         return round(1e9 / self.readout_hz) if self.readout_hz > 0 else 0
+
+    @property
+    def column_ns(self) -> float:
+        """Time from one column to the next in a scan; a scan is read before the next one begins."""
+        return min(self.scan_us * 1e3, self.period_ns) / self.width
 
 
 class MarkerSensor:
@@ -91,7 +97,7 @@ class MarkerSensor:
         # what the kernel is told in every call; floats also where a setting was written as whole
         self._fixed = (
             optics.block_ns, optics.path == "chord", float(optics.contrast), float(optics.edge_px),
-            round(optics.refractory_us * 1e3), optics.period_ns,
+            round(optics.refractory_us * 1e3), optics.period_ns, optics.column_ns,
         )  # fmt: skip
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
         self._state = self._dark.copy()
@@ -104,9 +110,10 @@ class MarkerSensor:
         self._bins: dict[int, Candidates] = {}
 
     @property
-    def scans(self) -> tuple[int, int]:
-        """Time between two scans of the read-out, 0 where it has none, and when one begins, ns."""
-        return self.optics.period_ns, self._phase_ns
+    def scans(self) -> Scans:
+        """When the read-out scans in this trial."""
+        optics = self.optics
+        return Scans(optics.period_ns, self._phase_ns, optics.column_ns, optics.width)
 
     def path(self, loads: F64) -> F64:
         """Markers in the image: column, row and radius in px, (n, 3, m).
@@ -148,8 +155,8 @@ class MarkerSensor:
 
         Between rows markers move on smooth curves, block by block of a global grid of true time,
         so that the result does not depend on how a trial is cut into calls. With a read-out that
-        scans, times are those of scans; of the last one what is not complete comes with the next
-        call.
+        scans, times are those at which columns are read; a scan that is not complete comes with
+        the next call.
 
         Args:
             loads: as in `path`; the first row is the last one of the call before.

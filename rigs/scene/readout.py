@@ -1,10 +1,12 @@
 """How an event camera hands its events over: the dead time of a pixel, and the scans of the array.
 
 The DVXplorer does not send an event when it happens: it scans its pixels, by default 5000 times a
-second where few of them fire. "If exact timing is important you can select a different setting, the
-constant ones do guarantee constant timing but only up to about 1000 eFPS" (iniVation's engineer
-L. Longinotti in the forum dv-users; the settings are `DVXeFPS` of dv-processing). Its stamps run on
-while a scan is read; here every event of a scan has the time at which the scan begins.
+second. A scan begins with a hold of the whole array; what happens later waits for the next scan.
+Then column after column is read, at 15 cycles of 50 MHz each: 192 us for 640 columns, and 7 us
+until the next hold (dv-processing, `setDVXplorerEFPS`, `EFPS_VARIABLE_5000`). All events of a
+column have one stamp, that of its reading (libcaer's `dvxplorer.c`: stamp, column, groups of eight
+rows). A column in which many groups fire takes longer, and with it the scan, up to 0.85 ms for all;
+that is left out here: at a million events a second a column has fewer than one event in a scan.
 
 A pixel has room for one event: it holds the first until it is read and reports nothing else in
 that scan. What it sees meanwhile is not lost from its reference level, as if it were read at once;
@@ -15,13 +17,44 @@ is never read.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from rigs.scene.sorting import sort_packed
 
 NEVER_NS = -(1 << 62)
 _TIME_BITS = 27
+_I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Scans:
+    """When a read-out scans its array and when it reads each column, true ns."""
+
+    period_ns: int
+    """From one scan to the next; 0: every event has its own time."""
+    phase_ns: int
+    """A scan begins at this time, and every `period_ns` before and after it."""
+    column_ns: float
+    """From one column to the next; 0: all of a scan at its begin."""
+    width: int
+    """Columns of the array."""
+
+    @property
+    def reading_ns(self) -> int:
+        """From the begin of a scan until its last column has been read."""
+        return int(self.width * self.column_ns)
+
+    def begin(self, t_ns: _I64) -> _I64:
+        """Begin of the scan that reads what happened at `t_ns`, int64, (n,)."""
+        return self.phase_ns - (self.phase_ns - t_ns) // self.period_ns * self.period_ns
+
+    def stamp(self, begin_ns: _I64, x: npt.NDArray[np.uint16]) -> _I64:
+        """Time at which columns `x` of the scans that begin at `begin_ns` are read, int64, (n,)."""
+        return begin_ns + (x * self.column_ns).astype(np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -73,10 +106,13 @@ def read_each(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def read_scans(  # type: ignore[no-untyped-def]
-    events, n, other, base_ns, end_ns, period_ns, phase_ns, refractory_ns, fired, t_ns, xs, ys, ps,
-    kept,
+    events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns, refractory_ns, fired, t_ns,
+    xs, ys, ps, kept,
 ):  # fmt: skip
-    """Hand over the scans that begin up to `end_ns`; see `read_each`.
+    """Hand over the scans that are read to their last column by `end_ns`; see `read_each`.
+
+    Args:
+        period_ns, phase_ns, column_ns: see `Scans`.
 
     Returns:
         how many events are handed over in all, and how many of later scans are left: these stand
@@ -88,7 +124,7 @@ def read_scans(  # type: ignore[no-untyped-def]
     first = (base_ns - phase_ns) // period_ns
     start_ns = phase_ns + first * period_ns
     lead_ns = base_ns - start_ns + period_ns - 1
-    past = (end_ns - phase_ns) // period_ns - first
+    past = (end_ns - np.int64(width * column_ns) - phase_ns) // period_ns - first
     left, inside, per_ns = 0, 0, 1.0 / period_ns
     for k in range(n):
         event = events[k]
@@ -116,11 +152,12 @@ def read_scans(  # type: ignore[no-untyped-def]
         t = base_ns + ((key & mask) >> 1)
         where = key >> low
         x, y = _column_of(where, y_bits, x_bits), _row_of(where, y_bits)
-        stamp = start_ns + (where >> (y_bits + x_bits)) * period_ns
+        begin = start_ns + (where >> (y_bits + x_bits)) * period_ns
         before = fired[y, x]
-        if t - before < refractory_ns or before > stamp - period_ns:
+        if t - before < refractory_ns or before > begin - period_ns:
             continue
         fired[y, x] = t
-        t_ns[kept], xs[kept], ys[kept], ps[kept] = stamp, x, y, key & 1
+        t_ns[kept], xs[kept] = begin + np.int64(x * column_ns), x
+        ys[kept], ps[kept] = y, key & 1
         kept += 1
     return kept, left

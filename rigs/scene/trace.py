@@ -64,8 +64,8 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
     loads, layout_mm, projection, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns,
-    phase_ns, lowest, threshold, state, fired, seen, origin, aim, place, pending, noise_t,
-    noise_place, noise_lot, leak_below,
+    column_ns, phase_ns, lowest, threshold, state, fired, seen, origin, aim, place, pending,
+    noise_t, noise_place, noise_lot, leak_below,
 ):  # fmt: skip
     """Signal and noise under `loads`, as the camera hands them over.
 
@@ -73,12 +73,13 @@ def trace(  # type: ignore[no-untyped-def]
         loads, layout_mm, projection: see `marker_path.markers_in_image`.
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
         chord: straight lines between rows in place of cubics.
-        period_ns, phase_ns: scans of the read-out begin at phase + k period; period 0: no scans.
+        period_ns, column_ns, phase_ns: see `readout.Scans`.
         lowest: the lowest threshold of all.
         threshold, fired: (height, width); state: (height, width, 4), written.
         seen: rectangles in which markers have been, see `edges.darken`; widened.
         origin, aim, place: the lists of `watch`, written.
-        pending: packed events of a scan that was not complete, ns after `row_ns[0]` - period.
+        pending: packed events of scans that were not complete, ns after `row_ns[0]`, less a period
+            and the time to read all columns.
         noise_t, noise_place, noise_lot: of `noise.candidates`, at least those of this time.
         leak_below: of `noise.NoiseRates`.
 
@@ -105,13 +106,14 @@ def trace(  # type: ignore[no-untyped-def]
     t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
     xs, ys = np.empty(room, np.uint16), np.empty(room, np.uint16)
     waiting, kept, begin = pending.shape[0], 0, 0
+    lead_ns = period_ns + np.int64(width * column_ns)
     noise_at = np.searchsorted(noise_t, row_ns[0])
     events[:waiting] = pending
     while begin < total - 1:
         blocks = find_blocks(row_ns, begin, block_ns, first)
         last = first[blocks]
         stop = begin + last
-        base_ns, end_ns = row_ns[begin] - period_ns, row_ns[stop]
+        base_ns, end_ns = row_ns[begin] - lead_ns, row_ns[stop]
         for k in range(last + 1):
             rows[k] = row_ns[begin + k] - row_ns[begin]
         n = waiting
@@ -178,7 +180,7 @@ def trace(  # type: ignore[no-untyped-def]
                     events, other = larger(events, capacity), np.empty(capacity, np.int64)
                 n = events_of_pixels(
                     pixels, count, pieces[piece:end], first, since, until, inverse, curve, steps,
-                    tree, threshold, contrast, edge, period_ns, stack, tile, fire, wait, state,
+                    tree, threshold, contrast, edge, lead_ns, stack, tile, fire, wait, state,
                     gaps, events, n,
                 )  # fmt: skip
                 piece = end
@@ -192,8 +194,8 @@ def trace(  # type: ignore[no-untyped-def]
             xs, ys = larger(xs, room), larger(ys, room)
         if period_ns > 0:
             kept, waiting = read_scans(
-                events, n, other, base_ns, end_ns, period_ns, phase_ns, refractory_ns, fired,
-                t_ns, xs, ys, ps, kept,
+                events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns, refractory_ns,
+                fired, t_ns, xs, ys, ps, kept,
             )  # fmt: skip
             for k in range(waiting):
                 events[k] -= (end_ns - row_ns[begin]) << 25

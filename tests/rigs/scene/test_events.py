@@ -189,8 +189,9 @@ def uneven_times(rng: np.random.Generator, first_ms: int, end_ms: int) -> np.nda
 
 @settings(max_examples=12, deadline=None)
 @given(
-    seed=st.integers(0, 100), first=st.integers(0, 70), readout=st.sampled_from([0, 1000, 3300]),
-    uneven=st.booleans(), path=st.sampled_from(["cubic", "chord"]), data=st.data(),
+    seed=st.integers(0, 100), first=st.integers(0, 70),
+    readout=st.sampled_from([0, 1000, 3300, 5000]), uneven=st.booleans(),
+    path=st.sampled_from(["cubic", "chord"]), data=st.data(),
 )  # fmt: skip
 def test_chunks_do_not_matter(
     seed: int, first: int, readout: float, uneven: bool, path: str, data: st.DataObject
