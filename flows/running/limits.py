@@ -20,6 +20,8 @@ _MEMORY = re.compile(
 _FILES = re.compile(r"Too many open files")
 _PROCESSES = re.compile(r"can't start new thread|Resource temporarily unavailable")
 _RAISE = "end other programs or raise the limit"
+_LEAST_BYTES = 150 << 20
+"""Address space below which numpy cannot be loaded: OpenBLAS then ends the process by itself."""
 _PR_SET_PDEATHSIG = 1
 _GO_ON = "then run the same command to go on; every committed trial is kept"
 
@@ -60,13 +62,15 @@ def run_in_child() -> str | None:
 
     Returns:
         None in the process that is to go on. The parent ends with its child's exit code, or gets
-        the reason here if the child crashed.
+        the reason here if the child crashed, or if memory is too little to start one.
     """
     if (
         resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
         or "numpy" in sys.modules
     ):
         return None
+    if resource.getrlimit(resource.RLIMIT_AS)[0] < _LEAST_BYTES:
+        return exhausted(MemoryError())
     passed = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, passed | {signal.SIGCHLD})
     parent = os.getpid()

@@ -37,6 +37,8 @@ main()
     [
         ("RLIMIT_AS", 40_000 << 10, "there is not enough memory (ulimit -v is 40000): "),
         ("RLIMIT_AS", 60_000 << 10, "there is not enough memory (ulimit -v is 60000): "),
+        # here OpenBLAS would end the process without an object
+        ("RLIMIT_AS", 120_000 << 10, "there is not enough memory (ulimit -v is 120000): "),
         ("RLIMIT_NOFILE", 3, "too many files are open (ulimit -n is 3): "),
     ],
 )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from multiprocessing import active_children
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -26,6 +29,8 @@ from tests.flows.conftest import tiny, write
 from tests.flows.serving.serving import until
 
 STEPS = ("sync", "label", "train", "evaluate", "report")
+FILES = {"sync": 6, "label": 6, "train": 5, "evaluate": 4, "report": 3}
+"""Fewer than how many files each has written when it is killed."""
 
 
 @pytest.fixture(scope="module")
@@ -36,35 +41,59 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     return folder / "store"
 
 
-def test_every_step_goes_on_after_it_was_killed(taken: Path) -> None:
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 6))]
+)
+def test_every_step_goes_on_after_it_was_killed(seed: int, taken: Path, tmp_path: Path) -> None:
+    """Each is killed with all its processes once it has written a random number of files."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     environment.pop("PREFECT_HOME", None)
-    runs = taken / "control" / "runs"
+    folder = shutil.copytree(taken, tmp_path / "store")
+    runs = folder / "control" / "runs"
+    random = Random(seed)
 
     def begun() -> set[str]:
         found = {path.name for path in runs.glob("*.json")} if runs.is_dir() else set()
         return {name for name in found if name.count(".") == 1}
 
+    def results() -> set[tuple[Path, int]]:
+        """Every version of a result: what is written anew counts, too."""
+        found = set()
+        for name in ("derived", "models", "report"):
+            for path in (folder / name).rglob("*"):
+                with suppress(FileNotFoundError):  # renamed meanwhile
+                    found.add((path, path.stat().st_mtime_ns))
+        return found
+
     for step in STEPS:
-        command = [sys.executable, "-m", "flows", step, str(taken), "--json"]
-        before = begun()
+        command = [sys.executable, "-m", "flows", step, str(folder), "--json"]
+        runs_before, results_before = begun(), results()
+        wanted = random.randrange(FILES[step])
         process = subprocess.Popen(
             command, cwd=ROOT, env=environment, start_new_session=True,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
+
+        def far_enough() -> bool:
+            if process.poll() is not None:  # noqa: B023
+                return True
+            return bool(begun() - runs_before) and len(results() - results_before) >= wanted  # noqa: B023
+
         try:
-            until(f"{step} begins", lambda: begun() - before or process.poll() is not None)  # noqa: B023
+            until(f"{step} has written {wanted} files", far_enough)
         finally:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait(60)
-        (killed,) = begun() - before
+        assert process.returncode == -signal.SIGKILL, f"{step} was over before {wanted} files"
+        (killed,) = begun() - runs_before
         done = subprocess.run(
             command, cwd=ROOT, env=environment, text=True, capture_output=True, timeout=240,
             check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         assert "Prefect server" not in done.stderr
-        assert json.loads(done.stdout)["done"] >= 1, done.stdout
+        made = json.loads(done.stdout)
+        assert made["done"] + made.get("fresh", 0) >= 1, made
         end = read_json(runs / killed.replace(".json", ".end.json"))
         assert (end["state"], end["by"]) == ("CRASHED", "next start")
 
