@@ -11,13 +11,13 @@ import os
 import sys
 from contextlib import suppress
 
-from flows.running.limits import exhausted, run_in_child
+from flows.running.limits import exhausted, run_in_child, too_few_threads
 
 
 def main() -> None:
     """Run the command line; ends the process with its exit code."""
-    if crash := run_in_child():
-        sys.exit(_fail(crash, 1))
+    if reason := too_few_threads() or run_in_child():
+        sys.exit(_fail(reason, 1))
     try:
         from flows.running import garbage
         from flows.running.standard_streams import OutputLost, guarded

@@ -12,6 +12,7 @@ import re
 import resource
 import signal
 import sys
+import threading
 
 _MEMORY = re.compile(
     r"annot allocate memory|failed to map segment|Unable to allocate|not enough memory|bad_alloc"
@@ -52,6 +53,27 @@ def _limit(kind: int, option: str, unit: int = 1) -> str:
     """Return the limit that this process has, as its shell calls it; empty without one."""
     found = resource.getrlimit(kind)[0]
     return "" if found == resource.RLIM_INFINITY else f" (ulimit {option} is {found // unit})"
+
+
+def too_few_threads() -> str | None:
+    """Say that threads cannot be started, where they cannot; libraries start some when loaded.
+
+    OpenBLAS sends the process SIGINT then, which would pass for Ctrl-C.
+    """
+    go = threading.Event()
+    begun = []
+    try:
+        for _ in range(os.cpu_count() or 1):
+            begun.append(thread := threading.Thread(target=go.wait))
+            thread.start()
+    except RuntimeError as error:
+        begun.pop()
+        return exhausted(error)
+    finally:
+        go.set()
+        for thread in begun:
+            thread.join()
+    return None
 
 
 def run_in_child() -> str | None:

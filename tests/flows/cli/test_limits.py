@@ -9,11 +9,12 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
-from flows.running.limits import exhausted
+from flows.running.limits import exhausted, too_few_threads
 from storage.errors import StoreError
 from storage.store import Store
 from storage.verify import verify
@@ -237,3 +238,24 @@ def test_a_child_ends_with_its_killed_parent() -> None:
             assert select.select([watched], [], [], 60)[0] == [watched]
         finally:
             os.close(watched)
+
+
+def test_threads_that_cannot_be_started_are_said_before_a_library_asks_for_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert too_few_threads() is None
+    start, begun = threading.Thread.start, []
+
+    def refuse_the_second(self: threading.Thread) -> None:
+        if begun:
+            raise RuntimeError("can't start new thread")
+        begun.append(self)
+        start(self)
+
+    monkeypatch.setattr(threading.Thread, "start", refuse_the_second)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    said = too_few_threads()
+    assert said is not None
+    assert said.startswith("no more processes or threads can be started")
+    (thread,) = begun
+    assert not thread.is_alive()
