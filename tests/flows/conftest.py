@@ -17,6 +17,7 @@ from tests.conftest import ROOT, SMALL
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
+from flows.collecting.collect import collect  # noqa: E402
 from flows.planning.orders import Order, make_order  # noqa: E402
 from flows.running.orchestration import prepare  # noqa: E402
 from flows.study import Outcome, study  # noqa: E402
@@ -43,6 +44,14 @@ def tiny() -> dict[str, Any]:
     }
     data["analysis"]["training"] = {"epochs": 2}
     return data
+
+
+def six_trials(folder: Path, rig: Path) -> Path:
+    """A store with the six slides, shortened, and nothing derived from them."""
+    data = tiny()
+    data["collection"]["motion"][3]["distance"] = "5 mm"
+    collect(make_order(write(folder / "tiny.yaml", data), rig, folder / "store"))
+    return folder / "store"
 
 
 def tiny_gravity() -> dict[str, Any]:

@@ -13,13 +13,9 @@ from flows.planning.orders import Order
 from flows.reporting.report import against, report_folder
 from flows.study import Outcome
 from storage.store import Store
-from tests.flows.reviewing.test_review_page import ARGUMENTS, CHROMIUM, PATIENCE_MS
+from tests.flows.browser import PATIENCE_MS, launched, needs_browser
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(
-    not (Path(CHROMIUM).exists() and shutil.which(CHROMIUM)),
-    reason=f"no browser at {CHROMIUM} (Debian's package chromium)",
-)
+pytestmark = needs_browser
 PAPER_PX = 703
 """A4 without its margins, at 96 pixels an inch."""
 
@@ -49,10 +45,8 @@ def folder(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+    with launched() as found:
         yield found
-        found.close()
 
 
 @pytest.mark.parametrize("name", ["index.html", "against.html"])

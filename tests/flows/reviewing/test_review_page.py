@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
@@ -22,21 +20,11 @@ import pytest
 
 from storage import review
 from tests.conftest import ROOT
+from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 from tests.flows.reviewable import DOUBTFUL, NAME, Reviewable, label
 
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 TRIALS = 864
-PATIENCE_MS = 10_000
-
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(
-    not (Path(CHROMIUM).exists() and shutil.which(CHROMIUM)),
-    reason=f"no browser at {CHROMIUM} (Debian's package chromium)",
-)
+pytestmark = needs_browser
 expect = sync_api.expect
 
 
@@ -62,11 +50,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     try:
         assert process.stdout is not None
         told = json.loads(process.stdout.readline())
-        with sync_api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
-            sync_api.expect.set_options(timeout=PATIENCE_MS)
+        with launched() as browser:
             yield Served(made, told, process, browser)
-            browser.close()
     finally:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)

@@ -18,11 +18,9 @@ from pathlib import Path
 import distributed
 import pytest
 
-from flows.collecting.collect import collect
 from flows.labelling.label import label
 from flows.learning.evaluate import evaluate
 from flows.learning.train import train
-from flows.planning.orders import make_order
 from flows.running import cluster as clusters
 from flows.running import stopping, trial_work
 from flows.running.campaigns import collected
@@ -34,7 +32,7 @@ from storage.push import push
 from storage.remote import Remote
 from storage.store import Store
 from tests.conftest import ROOT
-from tests.flows.conftest import tiny, write
+from tests.flows.conftest import six_trials
 from tests.flows.listening import listening
 from tests.storage.remotes import tree
 
@@ -45,11 +43,7 @@ STEPS = (label, train, evaluate)
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     """A store with six trials, and nothing derived from them."""
-    folder = tmp_path_factory.mktemp("dask")
-    data = tiny()
-    data["collection"]["motion"][3]["distance"] = "5 mm"
-    collect(make_order(write(folder / "tiny.yaml", data), rig_path, folder / "store"))
-    return folder / "store"
+    return six_trials(tmp_path_factory.mktemp("dask"), rig_path)
 
 
 @pytest.fixture(scope="module")

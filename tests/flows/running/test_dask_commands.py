@@ -16,10 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.collecting.collect import collect
-from flows.planning.orders import make_order
 from tests.conftest import ROOT
-from tests.flows.conftest import tiny, write
+from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until
 from tests.storage.remotes import tree
 
@@ -76,11 +74,7 @@ def running(words: list[str], log: Path, environment: dict[str, str]) -> Iterato
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     """A store with six trials, and nothing derived from them."""
-    folder = tmp_path_factory.mktemp("dask")
-    data = tiny()
-    data["collection"]["motion"][3]["distance"] = "5 mm"
-    collect(make_order(write(folder / "tiny.yaml", data), rig_path, folder / "store"))
-    return folder / "store"
+    return six_trials(tmp_path_factory.mktemp("dask"), rig_path)
 
 
 @pytest.mark.parametrize(

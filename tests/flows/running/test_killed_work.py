@@ -16,16 +16,14 @@ from random import Random
 
 import pytest
 
-from flows.collecting.collect import collect
 from flows.labelling.label import label
-from flows.planning.orders import make_order
 from flows.running import trial_work
 from flows.running.campaigns import collected
 from flows.running.spread import WorkerKilled
 from storage.files import read_json
 from storage.store import Store
 from tests.conftest import ROOT
-from tests.flows.conftest import tiny, write
+from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until
 
 STEPS = ("sync", "label", "train", "evaluate", "report")
@@ -36,9 +34,7 @@ FILES = {"sync": 6, "label": 6, "train": 5, "evaluate": 4, "report": 3}
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     """A store with six trials, and nothing derived from them."""
-    folder = tmp_path_factory.mktemp("killed")
-    collect(make_order(write(folder / "tiny.yaml", tiny()), rig_path, folder / "store"))
-    return folder / "store"
+    return six_trials(tmp_path_factory.mktemp("killed"), rig_path)
 
 
 @pytest.mark.parametrize(

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.conftest import ROOT
+from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 from tests.flows.serving.serving import Page, serving
 
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
-PATIENCE_MS = 30_000
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(
-    not (Path(CHROMIUM).exists() and shutil.which(CHROMIUM)),
-    reason=f"no browser at {CHROMIUM} (Debian's package chromium)",
-)
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +25,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium, which finds nobody outside this computer."""
-    with sync_api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+    with launched() as found:
         yield found
-        found.close()
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
 def test_a_person_logs_in_and_runs_something(page: Page, browser: Any, host: str) -> None:
     expect = sync_api.expect
-    expect.set_options(timeout=PATIENCE_MS)
     with browser.new_context() as context:
         tab = context.new_page()
         tab.set_default_timeout(PATIENCE_MS)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from typing import Any
 
 import pytest
+from abb_robot_client._egm_protobuf import egm_pb2
 
 from rigs.arms.abb import AbbArm
+from rigs.arms.pose import distance_mm, quaternion
 from rigs.arms.settings import AbbSettings, UrSettings
 from rigs.arms.ur import UrArm
-from rigs.capabilities import Arm, ArmFault
+from rigs.capabilities import Arm, ArmFault, Pose
 from rigs.wire.abb_rws import AbbStandIn
 from rigs.wire.ur import UrStandIn
-from tests.rigs.loopback import own_address
+from tests.rigs.loopback import own_address, until
 
 MakeRobot = Callable[..., UrStandIn]
 MakeArm = Callable[..., UrArm]
@@ -52,6 +57,33 @@ def arm_on() -> Iterator[MakeArm]:
             return arm
 
         yield make
+
+
+def egm_message(number: int, t_s: float | None, pose: Pose) -> egm_pb2.EgmRobot:
+    """A datagram of a controller that stands at `pose`; without a time if that is None."""
+    message = egm_pb2.EgmRobot()
+    message.header.seqno = number
+    part = message.feedBack
+    part.cartesian.pos.x, part.cartesian.pos.y, part.cartesian.pos.z = pose.xyz_mm
+    orient = part.cartesian.orient
+    orient.u0, orient.u1, orient.u2, orient.u3 = quaternion(pose)
+    if t_s is not None:
+        part.time.sec, part.time.usec = divmod(round(t_s * 1e6), 1_000_000)
+    return message
+
+
+def mm_after_kill(program: str, settings: str, robot: Any, limit_s: float) -> float:
+    """How far a stand-in's arm goes at 40 mm/s once the program that moves it is killed (mm)."""
+    with subprocess.Popen([sys.executable, "-c", program, settings]) as process:
+        try:
+            until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)
+        finally:
+            process.send_signal(signal.SIGKILL)
+    killed = robot.pose()
+    until(lambda: not robot.moving(), limit_s)
+    gone_mm = distance_mm(killed, robot.pose())
+    print(f"simulated: {gone_mm:.1f} mm at 40 mm/s after the program was killed")
+    return gone_mm
 
 
 def abb_settings(host: str, **more: Any) -> AbbSettings:

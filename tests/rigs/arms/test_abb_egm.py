@@ -10,8 +10,8 @@ import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from rigs.arms.abb_egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
-from rigs.arms.pose import quaternion
 from rigs.capabilities import Pose
+from tests.rigs.arms.conftest import egm_message
 from tests.rigs.loopback import own_address
 
 ROBOT = own_address()
@@ -20,15 +20,7 @@ Take = Callable[..., EgmPose | None]
 
 
 def packet(number: int, t_s: float | None, pose: Pose = HERE) -> egm_pb2.EgmRobot:
-    message = egm_pb2.EgmRobot()
-    message.header.seqno = number
-    part = message.feedBack
-    part.cartesian.pos.x, part.cartesian.pos.y, part.cartesian.pos.z = pose.xyz_mm
-    orient = part.cartesian.orient
-    orient.u0, orient.u1, orient.u2, orient.u3 = quaternion(pose)
-    if t_s is not None:
-        part.time.sec, part.time.usec = divmod(round(t_s * 1e6), 1_000_000)
-    return message
+    return egm_message(number, t_s, pose)
 
 
 @pytest.fixture

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 
@@ -16,11 +13,11 @@ from abb_robot_client._egm_protobuf import egm_pb2
 from rigs.arms import abb as driver
 from rigs.arms.abb import AbbArm
 from rigs.arms.abb_rws import REQUEST_S, WebRefused, WebServices
-from rigs.arms.pose import distance_mm, quaternion
+from rigs.arms.pose import distance_mm
 from rigs.capabilities import ArmFault, ArmState, Pose, Segment
 from rigs.wire.abb_rws import HOME, AbbStandIn
 from rigs.wire.faults import PACKETS_LOST, Kind
-from tests.rigs.arms.conftest import EGM_PORT, MakeAbb, abb_settings
+from tests.rigs.arms.conftest import EGM_PORT, MakeAbb, abb_settings, egm_message, mm_after_kill
 from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -50,14 +47,7 @@ def fails(action: Callable[[], object], within_s: float, match: str) -> None:
 
 
 def packet(pose: Pose, number: int, t_s: float) -> bytes:
-    message = egm_pb2.EgmRobot()
-    message.header.seqno = number
-    part = message.feedBack
-    part.cartesian.pos.x, part.cartesian.pos.y, part.cartesian.pos.z = pose.xyz_mm
-    orient = part.cartesian.orient
-    orient.u0, orient.u1, orient.u2, orient.u3 = quaternion(pose)
-    part.time.sec, part.time.usec = divmod(round(t_s * 1e6), 1_000_000)
-    data: bytes = message.SerializeToString()
+    data: bytes = egm_message(number, t_s, pose).SerializeToString()
     return data
 
 
@@ -151,16 +141,8 @@ threading.Event().wait()
 def test_the_controller_stops_the_arm_when_the_program_is_killed(abb_pair: MakeAbb) -> None:
     _, robot = abb_pair(connected=False)
     settings = abb_settings(robot.host).model_dump_json()
-    with subprocess.Popen([sys.executable, "-c", KILLED, settings]) as process:
-        try:
-            until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)
-        finally:
-            process.send_signal(signal.SIGKILL)
-    killed = robot.pose()
-    until(lambda: robot.watchdog_stops == 1, 1.0 + BUSY_S)
-    until(lambda: not robot.moving(), 1.0)
-    gone_mm = distance_mm(killed, robot.pose())
-    print(f"simulated: {gone_mm:.1f} mm at 40 mm/s after the program was killed")
+    gone_mm = mm_after_kill(KILLED, settings, robot, 2.0 + BUSY_S)
+    assert robot.watchdog_stops == 1
     assert 40.0 * 0.5 < gone_mm < 40.0 * 1.3
 
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import signal
 import socket
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -26,7 +23,7 @@ from rigs.arms.settings import AbbSocketSettings
 from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
 from rigs.wire.abb_socket import HOME, RapidStandIn
 from rigs.wire.faults import Fault, Kind, Stage
-from tests.rigs.arms.conftest import closed
+from tests.rigs.arms.conftest import closed, mm_after_kill
 from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -217,15 +214,7 @@ def test_a_path_thread_that_fails_says_so(pair: MakePair, monkeypatch: pytest.Mo
 def test_an_arm_stands_a_piece_after_the_program_was_killed(pair: MakePair) -> None:
     _, robot = pair(connected=False)
     given = settings(robot.host).model_dump_json()
-    with subprocess.Popen([sys.executable, "-c", KILLED, given]) as process:
-        try:
-            until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)
-        finally:
-            process.send_signal(signal.SIGKILL)
-    killed = robot.pose()
-    until(lambda: not robot.moving(), BUSY_S)
-    gone_mm = distance_mm(killed, robot.pose())
-    print(f"simulated: {gone_mm:.1f} mm at 40 mm/s after the program was killed")
+    gone_mm = mm_after_kill(KILLED, given, robot, BUSY_S)
     assert gone_mm < 40.0 * 0.25 + 1.0
 
 
