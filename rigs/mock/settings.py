@@ -150,9 +150,20 @@ class EventCamera(StrictModel):
     threshold: Positive = 0.2
     threshold_sigma: NonNegative = 0.03
     """Spread between pixels, cut at three of them."""
+    threshold_off: Positive | None = None
+    """Mean threshold of negative events; null: as `threshold`. With this or the next one, negative
+    thresholds are drawn apart from positive ones; without, a pixel has one for both."""
+    threshold_off_sigma: NonNegative | None = None
+    """Their spread; null: as `threshold_sigma`."""
+    cutoff_hz: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Bandwidth (3 dB) of a pixel at full brightness, elsewhere less in proportion to intensity;
+    0: no limit."""
     refractory_us: NonNegative = 500.0
     noise_hz: Annotated[float, Field(ge=0, le=100)] = 0.01
     """Noise events a second of a dark pixel."""
+    leak: Literal["events", "reference"] = "events"
+    """What leakage does: positive events at random times, or a memorised level that falls steadily,
+    so that positive events come sooner and negative ones later, as in v2e."""
     leak_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of that noise that is leakage (always positive, however bright); the rest is shot noise
     of both polarities, of which the brightest pixels have a quarter."""

@@ -17,6 +17,14 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from rigs.scene.circuit import (
+    RATE_DECADES,
+    Circuit,
+    new_circuit,
+    no_circuit,
+    see_image,
+    start_cells,
+)
 from rigs.scene.edges import CUT, dark_pixels, darken, see_discs
 from rigs.scene.marker_path import markers_in_image
 from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
@@ -47,6 +55,10 @@ class EventOptics:
     contrast: float = 2.08
     threshold: float = 0.2
     threshold_sigma: float = 0.03
+    threshold_off: float | None = None
+    threshold_off_sigma: float | None = None
+    cutoff_hz: float = 0.0
+    leak: Literal["events", "reference"] = "events"
     refractory_us: float = 500.0
     noise_hz: float = 0.01
     leak_share: float = 0.5
@@ -68,6 +80,12 @@ class EventOptics:
         return round(1e9 / self.readout_hz) if self.readout_hz > 0 else 0
 
     @property
+    def has_circuit(self) -> bool:
+        """Whether pixels have more than one threshold and a memory."""
+        off = self.threshold_off is not None or self.threshold_off_sigma is not None
+        return off or self.cutoff_hz > 0 or self.leak == "reference"
+
+    @property
     def column_ns(self) -> float:
         """Time from one column to the next in a scan; a scan is read before the next one begins."""
         return min(self.scan_us * 1e3, self.period_ns) / self.width
@@ -80,14 +98,20 @@ class MarkerSensor:
         self.optics = optics
         self._layout_mm = np.ascontiguousarray(layout_mm, np.float64)
         shape = (optics.height, optics.width)
-        spread = np.clip(generator(seed, "thresholds").standard_normal(shape), -3.0, 3.0)
-        threshold = optics.threshold + optics.threshold_sigma * spread
-        self.threshold: F64 = np.maximum(threshold, 0.1 * optics.threshold)
+        self.threshold: F64 = _between_pixels(
+            seed, "thresholds", shape, optics.threshold, optics.threshold_sigma
+        )
         self._lowest = float(self.threshold.min())
+        # a reference that leaks makes its positive events itself
+        rate_hz, leaks = optics.noise_hz, optics.leak_share
+        if optics.leak == "reference":
+            rate_hz, leaks = rate_hz * (1.0 - leaks), 0.0
         self._noise = NoiseRates(
-            optics.width, optics.height, optics.noise_hz, optics.leak_share, optics.hot_hz,
+            optics.width, optics.height, rate_hz, leaks, optics.hot_hz,
             hot_places(optics.width, optics.height, optics.hot_pixels, seed),
         )  # fmt: skip
+        self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
+        self._started = True
         self._leak_below = self._noise.leak_below
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
         self._projection = (
@@ -108,6 +132,20 @@ class MarkerSensor:
         self._phase_ns = 0
         self._trial = 0
         self._bins: dict[int, Candidates] = {}
+
+    def _new_circuit(self, seed: int) -> Circuit:
+        """Pixels with OFF thresholds and leak rates of their own."""
+        optics, shape, off = self.optics, self.threshold.shape, self.threshold
+        mean, sigma = optics.threshold_off, optics.threshold_off_sigma
+        if mean is not None or sigma is not None:
+            mean = optics.threshold if mean is None else mean
+            sigma = optics.threshold_sigma if sigma is None else sigma
+            off = _between_pixels(seed, "OFF thresholds", shape, mean, sigma)
+        leak_hz = np.zeros(shape)
+        if optics.leak == "reference":
+            decades = RATE_DECADES * generator(seed, "leak rates").standard_normal(shape)
+            leak_hz = optics.noise_hz * optics.leak_share * 10.0**decades
+        return new_circuit(self.threshold, off, leak_hz, optics.cutoff_hz)
 
     @property
     def scans(self) -> Scans:
@@ -139,6 +177,11 @@ class MarkerSensor:
         see_discs(
             discs, optics.contrast, optics.edge_px, self.threshold, self._state, self._seen
         )  # fmt: skip
+        if optics.has_circuit:
+            # a camera that has been running for long: its pixels are somewhere between two leaks
+            phase = generator(seed, "leak phases").random(self.threshold.shape)
+            see_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
+            self._started = False
         self._fired_ns[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
@@ -163,11 +206,14 @@ class MarkerSensor:
             t_ns: true time of each row, int64, (m,), strictly rising; every multiple of the
                 optics' `block_ns` between the first and the last one is among them.
         """
+        if not self._started:
+            start_cells(self._circuit, int(t_ns[0]))
+            self._started = True
         when, x, y, p, self._pending = trace(
             np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, *self._fixed,
             self._phase_ns, self._lowest, self.threshold, self._state, self._fired_ns, self._seen,
             *self._lists, self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])),
-            self._leak_below,
+            self._leak_below, self._circuit,
         )  # fmt: skip
         return when, x, y, p
 
@@ -187,6 +233,13 @@ class MarkerSensor:
             np.concatenate(column) for column in zip(*self._bins.values(), strict=True)
         )
         return t_ns, place, lot
+
+
+def _between_pixels(seed: int, name: str, shape: tuple[int, int], mean: float, sigma: float) -> F64:
+    """Thresholds that vary between pixels, cut at three sigma and at a tenth of the mean."""
+    spread = np.clip(generator(seed, name).standard_normal(shape), -3.0, 3.0)
+    result: F64 = np.maximum(mean + sigma * spread, 0.1 * mean)
+    return result
 
 
 def _empty_lists(markers: int, slots: int) -> tuple[npt.NDArray[np.generic], ...]:

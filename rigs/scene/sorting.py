@@ -15,6 +15,14 @@ _SHORT = 24
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def larger(array, capacity):  # type: ignore[no-untyped-def]
+    """`array` with room for `capacity` elements."""
+    grown = np.empty(capacity, array.dtype)
+    grown[: array.shape[0]] = array
+    return grown
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def sort_packed(keys, n, other, low, high):  # type: ignore[no-untyped-def]
     """Sort the first `n` of `keys` (int64, not negative) in place.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rigs.scene.circuit import events_of_circuit
 from rigs.scene.edges import CUT, widen
 from rigs.scene.marker_path import (
     excursion,
@@ -25,18 +26,11 @@ from rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
 from rigs.scene.pixels import events_of_pixels
 from rigs.scene.readout import read_each, read_scans
 from rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
+from rigs.scene.sorting import larger
 from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
 
 SPAN_NS = 96_000_000
 """As long a time is looked at in one go; a packed event has room for 134 ms."""
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def larger(array, capacity):  # type: ignore[no-untyped-def]
-    """`array` with room for `capacity` elements."""
-    grown = np.empty(capacity, array.dtype)
-    grown[: array.shape[0]] = array
-    return grown
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -65,7 +59,7 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 def trace(  # type: ignore[no-untyped-def]
     loads, layout_mm, projection, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns,
     column_ns, phase_ns, lowest, threshold, state, fired, seen, origin, aim, place, pending,
-    noise_t, noise_place, noise_lot, leak_below,
+    noise_t, noise_place, noise_lot, leak_below, circuit,
 ):  # fmt: skip
     """Signal and noise under `loads`, as the camera hands them over.
 
@@ -82,6 +76,7 @@ def trace(  # type: ignore[no-untyped-def]
             and the time to read all columns.
         noise_t, noise_place, noise_lot: of `noise.candidates`, at least those of this time.
         leak_below: of `noise.NoiseRates`.
+        circuit: pixels of `circuit`, which do all signal events where there are any.
 
     Returns:
         time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
@@ -131,7 +126,15 @@ def trace(  # type: ignore[no-untyped-def]
             for k in range(a, b):
                 since[k], until[k] = rows[k] - rows[a], rows[k + 1] - rows[a]
         inner_weights(first, blocks, weights, inner)
-        for i in range(path.shape[0]):
+        if circuit.awake.shape[0] > 0:
+            events, n = events_of_circuit(
+                circuit, path, begin, row_ns, first, blocks, rows, since, until, chord, inverse,
+                weights, inner, curve, spread, contrast, edge, seen, base_ns, pixels, events, n,
+            )  # fmt: skip
+            if capacity < events.shape[0]:
+                capacity = events.shape[0]
+                other = np.empty(capacity, np.int64)
+        for i in range(path.shape[0] if circuit.awake.shape[0] == 0 else 0):
             if stands_still(path, i, begin, stop):
                 continue
             fit_blocks(path, i, begin, first, blocks, chord, inverse, weights, inner, curve)
