@@ -108,8 +108,10 @@ def _training_s(orders: list[Order]) -> float:
     found = [order for order in orders if order.plan.protocol.collection.experiment == "kinematic"]
     if not found:
         return 0.0
-    training = found[0].plan.protocol.analysis.training
-    return training_windows(found) * training.epochs * len(training.seeds) / SAMPLES_PER_S
+    settings = found[0].plan.protocol.analysis
+    training = settings.training
+    networks = len(training.seeds) + (settings.beside() is not None)
+    return training_windows(found) * training.epochs * networks / SAMPLES_PER_S
 
 
 def _tell(tell: Callable[[str, bool], None], done: int, of: str) -> None:

@@ -16,6 +16,8 @@ from protocols.yaml_file import KeyedError, StrictModel
 
 Scale = Annotated[float, Field(ge=0, le=1e6)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+MARGIN = 2.0
+"""Spikes by which a class must lead for each of its output neurons: the paper's rule."""
 Spikes = Annotated[float, Field(ge=0, le=1e6)]
 
 
@@ -119,7 +121,7 @@ class Network(StrictModel):
     @property
     def margin(self) -> float:
         """The paper's lead of a winner, in spikes of a class: two for each of its neurons."""
-        return 2.0 * self.outputs_per_class
+        return MARGIN * self.outputs_per_class
 
 
 _DEVICE = r"^(cpu|cuda(:\d+)?)$"
@@ -317,16 +319,19 @@ class AnalysisSettings(StrictModel):
         data["detection"]["compare"] = None
         return AnalysisSettings.model_validate({**data, "preset": self.also, "also": None})
 
-    def rule_for(self, model: AnalysisSettings) -> Detection:
-        """The rule of detection here, in the spikes that another protocol's network gives.
+    def rule_for(self, outputs_per_class: float, margin: float) -> Detection:
+        """The rule of detection here, in the spikes that another network gives.
 
         Gravity trials are judged by the network of the kinematic campaign. A margin that is said
-        here is a lead by so many spikes of as many neurons as stand here; one that is not said is
-        the network's own.
+        here is a lead by so many spikes of as many neurons as stand here.
+
+        Args:
+            outputs_per_class: of the network; it may have fewer of one class than of another.
+            margin: the lead in its spikes where none is said here.
         """
-        factor = model.network.outputs_per_class / self.network.outputs_per_class
+        factor = outputs_per_class / self.network.outputs_per_class
         said = "margin" in self.detection.model_fields_set
-        margin = self.detection.margin * factor if said else model.detection.margin
+        margin = self.detection.margin * factor if said else margin
         grid = tuple(each * factor for each in self.detection.margin_grid)
         return self.detection.model_copy(update={"margin": margin, "margin_grid": grid})
 

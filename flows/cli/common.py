@@ -36,6 +36,7 @@ STEPS = {
     "label": "flows.labelling.label",
     "train": "flows.learning.train",
     "evaluate": "flows.learning.evaluate",
+    "judge_model": "flows.learning.other_networks",
     "window_baselines": "flows.learning.window_baselines",
     "window_checks": "flows.learning.window_checks",
     "report": "flows.reporting.report",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +19,15 @@ from flows.cli.common import (
     step,
 )
 from flows.running import console
+from protocols.errors import InputError
+
+
+class Engine(StrEnum):
+    """What counts the spikes of a model file."""
+
+    fast = "fast"
+    sinabs = "sinabs"
+
 
 ReviewedOption = Annotated[
     bool, typer.Option("--reviewed", help="Use what people decided in `sliplab review`.")
@@ -84,18 +94,75 @@ def evaluate(
     checks: Annotated[
         bool, typer.Option("--checks", help="Fail if permuted or shuffled labels show a fault.")
     ] = False,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            help="Score this in place of the store's: a model file, or a Sinabs state_dict with "
+            "its description.",
+        ),
+    ] = None,
+    engine: Annotated[
+        Engine | None,
+        typer.Option(
+            "--engine", help="Of --model: fast by default where it counts as Sinabs does."
+        ),
+    ] = None,
     dask: DaskOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score the network on trials it has never seen."""
-    options = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    options: dict[str, Any] = {"margin": margin, "smoothing": smoothing, "reviewed": reviewed}
+    if model is None and engine is not None:
+        raise InputError("--engine", "", engine.value, "belongs to --model")
     folder = located(store)
+    if model is not None:
+        for name, wanted in (("--baselines", baselines), ("--checks", checks)):
+            if wanted:
+                raise InputError(name, "", None, "is for the store's own network")
+        options |= {"model": model, "engine": None if engine is None else engine.value}
+        result = run_step(folder, campaign, "judge_model", dask, **options)
+        if as_json:
+            console.print_json(result)
+        else:
+            simulated = " (simulated)" if result["simulated"] else ""
+            console.print_pairs(f"{result['model']} on {store}{simulated}", _judged(result))
+        return
     result = run_step(folder, campaign, "evaluate", dask, **options)
     more = {"window_baselines": baselines, "window_checks": checks}
     for name, wanted in more.items():
         if wanted:
             result[name] = run_step(folder, campaign, name, reviewed=reviewed)
     finish(result, f"evaluate {store}", as_json)
+
+
+def _judged(result: dict[str, Any]) -> dict[str, Any]:
+    """A judged model in a few lines."""
+    accuracy, interval = result["accuracy"], result["interval"]
+    sure = (
+        ""
+        if interval["low"] is None
+        else (
+            f" ({interval['low']:.1%} to {interval['high']:.1%} over {interval['trials']} trials)"
+        )
+    )
+    shown = {"windows": accuracy["n"], "engine": result["engine"]}
+    if not result["same_as_sinabs"]:
+        shown["engine"] += "; a few counts may differ from Sinabs'"
+    if accuracy["n"]:
+        shown |= {
+            "strict accuracy": f"{accuracy['strict']:.1%}{sure}",
+            "argmax accuracy": f"{accuracy['argmax']:.1%}",
+            "margin accuracy": f"{accuracy['margin']:.1%}",
+        }
+    for name, found in result["latency_ms"].items():
+        if found["median"] is not None:
+            missed = f"{found['missed']} missed, {found['false_early']} early"
+            shown[f"{name} latency"] = f"median {found['median']:.0f} ms of {found['n']}; {missed}"
+    for name, found in result["lead_ms"].items():
+        if found["median"] is not None:
+            shown[f"{name} lead"] = f"median {found['median']:.0f} ms of {found['n']}"
+    return shown
 
 
 def report(

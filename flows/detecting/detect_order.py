@@ -76,7 +76,6 @@ def make_detect_order(
     if stride_ms is not None and not 0 < stride_ms <= fitted.windows.length_ms:
         right = f"must be over 0 and at most the window's {fitted.windows.length_ms} ms"
         raise InputError("--stride", "", f"{stride_ms:g} ms", right)
-    own = AnalysisSettings(network=fitted.network)
     common: dict[str, Any] = {
         "model": model, "model_sha256": sha256(model), "fitted": fitted,
         "stride_ms": stride_ms, "poll_s": poll_s,
@@ -89,7 +88,12 @@ def make_detect_order(
         if seconds is None and file.in_virtual_time:
             right = f"is needed on {file.name}: its time is virtual and would never end"
             raise InputError("--seconds", "", None, right)
-        return DetectOrder(file, detection=_detection(own, own, change), seconds=seconds, **common)
+        return DetectOrder(
+            file,
+            detection=_detection(AnalysisSettings(network=fitted.network), fitted, change),
+            seconds=seconds,
+            **common,
+        )
     if seconds is not None:
         right = "belongs to listening; a trial lasts as long as its motion"
         raise InputError("--seconds", "", seconds, right)
@@ -100,7 +104,7 @@ def make_detect_order(
     chosen = choose_trial(plan, trial)
     return DetectOrder(
         with_level(file, plan) if file.simulated else file,
-        detection=_detection(plan.protocol.analysis, own, change),
+        detection=_detection(plan.protocol.analysis, fitted, change),
         plan=plan,
         trial=chosen,
         reflex=None if reflex is None else make_reflex(reflex, file, plan, chosen, hold_s),
@@ -184,7 +188,7 @@ def _shallowest_mm(program: Program) -> float:
     return min(step.to.depth_mm for step in moves)
 
 
-def _detection(
-    said: AnalysisSettings, model: AnalysisSettings, change: dict[str, Any]
-) -> Detection:
-    return Detection.model_validate({**said.rule_for(model).model_dump(), **change})
+def _detection(said: AnalysisSettings, fitted: Fitted, change: dict[str, Any]) -> Detection:
+    network = fitted.network
+    rule = said.rule_for(network.outputs_per_class, network.margin)
+    return Detection.model_validate({**rule.model_dump(), **change})

@@ -17,8 +17,9 @@ from flows.learning import counting, window_scores
 from flows.learning.counting import COUNTS, count_spikes
 from flows.learning.detector_trials import hear_trials, heard_step
 from flows.learning.detector_work import DetectorWork, detector_work
+from flows.learning.other_networks import judge_beside
 from flows.learning.samples import load_samples
-from flows.learning.train import Model, training_settings, wanted_models
+from flows.learning.train import Model, rules_of, training_settings, wanted_models
 from flows.learning.trial_scores import score_row, summaries
 from flows.learning.window_scores import key_inputs, score_windows
 from flows.running.campaigns import Collected, training_campaigns
@@ -98,11 +99,10 @@ def make_job(
     change = {name: value for name, value in change.items() if value is not None}
     if change:
         change["choose"] = "protocol"
+    rules = rules_of(campaigns, settings.network.outputs_per_class)
     detection, trials, inputs = {}, [], [key_inputs(models, campaigns)]
     for item in campaigns:
-        detection[item.name] = Detection.model_validate(
-            {**item.settings.rule_for(settings).model_dump(), **change}
-        )
+        detection[item.name] = Detection.model_validate({**rules[item.name].model_dump(), **change})
         for trial, recording in item.trials:
             if trial.split != "test":
                 continue
@@ -213,12 +213,13 @@ def evaluate(
     cluster: Cluster | None = None,
     reviewed: bool = False,
 ) -> dict[str, Any]:
-    """Evaluate if any input or setting changed."""
+    """Evaluate if any input or setting changed; also the network that `analysis.also` names."""
     training_campaigns(campaigns)
     job = make_job(store, campaigns, margin, smoothing, cluster, reviewed)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
         run(evaluate_flow, Parcel(job), cluster)
+    stale |= judge_beside(store, campaigns, cluster, reviewed)
     return {
         "step": "evaluate",
         "done": int(stale),

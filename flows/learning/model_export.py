@@ -28,7 +28,7 @@ from analysis.nets.training import Fitted
 from flows.labelling.reviewed import Labels
 from flows.learning.model_latency import latencies
 from flows.learning.samples import load_samples
-from flows.learning.train import training_settings, wanted_models
+from flows.learning.train import models_beside, rules_of, training_settings, wanted_models
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
 from protocols.errors import InputError
@@ -61,6 +61,12 @@ class _Source:
     def simulated(self) -> bool:
         """Whether anything of the data is."""
         return any(bool(item.info["simulated"]) for item in self.campaigns)
+
+    @property
+    def margin(self) -> float:
+        """The lead by which windows are judged, in spikes of this network."""
+        rules = rules_of(self.campaigns, self.fitted.network.outputs_per_class)
+        return rules[training_campaigns(self.campaigns)[0].name].margin
 
     @property
     def about(self) -> dict[str, str]:
@@ -151,7 +157,11 @@ def _weights_file(whole: Quantised) -> bytes:
 
 def _made_from_these(source: _Source) -> bool:
     """Whether the model is what `train` would make of this store now. Raises StoreError."""
-    wanted = {model.key for model in wanted_models(source.store, source.campaigns)}
+    wanted = {
+        model.key
+        for make in (wanted_models, models_beside)
+        for model in make(source.store, source.campaigns)
+    }
     try:
         return read_json(source.path.with_suffix(".json"))["key"] in wanted
     except (OSError, ValueError, KeyError):
@@ -200,7 +210,7 @@ def _speck(
     """The description of the network on the chip."""
     fitted = source.fitted
     net = training.restore(fitted)
-    margin = training_settings(source.campaigns).detection.margin
+    margin = source.margin
     ran = chip_run(quantised_net(fitted, whole), seen.x)
     counts = training.engine(fitted).counts(seen.windows)
     rounding = whole.rounding(net)
@@ -270,7 +280,7 @@ def _card(
         "campaigns": campaigns,
     }
     versions = {name: version(name) for name in PACKAGES}
-    margin = training_settings(source.campaigns).detection.margin
+    margin = source.margin
     return model_card(
         source.fitted, source.about, data, splits, activity(net, seen.x), detection, versions,
         margin,

@@ -11,7 +11,7 @@ from analysis.nets import dataset, training
 from analysis.nets.quantised import Quantised, chip_run, quantised_net
 from analysis.nets.training import Fitted
 from flows.labelling.reviewed import Labels
-from flows.learning.train import training_settings
+from flows.learning.train import rules_of
 from flows.running.campaigns import Collected
 
 Latency = dict[str, Any]
@@ -30,11 +30,11 @@ def latencies(
     Args:
         on_trial: called before each of them; some thousand windows take a second.
     """
-    model = training_settings(campaigns)
+    rules = rules_of(campaigns, fitted.network.outputs_per_class)
     fast, chip = training.engine(fitted), quantised_net(fitted, whole)
     found: tuple[dict[str, list[Any]], ...] = ({}, {})
     for item in campaigns:
-        rule = item.settings.rule_for(model)
+        rule = rules[item.name]
         for _, recording in item.of_split("test"):
             on_trial()
             label = labels.read(item, recording)

@@ -20,7 +20,7 @@ from flows.running.campaigns import Collected, training_campaigns
 from flows.running.orchestration import Parcel, run
 from flows.running.timing import timed
 from protocols.errors import InputError
-from protocols.settings import AnalysisSettings
+from protocols.settings import MARGIN, AnalysisSettings, Detection
 from storage.derived import make_key
 from storage.files import read_json, write_bytes, write_json
 from storage.store import Store, StoreError
@@ -36,6 +36,12 @@ class Model:
     seed: int
     path: Path
     key: str
+    settings: AnalysisSettings
+
+    @property
+    def title(self) -> str:
+        """``seed 0``, or ``paper-seed 0``."""
+        return self.path.stem.replace("seed", "seed ")
 
     @property
     def info_path(self) -> Path:
@@ -66,6 +72,13 @@ def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
     return training_campaigns(campaigns)[0].settings
 
 
+def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, Detection]:
+    """The rule of each campaign, in spikes of a network with so many output neurons a class."""
+    usual = MARGIN * outputs_per_class
+    margin = training_settings(campaigns).rule_for(outputs_per_class, usual).margin
+    return {item.name: item.settings.rule_for(outputs_per_class, margin) for item in campaigns}
+
+
 def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
     """The models that the settings ask for, with the keys they must have.
 
@@ -75,8 +88,25 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     Raises:
         StoreError: a trial has no fresh label yet.
     """
+    return _models(store, campaigns, training_settings(campaigns), reviewed, "")
+
+
+def models_beside(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
+    """The same of the network that `analysis.also` asks for; none without one."""
+    settings = training_settings(campaigns).beside()
+    if settings is None:
+        return []
+    return _models(store, campaigns, settings, reviewed, f"{settings.preset}-")
+
+
+def _models(
+    store: Store,
+    campaigns: list[Collected],
+    settings: AnalysisSettings,
+    reviewed: bool,
+    prefix: str,
+) -> list[Model]:
     used = training_campaigns(campaigns)
-    settings = used[0].settings
     inputs = []
     labels = Labels(store, reviewed)
     for item in used:
@@ -101,14 +131,16 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
             inputs,
             {**parameters, "seed": seed, "dataset": dataset.VERSION},
         )
-        models.append(Model(seed, store.folder / "models" / f"seed{seed}.pt", key))
+        path = store.folder / "models" / f"{prefix}seed{seed}.pt"
+        models.append(Model(seed, path, key, settings))
     return models
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, AnalysisSettings, bool]]) -> int:
+def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     """Train one network and keep it."""
-    model, train, validation, settings, simulated = job.content
+    model, train, validation, simulated = job.content
+    settings = model.settings
     model.path.parent.mkdir(parents=True, exist_ok=True)
     with progress(model, settings.training.epochs, simulated) as told:
         fitted = training.fit(
@@ -159,7 +191,6 @@ def train_flow(
 ) -> int:
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models, cluster = wanted.content
-    settings = training_settings(campaigns)
     simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
     with timed(labels.store, "train"):
         train = load_samples(labels, campaigns, "train", cluster)
@@ -168,7 +199,7 @@ def train_flow(
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
         for model in models:
-            train_one(Parcel((model, train, validation, settings, simulated)))
+            train_one(Parcel((model, train, validation, simulated)))
     return len(models)
 
 
@@ -189,7 +220,10 @@ def train(
         InputError: there is no such device to train on.
     """
     labels = Labels(store, reviewed)
-    models = wanted_models(store, campaigns, reviewed)
+    models = [
+        *wanted_models(store, campaigns, reviewed),
+        *models_beside(store, campaigns, reviewed),
+    ]
     stale = [model for model in models if not model.fresh]
     if stale:
         _check_device(training_campaigns(campaigns)[0])

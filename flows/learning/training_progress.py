@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @contextmanager
 def progress(model: Model, epochs: int, simulated: bool) -> Iterator[Progress]:
     """Show the training of a model while the block runs."""
-    with console.bar(f"train seed {model.seed} (epochs)", epochs) as bar:
+    with console.bar(f"train {model.title} (epochs)", epochs) as bar:
         yield Progress(model, bar, simulated)
 
 
@@ -56,7 +56,7 @@ class Progress:
         from prefect.context import get_run_context
 
         data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-        words = f"training curves of seed {self._model.seed}, {len(self._records)} epochs"
+        words = f"training curves of {self._model.title}, {len(self._records)} epochs"
         with get_client(sync_client=True) as client:
             if self._artifact is not None:
                 client.update_artifact(self._artifact, ArtifactUpdate(data=data, description=words))
@@ -64,7 +64,7 @@ class Progress:
             run: Any = get_run_context()
             made = client.create_artifact(
                 ArtifactCreate(
-                    key=f"train-seed-{self._model.seed}-curves",
+                    key=f"train-{self._model.title.replace(' ', '-')}-curves",
                     type="image",
                     data=data,
                     description=words,

@@ -196,7 +196,13 @@ def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
     found = kept_counts(store, evaluated)
     if found is None:
         return {}
-    counts, y, trial = found["counts"], found["y"], found["trial"]
+    return intervals_of(found["counts"], found["y"], found["trial"])
+
+
+def intervals_of(
+    counts: npt.NDArray[np.int64], y: npt.NDArray[np.int64], trial: npt.NDArray[np.int64]
+) -> dict[str, Any]:
+    """The same of counts (n, 3) with their classes (n,) and trials (n,)."""
     said = metrics.winners(counts)
     true, called = y == metrics.INCIPIENT, said == metrics.INCIPIENT
     both = (true & called).astype(np.float64)

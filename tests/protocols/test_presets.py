@@ -88,10 +88,10 @@ def test_margins_of_all_campaigns_are_in_spikes_of_the_model(tmp_path: Path) -> 
     assert model.detection.margin == 2
     for name in ("gravity", "disturbance", "pilot_gravity", "pilot"):
         for own, margin in (({}, 2.0), ({"detection": {"margin": 4}}, 1.0)):
-            rule = settings(file(name, tmp_path, **own)).rule_for(model)
+            rule = settings(file(name, tmp_path, **own)).rule_for(1, model.detection.margin)
             assert (rule.margin, rule.smoothing) == (margin, 4)
             assert rule.margin_grid[:2] == (0.5, 1.0)
-    assert model.rule_for(model) == model.detection
+    assert model.rule_for(1, 2.0) == model.detection
 
 
 def test_the_network_beside_shares_data_and_differs_in_all_else() -> None:

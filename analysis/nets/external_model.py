@@ -1,0 +1,420 @@
+"""A spiking network that was made elsewhere: a state_dict, and a description of its layers.
+
+Sinabs itself computes it, so that its counts are those that its makers see. The event-driven
+kernels may take its place where the layers are those of `analysis.nets.network`; on weights off the
+grid (`analysis.nets.network.on_grid`) they add in another order than Sinabs, and a potential that
+ends at its threshold may fall on either side of it.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import Field, field_validator
+from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, SingleSpike
+from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
+from torch import nn
+
+from analysis.nets.metrics import CLASSES
+from analysis.nets.network import (
+    SPIKING,
+    WEIGHTED,
+    build,
+    exact,
+    matrices,
+    parameters,
+    set_weights,
+)
+from protocols.errors import InputError
+from protocols.settings import Network, Windows
+from protocols.yaml_file import KeyedError, StrictModel, load, register_tags
+
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Side = Annotated[int, Field(ge=1, le=512)]
+STATES = ("v_mem", "i_syn")
+"""What Sinabs' layers keep beside their parameters; every window begins without it."""
+
+
+class Conv(StrictModel):
+    """A convolution over the cells; channels and kernel are those of its weights."""
+
+    kind: Literal["conv"]
+    name: Name
+    """Of the layer in the state_dict: ``conv1`` for ``conv1.weight``."""
+    stride: Side = 1
+    padding: Annotated[int, Field(ge=0, le=512)] = 0
+
+
+class Linear(StrictModel):
+    """A fully connected layer."""
+
+    kind: Literal["linear"]
+    name: Name
+
+
+class Pool(StrictModel):
+    """Spikes of square patches added up, averaged, or the largest."""
+
+    kind: Literal["pool"]
+    how: Literal["sum", "average", "max"]
+    size: Side
+    stride: Side | None = None
+    """By default the size."""
+
+
+class Flatten(StrictModel):
+    """Channels and cells in one row."""
+
+    kind: Literal["flatten"]
+
+
+class Neurons(StrictModel):
+    """Integrate-and-fire neurons of Sinabs, leaky with a time constant."""
+
+    kind: Literal["iaf", "lif"]
+    name: Name | None = None
+    """Of the layer in the state_dict, where that has its threshold."""
+    threshold: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """Potential at which a neuron fires; by default that of the state_dict."""
+    spikes: Literal["single", "multi"]
+    """At most one spike a step (SingleSpike), or as many as thresholds are in the potential
+    (MultiSpike, which is Sinabs' default)."""
+    reset: Literal["zero", "subtract"]
+    """A neuron that fires goes back to zero (MembraneReset), or loses a threshold for each spike
+    (MembraneSubtract, which is Sinabs' default)."""
+    lowest: float | None = None
+    """Potentials do not fall below it (min_v_mem)."""
+    tau_mem: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    """Time constant of a lif's potential, steps; by default that of the state_dict."""
+    norm_input: bool = True
+    """Of a lif: currents are weighted so that a constant one is approached."""
+
+
+Layer = Annotated[Conv | Linear | Pool | Flatten | Neurons, Field(discriminator="kind")]
+register_tags("conv", "linear", "pool", "flatten", "iaf", "lif")
+
+
+class Description(StrictModel):
+    """What a state_dict does not say: the file beside it."""
+
+    model: Literal[1]
+    """Version of the file format."""
+    weights: Annotated[str, Field(min_length=1, max_length=1000)]
+    """The file that `torch.save(net.state_dict(), FILE)` wrote; relative to this one."""
+    windows: Windows = Windows()
+    """What it takes: event counts (steps, channels, cells, cells)."""
+    layers: tuple[Layer, ...] = Field(min_length=1, max_length=100)
+    outputs: tuple[Literal["no_slip", "incipient", "gross"], ...] = CLASSES  # type: ignore[assignment]
+    """The class of each output neuron; spikes of a class are added up."""
+
+    @field_validator("outputs")
+    @classmethod
+    def _every_class(cls, outputs: tuple[str, ...]) -> tuple[str, ...]:
+        left = [name for name in CLASSES if name not in outputs]
+        if left:
+            raise ValueError(f"must give each class a neuron; none is {left[0]}")
+        return outputs
+
+
+@dataclass(frozen=True)
+class ExternalModel:
+    """A described network with its weights, checked against each other.
+
+    Attributes:
+        description: the file.
+        weights: the state_dict's bytes.
+    """
+
+    description: Description
+    weights: bytes
+
+    @property
+    def windows(self) -> Windows:
+        """The windows that it takes."""
+        return self.description.windows
+
+    @property
+    def outputs_per_class(self) -> float:
+        """Output neurons of a class, in the mean."""
+        return len(self.description.outputs) / len(CLASSES)
+
+    def sinabs(self) -> SinabsNet:
+        """The network in Sinabs' layers."""
+        return _assemble(self.description, _tensors(self.weights))
+
+    def fast(self) -> nn.Sequential:
+        """The same as `analysis.nets.network.build` makes it, for the kernels.
+
+        Raises:
+            ValueError: the kernels compute no such network; the message says which part.
+        """
+        return _as_ours(self.description, _tensors(self.weights))
+
+    def on_grid(self) -> bool:
+        """Whether the kernels' counts are Sinabs' by arithmetic."""
+        try:
+            return exact(matrices(self.fast()))
+        except ValueError:
+            return False
+
+
+@dataclass(frozen=True)
+class SinabsNet:
+    """A network in Sinabs' layers, time folded into the batch.
+
+    Attributes:
+        classes: int64 (outputs,), the class of each output neuron.
+    """
+
+    net: nn.Sequential
+    windows: Windows
+    classes: npt.NDArray[np.int64]
+
+    def counts(self, x: npt.NDArray[Any], batch: int = 64) -> npt.NDArray[np.int64]:
+        """Output spikes int64 (n, 3) of windows (n, steps, channels, cells, cells), from rest.
+
+        Raises:
+            ValueError: windows of another shape.
+        """
+        settings = self.windows
+        expected = (settings.steps, settings.channels, settings.cells, settings.cells)
+        if x.shape[1:] != expected:
+            raise ValueError(f"samples have the shape {x.shape}; expected (n, {expected})")
+        out = np.zeros((len(x), len(CLASSES)), np.int64)
+        with torch.no_grad():
+            for start in range(0, len(x), batch):
+                part = torch.from_numpy(x[start : start + batch].astype(np.float32))
+                for layer in self.net:
+                    if isinstance(layer, IAFSqueeze | LIFSqueeze):
+                        layer.reset_states()
+                spikes = self.net(part.flatten(0, 1)).unflatten(0, (len(part), -1)).sum(dim=1)
+                counted = np.rint(spikes.numpy()).astype(np.int64)
+                np.add.at(out[start : start + batch].T, self.classes, counted.T)
+        return out
+
+
+def load_external(path: Path) -> ExternalModel:
+    """Read a description (YAML or JSON) and the weights that it names, and check both.
+
+    Nothing in the weights is executed.
+
+    Raises:
+        InputError: file, key, value and what would be right.
+    """
+    description = load(Description, path, "description of a model")
+    file = path.parent / description.weights
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        reason = f"cannot be read: {error.strerror}"
+        raise InputError(path, "weights", description.weights, reason) from None
+    try:
+        _assemble(description, _tensors(data))
+    except KeyedError as error:
+        raise InputError(path, error.key, error.value, str(error)) from None
+    except ValueError as error:
+        raise InputError(file, "", None, str(error)) from None
+    return ExternalModel(description, data)
+
+
+def _tensors(data: bytes) -> dict[str, torch.Tensor]:
+    """A state_dict's tensors, without the states of neurons."""
+    try:
+        found = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, ValueError, pickle.UnpicklingError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(v, torch.Tensor) for v in found.values()):
+        raise ValueError("must be a state_dict: save it by torch.save(net.state_dict(), FILE)")
+    return {
+        str(name): value.float()
+        for name, value in found.items()
+        if str(name).rpartition(".")[2] not in STATES
+    }
+
+
+def _assemble(description: Description, tensors: dict[str, torch.Tensor]) -> SinabsNet:
+    """The layers in order, with every tensor used and every shape checked."""
+    windows = description.windows
+    left = dict(tensors)
+    shape: tuple[int, ...] = (windows.channels, windows.cells, windows.cells)
+    layers: list[nn.Module] = []
+    for place, layer in enumerate(description.layers):
+        made = _module(layer, f"layers[{place}]", left, shape, windows.steps)
+        layers.append(made)
+        with torch.no_grad():
+            shape = tuple(made(torch.zeros(windows.steps, *shape)).shape[1:])
+    if left:
+        raise KeyedError(
+            "layers", next(iter(left)), "is a tensor of the weights that no layer here takes"
+        )
+    if not isinstance(description.layers[-1], Neurons):
+        raise KeyedError("layers", description.layers[-1].kind, "must end with neurons")
+    if shape != (len(description.outputs),):
+        raise KeyedError(
+            "outputs", len(description.outputs), f"the last layer gives {list(shape)}; name each"
+        )
+    classes = np.array([CLASSES.index(name) for name in description.outputs], np.int64)
+    return SinabsNet(nn.Sequential(*layers), windows, classes)
+
+
+def _module(
+    layer: Layer, key: str, left: dict[str, torch.Tensor], shape: tuple[int, ...], steps: int
+) -> nn.Module:
+    """One layer; the tensors that it takes are taken out of `left`."""
+    if isinstance(layer, Neurons):
+        return _neurons(layer, key, left, steps)
+    if isinstance(layer, Flatten):
+        return nn.Flatten()
+    if isinstance(layer, Linear):
+        weight, bias = _weights(layer.name, key, left, 2)
+        if shape != weight.shape[1:]:
+            raise KeyedError(
+                f"{key}.name", layer.name, _unfit(layer.name, weight, shape, "flatten before it")
+            )
+        made: nn.Module = nn.Linear(weight.shape[1], weight.shape[0], bias=bias is not None)
+        return _filled(made, weight, bias)
+    if len(shape) != 3:
+        raise KeyedError(f"{key}.kind", layer.kind, f"needs channels and cells, not {list(shape)}")
+    if isinstance(layer, Conv):
+        weight, bias = _weights(layer.name, key, left, 4)
+        if weight.shape[1] != shape[0]:
+            raise KeyedError(f"{key}.name", layer.name, _unfit(layer.name, weight, shape))
+        outer = min(shape[1:]) + 2 * layer.padding
+        if max(weight.shape[2:]) > outer:
+            raise KeyedError(f"{key}.padding", layer.padding, f"leaves {outer} cells for a kernel "
+                             f"of {max(weight.shape[2:])}")  # fmt: skip
+        made = nn.Conv2d(
+            weight.shape[1], weight.shape[0], (weight.shape[2], weight.shape[3]),
+            stride=layer.stride, padding=layer.padding, bias=bias is not None,
+        )  # fmt: skip
+        return _filled(made, weight, bias)
+    if layer.size > min(shape[1:]):
+        raise KeyedError(f"{key}.size", layer.size, f"must not exceed the {min(shape[1:])} cells")
+    stride = layer.stride or layer.size
+    if layer.how == "sum":
+        return SumPool2d(layer.size, stride)
+    return (nn.AvgPool2d if layer.how == "average" else nn.MaxPool2d)(layer.size, stride)
+
+
+def _weights(
+    name: str, key: str, left: dict[str, torch.Tensor], dimensions: int
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Weight and bias of a layer, taken out of `left`."""
+    weight = left.pop(f"{name}.weight", None)
+    if weight is None or weight.ndim != dimensions:
+        there = sorted({k.rpartition(".")[0] for k, v in left.items() if v.ndim == dimensions})
+        raise KeyedError(
+            f"{key}.name", name, f"must name weights of {dimensions} dimensions: "
+            f"{', '.join(there) or 'there are none left'}",
+        )  # fmt: skip
+    if not weight.isfinite().all():
+        raise KeyedError(f"{key}.name", name, "its weights are not all finite")
+    return weight, left.pop(f"{name}.bias", None)
+
+
+def _unfit(name: str, weight: torch.Tensor, shape: tuple[int, ...], hint: str = "") -> str:
+    wanted = f"{name}.weight takes {weight.shape[1]} inputs, and here are {list(shape)}"
+    return f"{wanted}; {hint}" if hint and len(shape) > 1 else wanted
+
+
+def _filled(made: Any, weight: torch.Tensor, bias: torch.Tensor | None) -> Any:
+    with torch.no_grad():
+        made.weight.copy_(weight)
+        if bias is not None:
+            made.bias.copy_(bias)
+    return made
+
+
+def _neurons(layer: Neurons, key: str, left: dict[str, torch.Tensor], steps: int) -> nn.Module:
+    """Neurons with the parameters of the description, or those of the state_dict."""
+
+    def of(parameter: str, said: float | None, called: str) -> float | None:
+        kept = left.pop(f"{layer.name}.{parameter}", None) if layer.name else None
+        if kept is None:
+            return said
+        if kept.numel() != 1:
+            raise KeyedError(f"{key}.name", layer.name, f"{parameter} differs between neurons")
+        value = float(kept)
+        if said is not None and np.float32(said) != np.float32(value):
+            raise KeyedError(f"{key}.{called}", said, f"the state_dict has {value:g}")
+        return value
+
+    threshold = of("spike_threshold", layer.threshold, "threshold")
+    lowest = of("min_v_mem", layer.lowest, "lowest")
+    tau = of("tau_mem", layer.tau_mem, "tau_mem")
+    if threshold is None:
+        raise KeyedError(f"{key}.threshold", None, "is missing, and the state_dict has none")
+    if (tau is None) == (layer.kind == "lif"):
+        right = "is missing, and the state_dict has none" if tau is None else "belongs to a lif"
+        raise KeyedError(f"{key}.tau_mem", tau, right)
+    common: dict[str, Any] = {
+        "num_timesteps": steps,
+        "spike_threshold": torch.tensor(threshold),
+        "spike_fn": SingleSpike if layer.spikes == "single" else MultiSpike,
+        "reset_fn": MembraneReset() if layer.reset == "zero" else MembraneSubtract(),
+        "min_v_mem": lowest,
+    }
+    if layer.kind == "iaf":
+        return IAFSqueeze(**common)
+    return LIFSqueeze(tau_mem=tau, norm_input=layer.norm_input, **common)
+
+
+def _as_ours(description: Description, tensors: dict[str, torch.Tensor]) -> nn.Sequential:
+    made: list[Any] = list(_assemble(description, tensors).net)
+    order = (nn.Conv2d, IAFSqueeze, nn.Conv2d, IAFSqueeze, nn.Flatten, nn.Linear, IAFSqueeze,
+             nn.Linear, IAFSqueeze)  # fmt: skip
+    if tuple(map(type, made)) != order:
+        raise ValueError("the layers are not two convolutions and two fully connected ones")
+    if description.outputs != CLASSES * (len(description.outputs) // len(CLASSES)):
+        raise ValueError(f"outputs must be {', '.join(CLASSES)}, again and again")
+    conv1, conv2, fc1, fc2 = weighted = [made[k] for k in (0, 2, 5, 7)]
+    said = [layer for layer in description.layers if isinstance(layer, Neurons)]
+    if any((each.spikes, each.reset) != ("single", "zero") for each in said):
+        raise ValueError("neurons must fire once a step and be reset to zero")
+    neurons = [made[k] for k in (1, 3, 6, 8)]
+    if any(each.min_v_mem is not None for each in neurons):
+        raise ValueError("neurons must have no lowest potential")
+    if len({float(each.spike_threshold) for each in neurons}) > 1:
+        raise ValueError("all thresholds must be the same")
+    if (fc1.bias is None) != (fc2.bias is None):
+        raise ValueError("both fully connected layers must have biases, or none")
+    if conv1.bias is not None or conv2.bias is not None:
+        raise ValueError("convolutions must have no biases")
+    for conv, stride in ((conv1, 1), (conv2, 2)):
+        (k, *_), square = conv.kernel_size, len(set(conv.kernel_size)) == 1
+        if not square or k not in (1, 3, 5, 7) or conv.padding != (k // 2,) * 2:
+            raise ValueError("kernels must be squares of 1, 3, 5 or 7, padded by their half")
+        if conv.stride != (stride, stride):
+            raise ValueError("strides must be 1 and 2")
+    net = build(
+        Network(
+            conv1_channels=conv1.out_channels,
+            conv2_channels=conv2.out_channels,
+            conv1_kernel=conv1.kernel_size[0],
+            conv2_kernel=conv2.kernel_size[0],
+            hidden=fc1.out_features,
+            outputs_per_class=fc2.out_features // len(CLASSES),
+            biases=fc1.bias is not None,
+        ),
+        description.windows,
+        0,
+    )
+    theirs = dict(zip(WEIGHTED, weighted, strict=True))
+    set_weights(
+        net,
+        {
+            name: getattr(theirs[layer], kind).detach()
+            for name in parameters(net)
+            for layer, kind in [name.split(".")]
+        },
+    )
+    for name, each in zip(SPIKING, neurons, strict=True):
+        getattr(net, name).spike_threshold = each.spike_threshold
+    return net

@@ -1,0 +1,417 @@
+"""Other networks on the store's test trials: the preset that `also` names, and models of files.
+
+They are judged by the very functions that judge the store's own network, on the same windows and
+trials, and by the rule in spikes of their own outputs. What comes of it stands in a column of the
+report beside the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from prefect import flow
+
+from analysis.nets import dataset, metrics, model_file, training, window_groups
+from analysis.nets.external_model import Description, ExternalModel, load_external
+from analysis.nets.network import spike_counts
+from analysis.nets.samples import strided_windows
+from analysis.nets.sparse import SparseWindows
+from analysis.nets.spiking import Engine
+from flows.labelling.reviewed import Labels
+from flows.learning import window_scores
+from flows.learning.train import models_beside, rules_of, training_settings
+from flows.learning.trial_scores import score_row, summaries
+from flows.learning.window_scores import intervals_of
+from flows.running import console
+from flows.running.campaigns import Collected, training_campaigns
+from flows.running.orchestration import Parcel, run
+from flows.running.timing import timed
+from flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from protocols.errors import InputError
+from protocols.hashing import hash_data, hash_integer
+from protocols.settings import Detection, Samples, Windows
+from storage.derived import Derived, make_key
+from storage.recording import Recording
+from storage.store import Store, StoreError
+
+if TYPE_CHECKING:
+    from flows.running.cluster import Cluster
+
+STEP = "other_networks"
+VERSION = 1
+Engines = Literal["fast", "sinabs"]
+ENGINES: tuple[Engines, ...] = ("fast", "sinabs")
+Json = dict[str, Any]
+I64 = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class OtherNetwork:
+    """A network that is judged beside the store's own.
+
+    Attributes:
+        name: of what is kept, safe as a file's name.
+        title: for people.
+        content: its file's bytes: a model file of this program, or weights of `description`.
+        windows: what it takes.
+        outputs_per_class: in the mean.
+        engine: what counts its spikes: the event-driven kernels, or Sinabs.
+        exact: whether both give the same counts by arithmetic.
+    """
+
+    name: str
+    title: str
+    content: bytes
+    description: Description | None
+    windows: Windows
+    outputs_per_class: float
+    engine: Engines
+    exact: bool
+
+
+@dataclass(frozen=True)
+class _Judging:
+    """What the counts of a trial depend on besides the trial."""
+
+    network: OtherNetwork
+    label: Json | None
+    """Of a trial whose windows are samples, too."""
+    samples: Samples
+    seed: int
+    stride_ms: int
+    threads: int | None
+
+
+def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
+    """A model file of this program, or a state_dict with its description, as a network to judge.
+
+    Args:
+        path: the model file, the description (YAML or JSON), or the weights that a description of
+            the same name stands beside.
+        engine: by default the kernels where they give Sinabs' counts by arithmetic, else Sinabs.
+
+    Raises:
+        InputError: file, key, value and what would be right.
+    """
+    if path.suffix in {".yaml", ".yml", ".json"}:
+        return _described(path, engine)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    try:
+        fitted = model_file.parse(content, str(path))
+    except ValueError as error:
+        for suffix in (".yaml", ".yml", ".json"):
+            if path.with_suffix(suffix).exists():
+                return _described(path.with_suffix(suffix), engine)
+        reason = str(error).removeprefix(f"{path}: ")
+        raise InputError(
+            path, "", None, f"{reason}; a state_dict needs a description beside it, such as "
+            f"{path.with_suffix('.yaml').name} (docs/models.md)",
+        ) from None  # fmt: skip
+    return OtherNetwork(
+        f"model-{path.stem}", path.name, content, None, fitted.windows,
+        fitted.network.outputs_per_class, engine or "fast", exact=True,
+    )  # fmt: skip
+
+
+def _described(path: Path, engine: Engines | None) -> OtherNetwork:
+    model = load_external(path)
+    exact = model.on_grid()
+    if engine == "fast":
+        try:
+            model.fast()
+        except ValueError as error:
+            reason = f"cannot run {path}: {error}; must be sinabs"
+            raise InputError("--engine", "", engine, reason) from None
+    return OtherNetwork(
+        f"model-{path.stem}", Path(model.description.weights).name, model.weights,
+        model.description, model.windows, model.outputs_per_class,
+        engine or ("fast" if exact else "sinabs"), exact,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is judged by what, found before anything is computed."""
+
+    store: Store
+    campaigns: list[Collected]
+    labels: Labels
+    network: OtherNetwork
+    rules: dict[str, Detection]
+    about: Json
+    cluster: Cluster | None = None
+
+    @property
+    def data_key(self) -> str:
+        """Of the trials and labels alone."""
+        return data_key(self.labels, self.campaigns)
+
+    @property
+    def key(self) -> str:
+        """Of all that the result depends on."""
+        network = self.network
+        said = None if network.description is None else network.description.model_dump(mode="json")
+        model = hash_data([network.content.hex(), said, network.engine])
+        rules = {name: rule.model_dump(mode="json") for name, rule in self.rules.items()}
+        return make_key(
+            STEP, VERSION,
+            [model, self.data_key, network.title, self.about, window_scores.VERSION], rules,
+        )  # fmt: skip
+
+    def run(self) -> bool:
+        """Compute it if anything changed; whether it did."""
+        stale = not Derived.of(self.store, STEP).fresh(self.network.name, self.key)
+        if stale:
+            run(_flow, Parcel(self), self.cluster)
+        return stale
+
+
+def data_key(labels: Labels, campaigns: list[Collected]) -> str:
+    """The key of the test trials and their labels.
+
+    Raises:
+        StoreError: a trial has no label.
+    """
+    inputs = []
+    for item in campaigns:
+        for trial, recording in item.of_split("test"):
+            if not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            inputs.append([item.name, trial.id, recording.checksum, labels.key(item, recording)])
+    return make_key(STEP, VERSION, inputs, training_settings(campaigns).samples.model_dump())
+
+
+def judge_model(
+    store: Store,
+    campaigns: list[Collected],
+    model: Path,
+    engine: Engines | None = None,
+    margin: float | None = None,
+    smoothing: int | None = None,
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> Json:
+    """Judge a model of a file on the test trials; what came of it, for people and programs.
+
+    Args:
+        model, engine: see `network_of`.
+        margin, smoothing: instead of the protocols' own.
+        reviewed: people's decisions are applied to the labels.
+
+    Raises:
+        InputError: the model; the message says what would be right.
+        StoreError: a trial has no label yet.
+    """
+    network = network_of(model, engine)
+    change: Json = {"choose": "protocol", "compare": None, "margin": margin, "smoothing": smoothing}
+    change = {k: v for k, v in change.items() if v is not None or k == "compare"}
+    rules = {
+        name: Detection.model_validate({**rule.model_dump(), **change})
+        for name, rule in rules_of(campaigns, network.outputs_per_class).items()
+    }
+    labels = Labels(store, reviewed)
+    about = {"preset": None, "seed": None}
+    judgement = Judgement(store, campaigns, labels, network, rules, about, cluster)
+    if network.engine == "fast" and not network.exact:
+        console.say(
+            f"warning: {network.title}: its weights are off the grid, where the fast engine's "
+            "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
+        )
+    done = judgement.run()
+    found = Derived.of(store, STEP).read(network.name)
+    kinematic = found["experiments"]["kinematic"]
+    return {
+        "step": "evaluate",
+        "done": int(done),
+        "fresh": int(not done),
+        "model": network.title,
+        "engine": network.engine,
+        "same_as_sinabs": network.exact or network.engine == "sinabs",
+        "simulated": store.simulated,
+        "margin": {name: rule.margin for name, rule in rules.items()},
+        "accuracy": found["windows"]["accuracy"],
+        "interval": found["windows"]["interval"],
+        "latency_ms": kinematic["latency_ms"],
+        "lead_ms": {k: v["lead_ms"] for k, v in found["experiments"].items() if k != "kinematic"},
+        **labels.told(campaigns),
+    }
+
+
+def judge_beside(
+    store: Store,
+    campaigns: list[Collected],
+    cluster: Cluster | None = None,
+    reviewed: bool = False,
+) -> bool:
+    """Judge the network that `analysis.also` asks for; whether there was anything to do.
+
+    Raises:
+        StoreError: it is missing or stale.
+    """
+    done = False
+    for model in models_beside(store, campaigns, reviewed):
+        if not model.fresh:
+            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
+        settings = model.settings
+        own = settings.network.outputs_per_class
+        network = OtherNetwork(
+            f"preset-{settings.preset}", f"preset: {settings.preset}", model.path.read_bytes(),
+            None, settings.windows, own, "fast", exact=True,
+        )  # fmt: skip
+        rules = {
+            item.name: settings.detection.model_copy(
+                update={"false_early_ms": item.settings.detection.false_early_ms}
+            )
+            for item in campaigns
+        }
+        about = {"preset": settings.preset, "seed": model.seed}
+        judgement = Judgement(
+            store, campaigns, Labels(store, reviewed), network, rules, about, cluster
+        )
+        done |= judgement.run()
+    return done
+
+
+def kept(store: Store, campaigns: list[Collected], reviewed: bool = False) -> dict[str, Json]:
+    """What was judged on the trials and labels of today, by name."""
+    folder = Derived.of(store, STEP)
+    wanted = data_key(Labels(store, reviewed), campaigns)
+    found = {}
+    for path in sorted(folder.folder.glob("*.json")):
+        result = folder.read(path.stem)
+        if result.get("data_key") == wanted:
+            found[path.stem] = result
+    return found
+
+
+@flow(name="judge a network", validate_parameters=False, persist_result=False)
+def _flow(wanted: Parcel[Judgement]) -> None:
+    """Count spikes of every test trial, then score."""
+    job = wanted.content
+    with timed(job.store, "evaluate"):
+        _count_all(job)
+        _score(job)
+
+
+def _count_all(job: Judgement) -> None:
+    network, kinematic = job.network, {item.name for item in training_campaigns(job.campaigns)}
+    samples = training_settings(job.campaigns).samples
+    said = None if network.description is None else network.description.model_dump(mode="json")
+    model = hash_data([network.content.hex(), said, network.engine])
+    work = []
+    for item in job.campaigns:
+        stride = job.rules[item.name].stride_ms or network.windows.length_ms
+        for trial, recording in item.of_split("test"):
+            label = job.labels.read(item, recording) if item.name in kinematic else None
+            key = make_key(
+                STEP, VERSION, [model, recording.checksum, job.labels.key(item, recording)],
+                [network.windows.model_dump(mode="json"), samples.model_dump(), stride],
+            )  # fmt: skip
+            judging = _Judging(
+                network, label, samples, hash_integer("samples", trial.id), stride,
+                None if job.cluster is None else 1,
+            )  # fmt: skip
+            work.append(TrialWork(recording, item.name, key, judging))
+    step = _counts_step(network)
+    stale = stale_trials(job.store, step, work)
+    if stale:
+        keep_trials(job.store, step, "evaluate", stale, _count, job.cluster, processes=False)
+
+
+def _counts_step(network: OtherNetwork) -> str:
+    return f"counts-{network.name}"
+
+
+def _count(recording: Recording, judging: _Judging) -> tuple[Json, dict[str, npt.NDArray[Any]]]:
+    """Spikes of the windows of a trial, one after the other, and of those that are samples."""
+    network = judging.network
+    if judging.threads is not None:
+        training.limit_threads(judging.threads)
+    counts = _counter(network.content, network.description, network.engine)
+    length_ns = network.windows.length_ms * 1_000_000
+    span = dataset.recorded_span(recording)
+    starts = strided_windows(*span, length_ns, judging.stride_ms * 1_000_000)
+    found = {
+        "counts": counts(dataset.cut_windows(recording, starts, network.windows)),
+        "end_ns": starts + length_ns,
+    }
+    if judging.label is not None:
+        samples = dataset.trial_samples(
+            recording, judging.label, 0, network.windows, judging.samples, judging.seed
+        )
+        found |= {"sample_counts": counts(samples.windows), "y": samples.y}
+    return {}, found
+
+
+@lru_cache(maxsize=2)
+def _counter(
+    content: bytes, description: Description | None, engine: Engines
+) -> Callable[[SparseWindows], I64]:
+    """What gives output spikes int64 (n, 3) of windows, each from rest."""
+    if description is None:
+        fitted = model_file.parse(content, "the model")
+        if engine == "fast":
+            return training.engine(fitted).counts
+        net = training.restore(fitted)
+        return lambda x: spike_counts(net, x.dense())
+    model = ExternalModel(description, content)
+    if engine == "fast":
+        return Engine(model.fast(), model.windows.cells).counts
+    sinabs = model.sinabs()
+    return lambda x: sinabs.counts(x.dense())
+
+
+def _score(job: Judgement) -> None:
+    """Windows, detections and latencies, kept as one result."""
+    network = job.network
+    rows: list[Json] = []
+    counts: list[I64] = []
+    labels: list[I64] = []
+    places: list[I64] = []
+    for item in job.campaigns:
+        made = Derived.of(job.store, _counts_step(network), item.name)
+        for trial, recording in item.of_split("test"):
+            arrays = made.arrays(recording.folder.name)
+            label = job.labels.read(item, recording)
+            rule = job.rules[item.name]
+            rows.append(score_row(item, trial, label, arrays["counts"], arrays["end_ns"], rule))
+            if "y" in arrays:
+                counts.append(arrays["sample_counts"])
+                labels.append(arrays["y"])
+                places.append(np.full(len(arrays["y"]), len(places), np.int64))
+    margin = job.rules[training_campaigns(job.campaigns)[0].name].margin
+    result = {
+        "data_key": job.data_key,
+        "title": network.title,
+        "engine": network.engine,
+        "exact": network.exact,
+        **job.about,
+        "windows": _windows(counts, labels, places, margin),
+        "trials": rows,
+        "experiments": summaries(rows),
+        "detection": {name: rule.model_dump(mode="json") for name, rule in job.rules.items()},
+    }
+    Derived.of(job.store, STEP).write(network.name, job.key, result)
+
+
+def _windows(
+    counts: Sequence[I64], labels: Sequence[I64], places: Sequence[I64], margin: float
+) -> Json:
+    """Figures of the sample windows, with intervals over trials."""
+    none = np.empty(0, np.int64)
+    all_counts = np.concatenate([np.empty((0, 3), np.int64), *counts])
+    y, trial = np.concatenate([none, *labels]), np.concatenate([none, *places])
+    return {
+        **metrics.score(all_counts, y, margin).as_dict(),
+        "interval": window_groups.share(window_groups.strict_hits(all_counts, y), trial),
+        "window_intervals": intervals_of(all_counts, y, trial),
+    }

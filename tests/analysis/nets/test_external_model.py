@@ -1,0 +1,236 @@
+"""Networks that were made elsewhere count as Sinabs itself does, and faults in them are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, SingleSpike
+from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
+from torch import nn
+
+from analysis.nets.external_model import load_external
+from analysis.nets.network import spike_counts
+from analysis.nets.spiking import Engine
+from protocols import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS, CELLS = 20, 12
+WINDOWS = {"length_ms": STEPS, "crop_px": 240}
+OURS: list[dict[str, Any]] = [
+    {"kind": "conv", "name": "0", "padding": 2},
+    {"kind": "iaf", "name": "1", "spikes": "single", "reset": "zero"},
+    {"kind": "conv", "name": "2", "stride": 2, "padding": 1},
+    {"kind": "iaf", "name": "3", "threshold": 1, "spikes": "single", "reset": "zero"},
+    {"kind": "flatten"},
+    {"kind": "linear", "name": "5"},
+    {"kind": "iaf", "name": "6", "spikes": "single", "reset": "zero"},
+    {"kind": "linear", "name": "7"},
+    {"kind": "iaf", "name": "8", "spikes": "single", "reset": "zero"},
+]
+
+
+def iaf(**changes: Any) -> IAFSqueeze:
+    """The paper's neuron, in plain Sinabs."""
+    return IAFSqueeze(
+        num_timesteps=STEPS, spike_fn=SingleSpike, reset_fn=MembraneReset(), **changes
+    )
+
+
+def papers(step: float, outputs: int = 3, threshold: float = 1.0) -> nn.Sequential:
+    """The paper's layers in plain Sinabs, weights whole multiples of `step`."""
+    torch.manual_seed(0)
+
+    def neurons() -> IAFSqueeze:
+        return iaf(spike_threshold=torch.tensor(threshold))
+
+    net = nn.Sequential(
+        nn.Conv2d(1, 4, 5, padding=2, bias=False), neurons(),
+        nn.Conv2d(4, 6, 3, stride=2, padding=1, bias=False), neurons(),
+        nn.Flatten(), nn.Linear(216, 16), neurons(), nn.Linear(16, outputs), neurons(),
+    )  # fmt: skip
+    return rounded(net, step)
+
+
+def rounded(net: nn.Sequential, step: float) -> nn.Sequential:
+    with torch.no_grad():
+        for layer in net:
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                for value in layer.parameters():
+                    value.copy_((value * 4 / step).round() * step)
+    return net
+
+
+def by_hand(net: nn.Sequential, x: np.ndarray, batch: int) -> np.ndarray:
+    """Output spikes (n, outputs) of Sinabs' layers as their documentation runs them."""
+    out = []
+    for start in range(0, len(x), batch):
+        for layer in net:
+            if hasattr(layer, "reset_states"):
+                layer.reset_states()
+        part = torch.from_numpy(x[start : start + batch].astype(np.float32))
+        with torch.no_grad():
+            spikes = net(part.flatten(0, 1))
+        out.append(spikes.unflatten(0, (len(part), STEPS)).sum(dim=1).numpy())
+    return np.concatenate(out).astype(np.int64)
+
+
+def windows(n: int, share: float = 0.05, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).poisson(share, (n, STEPS, 1, CELLS, CELLS)).astype(np.uint8)
+
+
+def saved(
+    folder: Path, net: nn.Sequential, layers: list[dict[str, Any]] | None = None, **more: Any
+) -> Path:
+    """Weights and description of a network, in files."""
+    torch.save(net.state_dict(), folder / "lab.pt")
+    data = {"model": 1, "weights": "lab.pt", "windows": WINDOWS, "layers": layers or OURS, **more}
+    path = folder / "lab.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+@pytest.mark.parametrize("batch", [1, 7, 64])
+def test_weights_of_tenths_give_sinabs_own_counts(tmp_path: Path, batch: int) -> None:
+    net, x = papers(0.1), windows(150, 0.2)
+    found = load_external(saved(tmp_path, net))
+    assert not found.on_grid()
+    counts = found.sinabs().counts(x)
+    np.testing.assert_array_equal(counts, by_hand(net, x, batch))
+    assert len(np.unique(counts, axis=0)) > 10
+    # a file written after a run holds potentials of its batch: they are left out
+    np.testing.assert_array_equal(load_external(saved(tmp_path, net)).sinabs().counts(x), counts)
+
+
+@pytest.mark.parametrize("outputs", [3, 12])
+def test_on_the_grid_the_kernels_count_as_sinabs_does(tmp_path: Path, outputs: int) -> None:
+    net, x = papers(2.0**-6, outputs), windows(100)
+    names = ["no_slip", "incipient", "gross"] * (outputs // 3)
+    found = load_external(saved(tmp_path, net, outputs=names))
+    assert found.on_grid()
+    assert found.outputs_per_class == outputs / 3
+    expected = by_hand(net, x, 50).reshape(100, -1, 3).sum(axis=1)
+    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
+    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+    np.testing.assert_array_equal(spike_counts(found.fast(), x), expected)
+
+
+def test_other_thresholds_are_kept(tmp_path: Path) -> None:
+    net, x = papers(2.0**-6, threshold=1.5), windows(60)
+    layers = [dict(each) for each in OURS]
+    layers[3]["threshold"] = 1.5
+    found = load_external(saved(tmp_path, net, layers))
+    expected = by_hand(net, x, 60)
+    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
+    np.testing.assert_array_equal(Engine(found.fast(), CELLS).counts(x), expected)
+
+
+def test_pools_leaks_and_sinabs_default_neurons(tmp_path: Path) -> None:
+    """Five outputs: two of no slip, two of incipient, one of gross."""
+    torch.manual_seed(1)
+    multi = {"spike_fn": MultiSpike, "reset_fn": MembraneSubtract()}
+    net = nn.Sequential(
+        nn.Conv2d(1, 4, 3, padding=1), IAFSqueeze(num_timesteps=STEPS, min_v_mem=-1.0, **multi),
+        SumPool2d(2), nn.Conv2d(4, 4, (3, 3)),
+        LIFSqueeze(tau_mem=15.0, num_timesteps=STEPS, norm_input=False, **multi),
+        nn.AvgPool2d(2), nn.MaxPool2d(2, 1), nn.Flatten(), nn.Linear(4, 5),
+        IAFSqueeze(num_timesteps=STEPS, **multi),
+    )  # fmt: skip
+    rounded(net, 0.1)
+    both = {"spikes": "multi", "reset": "subtract"}
+    layers = [
+        {"kind": "conv", "name": "0", "padding": 1},
+        {"kind": "iaf", "name": "1", **both},
+        {"kind": "pool", "how": "sum", "size": 2},
+        {"kind": "conv", "name": "3"},
+        {"kind": "lif", "name": "4", "norm_input": False, **both},
+        {"kind": "pool", "how": "average", "size": 2},
+        {"kind": "pool", "how": "max", "size": 2, "stride": 1},
+        {"kind": "flatten"},
+        {"kind": "linear", "name": "8"},
+        {"kind": "iaf", "name": "9", **both},
+    ]
+    names = ["incipient", "no_slip", "gross", "no_slip", "incipient"]
+    found, x = load_external(saved(tmp_path, net, layers, outputs=names)), windows(40, 0.03)
+    counts = by_hand(net, x, 40)
+    expected = np.stack([counts[:, 1] + counts[:, 3], counts[:, 0] + counts[:, 4], counts[:, 2]], 1)
+    assert len(np.unique(expected, axis=0)) > 10
+    np.testing.assert_array_equal(found.sinabs().counts(x), expected)
+    assert not found.on_grid()
+    with pytest.raises(ValueError, match="not two convolutions"):
+        found.fast()
+
+
+def _at(place: int, **changes: Any) -> Callable[[list[dict[str, Any]]], None]:
+    return lambda layers: layers[place].update(changes)
+
+
+WRONG: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] = {
+    "no such weights": (
+        _at(0, name="first"),
+        r"layers\[0\]\.name = first: must name weights of 4 dimensions: 0, 2",
+    ),
+    "a matrix for a convolution": (
+        _at(2, name="5"),
+        r"layers\[2\]\.name = 5: must name weights of 4 dimensions: 2",
+    ),
+    "stride forgotten": (
+        _at(2, stride=1),
+        r"layers\[5\]\.name = 5: 5\.weight takes 216 inputs, and here are \[864\]",
+    ),
+    "flatten forgotten": (lambda x: x.pop(4), r"layers\[4\]\.name = 5: .*flatten before it"),
+    "threshold missing": (
+        _at(3, threshold=None),
+        r"layers\[3\]\.threshold: is missing, and the state_dict has none",
+    ),
+    "another threshold": (
+        _at(1, threshold=2),
+        r"layers\[1\]\.threshold = 2.0: the state_dict has 1",
+    ),
+    "no time constant": (_at(1, kind="lif"), r"layers\[1\]\.tau_mem: is missing"),
+    "one too many": (_at(1, tau_mem=3), r"layers\[1\]\.tau_mem = 3.0: belongs to a lif"),
+    "unknown layer": (_at(1, kind="relu"), r"layers\[1\]\.kind = relu: must be one of"),
+    "spikes not said": (lambda x: x[1].pop("spikes"), r"layers\[1\]\.spikes: is missing"),
+    "a layer left out": (
+        lambda x: (x.pop(7), x.pop(7)),
+        r"layers = 7\.weight: is a tensor of the weights that no layer here takes",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_faults_are_named(name: str, tmp_path: Path) -> None:
+    change, message = WRONG[name]
+    layers = [dict(each) for each in OURS]
+    net = papers(0.1)
+    change(layers)
+    path = saved(tmp_path, net, layers)
+    if name == "threshold missing":
+        state = {k: v for k, v in net.state_dict().items() if not k.startswith("3.")}
+        torch.save(state, tmp_path / "lab.pt")
+    with pytest.raises(InputError, match=rf"lab\.yaml: {message}"):
+        load_external(path)
+
+
+def test_wrong_outputs_and_files(tmp_path: Path) -> None:
+    net = papers(0.1)
+    layers = [dict(each) for each in OURS]
+    path = saved(tmp_path, net, layers, outputs=["no_slip", "gross"])
+    with pytest.raises(InputError, match=r"outputs .*each class a neuron; none is incipient"):
+        load_external(path)
+    path = saved(tmp_path, net, layers, outputs=["no_slip", "incipient", "gross", "gross"])
+    with pytest.raises(InputError, match=r"outputs = 4: the last layer gives \[3\]"):
+        load_external(path)
+    path = saved(tmp_path, net, layers)
+    torch.save(net, tmp_path / "lab.pt")  # a whole pickled network, which nobody runs
+    with pytest.raises(InputError, match=r"lab\.pt: must be a state_dict"):
+        load_external(path)
+    (tmp_path / "lab.pt").unlink()
+    with pytest.raises(InputError, match=r"lab\.yaml: weights = lab\.pt: cannot be read"):
+        load_external(path)
