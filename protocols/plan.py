@@ -151,7 +151,11 @@ class Plan:
         """What is allowed and probably not meant."""
         windows, samples = self.protocol.analysis.windows, self.protocol.analysis.samples
         need = windows.length_ms * samples.per_class / 1000
-        found = []
+        preset = self.protocol.analysis.preset is not None
+        found = [
+            f"analysis.{each.key}: {here} goes before the {each.value} of the preset"
+            for each, here in (self.protocol.analysis.overrides if preset else ())
+        ]
         program = self.program(self.trials[0])
         hold = sum(
             step.seconds for step in program.steps if isinstance(step, Dwell) and step.recorded

@@ -56,7 +56,7 @@ PAPER = (
     Value("training.mirror", False, "published", "windows mirrored in training"),
     Value("detection.smoothing", 4, "published", "windows of the sliding mean"),
     Value("detection.margin", 2.0, "published", "lead of a winner (spikes)"),
-    Value("detection.choose", "protocol", "assumed", "smoothing and margin chosen by"),
+    Value("detection.choose", "protocol", "published", "source of sliding mean and lead"),
     Value("detection.stride_ms", None, "published", "stride of the windows (ms)"),
 )
 """Mirroring and overlapping windows would have been said; layers' sizes, loss and rate are not."""

@@ -15,30 +15,76 @@ from analysis.pictures.report import Section, Table, number, percent
 
 Json = dict[str, Any]
 
-_COLUMNS = ("figure", "paper", "here", "95 % over trials", "n")
+_COLUMNS = ("figure", "paper")
+_OF_ONE = ("95 % over trials", "n")
+_DIFFERENCES = ("setting", "paper", "here", "the paper's value is")
+_SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
+"""A difference that no setting makes."""
 
 
 def section(summary: Json) -> Section:
     """Every published figure beside this one's."""
     kind = "simulated" if summary["simulated"] else "measured on this rig"
-    words = "here" if not summary["simulated"] else "here (simulated)"
-    columns = [*_COLUMNS[:2], words, *_COLUMNS[3:]]
+    simulated = " (simulated)" if summary["simulated"] else ""
+    networks = {f"here{simulated}": summary}
+    networks |= {f"{_title(found)}{simulated}": found for found in summary["networks"].values()}
+    columns = [*_COLUMNS, *(name for title in networks for name in (title, *_OF_ONE))]
+    each = [[*_windows(found), *_times(found)] for found in networks.values()]
+    rows = [
+        [*same[0][: len(_COLUMNS)], *(cell for row in same for cell in row[len(_COLUMNS) :])]
+        for same in zip(*each, strict=True)
+    ]
+    said = summary["paper"]
+    differences = [
+        [row["setting"], row["paper"], row["here"], row["source"]] for row in said["differences"]
+    ]
     return Section(
         "Beside the paper",
         [
             "The paper's figures were measured by its authors on their own robot and skin; those "
             f"of this report are {kind}. They are different things of the same name: a figure that "
             "agrees proves nothing about the other, and where they differ either may be right.",
+            f"The paper does not say, and here is assumed: {'; '.join(said['assumed'])}.",
+            *(_how(found) for found in summary["networks"].values()),
         ],
         (),
         [
             Table(
-                columns, [*_windows(summary), *_times(summary)],
+                columns, rows,
                 "Intervals draw whole trials again, windows of a trial together. Accuracy of raw "
                 "spike counts, ties shared.",
-            )
+            ),
+            Table(
+                _DIFFERENCES, [*differences, _SCANNED],
+                "In which settings the network here"
+                + (f" (preset {said['preset']})" if said["preset"] else "")
+                + " differs from the paper's.",
+            ),
         ],
     )  # fmt: skip
+
+
+def _title(network: Json) -> str:
+    """A column's heading."""
+    return f"{network['preset']} preset" if network["preset"] else str(network["title"])
+
+
+def _how(network: Json) -> str:
+    """How a network beside the store's own was made and counted."""
+    margin = ", ".join(sorted({f"{rule['margin']:g}" for rule in network["detection"].values()}))
+    rule = f"judged on the same windows and labels, by a margin of {margin} spikes"
+    if network["preset"]:
+        return (
+            f"“{_title(network)}” is the paper's network, trained on the same windows as the one "
+            f"here (seed {network['seed']}), with the paper's values of the settings below; {rule}."
+        )
+    counted = "Sinabs" if network["engine"] == "sinabs" else "the event-driven kernels"
+    if not network["exact"] and network["engine"] != "sinabs":
+        counted += (
+            ", whose counts may differ from Sinabs' in a few windows because its weights are off "
+            "the grid"
+        )
+    return f"“{_title(network)}” is a model of a file, counted by {counted}; {rule}."
 
 
 def _windows(summary: Json) -> list[list[str]]:
@@ -57,6 +103,15 @@ def _windows(summary: Json) -> list[list[str]]:
         if row is not None:
             count = f"{row['n']} windows, {row['trials']} trials"
         rows.append([title, PAPER[name].text, percent(value), span, count])
+    count, interval = rows[0][-1], kinematic["interval"]
+    sure = "–"
+    if interval["low"] is not None:
+        sure = f"{percent(interval['low'])} to {percent(interval['high'])}"
+    right = kinematic["accuracy"]
+    rows[1:1] = [
+        ["the same, a tie wrong", "–", percent(right["strict"]), sure, count],
+        ["the same, won by the margin", "–", percent(right["margin"]), "–", count],
+    ]
     rows.append(["most confused pair", PAPER["confused"].text, *_confused(kinematic["confusion"])])
     return rows
 

@@ -15,7 +15,7 @@ from prefect import flow
 from analysis.nets import model_file
 from analysis.pictures import report as page
 from flows.labelling import label_errors
-from flows.learning import evaluate
+from flows.learning import evaluate, other_networks
 from flows.learning.train import wanted_models
 from flows.learning.window_baselines import fresh_keys
 from flows.reporting import report_against_page as against_page
@@ -32,7 +32,7 @@ from storage.files import make_folder, read_json, write_json, write_text
 from storage.store import Store, safe_name
 
 STEP = "report"
-VERSION = 7
+VERSION = 8
 
 
 def report_folder(store: Store) -> Path:
@@ -46,7 +46,7 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
     Raises:
         StoreError: there is no evaluation of this version yet.
     """
-    evaluated, _ = evaluate.evaluation_of(store)
+    evaluated, evaluation = evaluate.evaluation_of(store)
     collected = [
         [
             item.name,
@@ -60,7 +60,20 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
     # commands in the page name the store's folder
     where = str(store.folder.resolve())
     checked = Derived.of(store, label_errors.CHECK).key(label_errors.CHECK)
-    inputs = [evaluated, collected, clocks, fresh_keys(store), extras(store), checked, where]
+    reviewed = evaluation.get("reviewed") is not None
+    others = sorted(
+        found["key"] for found in other_networks.kept(store, campaigns, reviewed).values()
+    )
+    inputs = [
+        evaluated,
+        collected,
+        clocks,
+        others,
+        fresh_keys(store),
+        extras(store),
+        checked,
+        where,
+    ]
     return make_key(STEP, VERSION, inputs, None)
 
 

@@ -7,6 +7,8 @@ from importlib.metadata import version
 from typing import Any
 
 from flows.labelling.label_errors import read_check
+from flows.learning import other_networks
+from flows.learning.train import training_settings
 from flows.learning.window_baselines import EVALUATION, beside
 from flows.learning.window_scores import window_intervals
 from flows.planning.estimate import plan_bytes
@@ -14,6 +16,8 @@ from flows.reporting.campaign_section import reference_rows, wear
 from flows.reporting.report_trials import accounted, intervals, told
 from flows.running import timing
 from flows.running.campaigns import Collected, training_campaigns
+from protocols.phases import Press
+from protocols.presets import PAPER, at
 from rigs.rig_file import load_rig_file
 from storage.derived import Derived
 from storage.store import Store
@@ -51,6 +55,7 @@ def make_summary(
 ) -> dict[str, Any]:
     """Everything `summary.json` says; only `timing_s` differs between equal runs."""
     windows, experiments = evaluation["windows"], evaluation["experiments"]
+    reviewed = evaluation.get("reviewed") is not None
     kinematic = {
         "accuracy": windows["accuracy"],
         "confusion": windows["confusion"],
@@ -71,6 +76,11 @@ def make_summary(
             **experiments["disturbance"],
             **_judged(campaigns, evaluation, "disturbance"),
         },
+        "networks": {
+            name: _network(campaigns, found)
+            for name, found in other_networks.kept(store, campaigns, reviewed).items()
+        },
+        "paper": _paper(campaigns),
         "trials": [told(row) for row in evaluation["trials"]],
         "references": _references(store, campaigns),
         "labels": {
@@ -112,6 +122,53 @@ def _judged(
         "accounted": accounted(campaigns, rows, experiment),
         "intervals": intervals([told(row) for row in rows if row["experiment"] == experiment]),
     }
+
+
+def _network(campaigns: list[Collected], found: dict[str, Any]) -> dict[str, Any]:
+    """Another network's figures, under the keys that the store's own have."""
+    kinematic = {**found["windows"], **found["experiments"]["kinematic"]}
+    experiments = {**found["experiments"], "kinematic": kinematic}
+    return {
+        **{key: found[key] for key in ("title", "preset", "seed", "engine", "exact", "detection")},
+        **{
+            name: {**figures, **_judged(campaigns, found, name)}
+            for name, figures in experiments.items()
+        },
+    }
+
+
+def _paper(campaigns: list[Collected]) -> dict[str, Any]:
+    """In which settings this differs from the paper, and which of them it does not say."""
+    settings = training_settings(campaigns)
+    depths = {
+        f"{phase.depth} mm"
+        for item in campaigns
+        if item.experiment != "kinematic"
+        for phase in item.plan.protocol.collection.motion
+        if isinstance(phase, Press)
+    }
+    rows = [
+        {"setting": each.words, "key": each.key, "paper": _said(each.value), "here": _said(here),
+         "source": each.source}
+        for each, here in settings.overrides
+    ]  # fmt: skip
+    assumed = [f"{each.words} {_said(at(settings, each.key))}" for each in PAPER
+               if each.source == "assumed"]  # fmt: skip
+    if depths:
+        assumed.append(f"press depth of gravity and disturbance trials {', '.join(sorted(depths))}")
+    return {"preset": settings.preset, "differences": rows, "assumed": assumed}
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple):
+        return ", ".join(map(_said, value))
+    return "the window's length" if value is None else f"{value:g}" if _real(value) else str(value)
+
+
+def _real(value: Any) -> bool:
+    return isinstance(value, int | float)
 
 
 def _references(store: Store, campaigns: list[Collected]) -> dict[str, Any]:

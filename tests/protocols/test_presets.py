@@ -26,6 +26,7 @@ PUBLISHED: dict[str, Any] = {
     "training.mirror": False,
     "detection.smoothing": 4,
     "detection.margin": 2,
+    "detection.choose": "protocol",
     "detection.stride_ms": None,
 }
 """Lu et al.: preprocessing, data set, network, detection."""
@@ -73,6 +74,13 @@ def test_keys_beside_the_preset_go_before_it_and_are_named() -> None:
         ("network.hidden", 32, 64),
         ("detection.margin", 2.0, 3.0),
     ]
+
+
+def test_a_plan_warns_of_what_goes_before_the_preset(tmp_path: Path) -> None:
+    warned = load_plan(file("pilot", tmp_path, preset="paper", detection={"margin": 3})).warnings()
+    assert warned == ["analysis.detection.margin: 3.0 goes before the 2.0 of the preset"]
+    assert load_plan(file("pilot", tmp_path, preset="paper")).warnings() == []
+    assert load_plan(file("pilot", tmp_path)).warnings() == []
 
 
 def test_an_unknown_preset_is_refused(tmp_path: Path) -> None:

@@ -14,10 +14,13 @@ from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, Singl
 from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
 from torch import nn
 
-from analysis.nets.external_model import load_external
+from analysis.nets.external_model import Description, load_external
 from analysis.nets.network import spike_counts
 from analysis.nets.spiking import Engine
 from protocols import InputError
+from protocols.settings import Windows
+from protocols.yaml_file import parse_yaml, validate
+from tests.conftest import ROOT
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,24 +39,23 @@ OURS: list[dict[str, Any]] = [
 ]
 
 
-def iaf(**changes: Any) -> IAFSqueeze:
-    """The paper's neuron, in plain Sinabs."""
-    return IAFSqueeze(
-        num_timesteps=STEPS, spike_fn=SingleSpike, reset_fn=MembraneReset(), **changes
-    )
-
-
-def papers(step: float, outputs: int = 3, threshold: float = 1.0) -> nn.Sequential:
+def papers(
+    step: float, outputs: int = 3, threshold: float = 1.0, cells: int = CELLS, steps: int = STEPS
+) -> nn.Sequential:
     """The paper's layers in plain Sinabs, weights whole multiples of `step`."""
     torch.manual_seed(0)
 
     def neurons() -> IAFSqueeze:
-        return iaf(spike_threshold=torch.tensor(threshold))
+        return IAFSqueeze(
+            num_timesteps=steps, spike_fn=SingleSpike, reset_fn=MembraneReset(),
+            spike_threshold=torch.tensor(threshold),
+        )  # fmt: skip
 
     net = nn.Sequential(
         nn.Conv2d(1, 4, 5, padding=2, bias=False), neurons(),
         nn.Conv2d(4, 6, 3, stride=2, padding=1, bias=False), neurons(),
-        nn.Flatten(), nn.Linear(216, 16), neurons(), nn.Linear(16, outputs), neurons(),
+        nn.Flatten(), nn.Linear(6 * (cells // 2) ** 2, 16), neurons(),
+        nn.Linear(16, outputs), neurons(),
     )  # fmt: skip
     return rounded(net, step)
 
@@ -77,7 +79,7 @@ def by_hand(net: nn.Sequential, x: np.ndarray, batch: int) -> np.ndarray:
         part = torch.from_numpy(x[start : start + batch].astype(np.float32))
         with torch.no_grad():
             spikes = net(part.flatten(0, 1))
-        out.append(spikes.unflatten(0, (len(part), STEPS)).sum(dim=1).numpy())
+        out.append(spikes.unflatten(0, (len(part), -1)).sum(dim=1).numpy())
     return np.concatenate(out).astype(np.int64)
 
 
@@ -234,3 +236,11 @@ def test_wrong_outputs_and_files(tmp_path: Path) -> None:
     (tmp_path / "lab.pt").unlink()
     with pytest.raises(InputError, match=r"lab\.yaml: weights = lab\.pt: cannot be read"):
         load_external(path)
+
+
+def test_the_documented_description_is_one() -> None:
+    text = (ROOT / "docs" / "models.md").read_text()
+    block = text.split('```yaml title="lab.yaml"\n')[1].split("```")[0]
+    found = validate(Description, parse_yaml(block, "lab.yaml"), "lab.yaml")
+    assert [each.kind for each in found.layers] == [each["kind"] for each in OURS]
+    assert found.windows == Windows()

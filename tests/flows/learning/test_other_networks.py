@@ -1,0 +1,134 @@
+"""Other networks on a store: the preset that `also` names, and models of files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from analysis.nets import metrics, model_file
+from analysis.nets.dataset import trial_windows
+from analysis.nets.network import spike_counts
+from analysis.nets.training import restore
+from flows.labelling.reviewed import Labels
+from flows.learning.other_networks import STEP, judge_model
+from flows.learning.samples import load_samples
+from flows.planning.orders import Order
+from flows.reporting.report import read_summary, report
+from flows.running.campaigns import collected
+from flows.study import Outcome
+from protocols import InputError
+from protocols.settings import Windows
+from storage.derived import Derived
+from storage.store import Store
+from tests.analysis.nets.test_external_model import OURS, by_hand, papers
+from tests.command_line import here
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study."""
+    folder = tmp_path_factory.mktemp("others") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    return Store.open(folder)
+
+
+def lab(folder: Path, step: float = 0.1, **changes: Any) -> Path:
+    """A lab's network in plain Sinabs, for windows of the store: its two files."""
+    net = papers(step, cells=20, steps=30)
+    torch.save(net.state_dict(), folder / "lab.pt")
+    data = {"model": 1, "weights": "lab.pt", "layers": OURS, **changes}
+    path = folder / "lab.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
+    campaigns = collected(store)
+    found = Derived.of(store, STEP).read("preset-paper")
+    rules = found["detection"]
+    assert {(rule["smoothing"], rule["margin"]) for rule in rules.values()} == {(4, 2.0)}
+    assert rules.keys() == {"tiny", "tiny_gravity"}
+    fitted = model_file.load(store.folder / "models" / "paper-seed0.pt")
+    assert (fitted.network.outputs_per_class, fitted.network.biases) == (1, False)
+    test = load_samples(Labels(store), campaigns, "test")
+    counts = spike_counts(restore(fitted), test.x)
+    expected = metrics.score(counts, test.y, 2.0).as_dict()
+    assert {name: found["windows"][name] for name in expected} == json.loads(json.dumps(expected))
+    assert len(found["trials"]) == 4
+    assert (
+        read_summary(store)["networks"]["preset-paper"]["kinematic"]["accuracy"]
+        == (expected["accuracy"])
+    )
+
+
+def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
+    store: Store, tmp_path: Path
+) -> None:
+    path, campaigns = lab(tmp_path), collected(store)
+    done = here("evaluate", store.folder, "--model", tmp_path / "lab.pt", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert (said["engine"], said["same_as_sinabs"], said["margin"]["tiny"]) == ("sinabs", True, 2.0)
+    net = papers(0.1, cells=20, steps=30)
+    test = load_samples(Labels(store), campaigns, "test")
+    expected = by_hand(net, test.x, 16)
+    assert said["accuracy"] == vars(metrics.accuracy(expected, test.y, 2.0))
+    assert len(np.unique(expected, axis=0)) > 3
+    for item in campaigns:
+        kept = Derived.of(store, "counts-model-lab", item.name)
+        for _, recording in item.of_split("test"):
+            x, end_ns = trial_windows(recording, Windows())
+            arrays = kept.arrays(recording.folder.name)
+            np.testing.assert_array_equal(arrays["counts"], by_hand(net, x.dense(), 50))
+            np.testing.assert_array_equal(arrays["end_ns"], end_ns)
+    # again there is nothing to do, and the report has a column more
+    assert judge_model(store, campaigns, path)["done"] == 0
+    assert report(store, campaigns)["done"] == 1
+    page = (store.folder / "report" / "index.html").read_text()
+    assert "lab.pt (simulated)" in page
+    assert "paper preset (simulated)" in page
+
+
+def test_the_kernels_say_where_they_may_differ(store: Store, tmp_path: Path) -> None:
+    lab(tmp_path)
+    done = here("evaluate", store.folder, "--model", tmp_path / "lab.yaml", "--engine", "fast")
+    assert done.returncode == 0, done.stderr
+    assert "may differ from Sinabs'" in done.stderr
+    on_grid = judge_model(store, collected(store), lab(tmp_path, 2.0**-6))
+    assert (on_grid["engine"], on_grid["same_as_sinabs"]) == ("fast", True)
+    slow = judge_model(store, collected(store), lab(tmp_path, 2.0**-6), "sinabs")
+    assert slow["accuracy"] == on_grid["accuracy"]
+    assert slow["latency_ms"] == on_grid["latency_ms"]
+
+
+def test_a_model_of_this_program_is_judged_as_in_its_store(store: Store) -> None:
+    own = Derived.of(store, "evaluation").read("evaluation")
+    found = judge_model(store, collected(store), store.folder / "models" / "seed0.pt")
+    assert found["accuracy"] == own["windows"]["accuracy"]
+    assert found["interval"] == own["windows"]["interval"]
+    assert Derived.of(store, STEP).read("model-seed0")["trials"] == own["trials"]
+
+
+def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
+    campaigns = collected(store)
+    with pytest.raises(InputError, match=r"lab\.pt: cannot be read"):
+        judge_model(store, campaigns, tmp_path / "lab.pt")
+    path = lab(tmp_path, windows={"length_ms": 30, "pool_px": 40})
+    with pytest.raises(InputError, match=r"lab\.yaml: layers\[5\]\.name = 5"):
+        judge_model(store, campaigns, path)
+    path.unlink()
+    with pytest.raises(InputError, match=r"needs a description beside it, such as lab\.yaml"):
+        judge_model(store, campaigns, tmp_path / "lab.pt")
+    layers = [*OURS[:3], {**OURS[3], "lowest": -1.0}, *OURS[4:]]
+    with pytest.raises(InputError, match=r"--engine = fast: .*no lowest potential; must be sinabs"):
+        judge_model(store, campaigns, lab(tmp_path, layers=layers), "fast")
+    done = here("evaluate", store.folder, "--engine", "fast")
+    assert done.returncode == 2
+    assert "--engine = fast: belongs to --model" in done.stderr
