@@ -47,9 +47,10 @@ class History:
         self._length += n
         return self._rows[self._length - n : self._length]
 
-    def shrink(self, n: int) -> None:
-        """Take back the last `n` rows of room."""
+    def shrink(self, n: int, end_ns: int) -> None:
+        """Take back the last `n` rows of room; the row before them ends at `end_ns`."""
         self._length -= n
+        self._t_ns[self._length - 1] = end_ns
 
     def between(self, first_ns: int, last_ns: int) -> tuple[I64, F64]:
         """Times and rows from the last row at or before `first_ns` to the first at or after

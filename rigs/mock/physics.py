@@ -1,7 +1,8 @@
 """The skin on the plate through one trial: springs, plate, and what is kept of them row by row.
 
 Rows stand on a global grid: every `step_ms` while the plate is held, every millisecond while it
-may fall, and nothing is computed beyond the present. Which rows there are depends on what the
+may fall, and nothing is computed beyond the present; one more stands where the plate meets its
+stop. Which rows there are depends on what the
 plate was told and when, never on who looked how often.
 """
 
@@ -27,7 +28,7 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 
 FINE_NS = 1_000_000
-"""Step while the plate may fall; the scheme is of first order there."""
+"""Step while the plate may fall."""
 KEPT_NS = 300_000_000_000
 """History kept at least, twice as much at most; a trial takes a few tens of seconds."""
 _CHUNK = 4096
@@ -123,17 +124,16 @@ class Physics:
             self._plate_motion[:] = height[-1], 0.0
             return
         plate, mass_kg = self._settings.scene.plate, self._release[2]
-        done = advance_free(
+        done, landed = advance_free(
             springs.table, springs.friction, springs.law, state, t_ns, sensor,
-            self._plate_motion, mass_kg, self._weight(t_ns[1:]), plate.stiction_n,
+            self._plate_motion, mass_kg, self._weight(t_ns), plate.stiction_n,
             -plate.stroke_mm, track, load,
         )  # fmt: skip
-        if done < count or self._plate_motion[0] <= -plate.stroke_mm:
+        if landed:
             self._hold_plate(-plate.stroke_mm)
-        if done < count:
-            self.track.shrink(count - done)
-            if self.loads is not None:
-                self.loads.shrink(count - done)
+            for rows in (self.track, self.loads):
+                if rows is not None:
+                    rows.shrink(count - done, int(t_ns[done]))
 
     # -- the plate -------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from rigs.scene.springs import (
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def move_tips(lanes, n, field, law, sensor, plate_y, start_s, h, decay, gain):  # type: ignore[no-untyped-def]
+def move_tips(lanes, n, field, law, sensor, plate_y, swerve, start_s, h, decay, gain):  # type: ignore[no-untyped-def]
     """Advance every tip by one step in which sensor and plate move linearly.
 
     Args:
@@ -38,7 +38,10 @@ def move_tips(lanes, n, field, law, sensor, plate_y, start_s, h, decay, gain):  
     """
     for k in range(lanes.shape[0]):
         first = k * LANES
-        respond(lanes[k], field, law, first, min(n - first, LANES), sensor, plate_y, h, decay, gain)
+        respond(
+            lanes[k], field, law, first, min(n - first, LANES), sensor, plate_y, swerve, h, decay,
+            gain,
+        )  # fmt: skip
         settle(lanes[k], law, start_s, h, decay)
 
 
@@ -76,6 +79,8 @@ def advance(table, field, law, state, t_ns, sensor, plate_y, track, load):  # ty
             step_ns = t_ns[k + 1] - t_ns[k]
             h = step_ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
-        move_tips(lanes, n, field, law, sensor[k], plate_y[k + 1], t_ns[k] * 1e-9, h, decay, gain)
+        move_tips(
+            lanes, n, field, law, sensor[k], plate_y[k + 1], 0.0, t_ns[k] * 1e-9, h, decay, gain
+        )
         record(lanes, n, plate_y[k + 1], track[k], load[k])
     gather(lanes, state)

@@ -15,6 +15,7 @@ from numba import njit
 from rigs.scene.column import ITERATIONS, bend_step, column, first_bend
 from rigs.scene.friction import grip_between, knot_at
 from rigs.scene.rows import (
+    AFTER,
     ALONE,
     BEFORE,
     C0,
@@ -33,7 +34,6 @@ from rigs.scene.rows import (
     HIGH,
     KNOT,
     LANES,
-    LIMIT,
     LOW,
     PRESSED,
     SEEKS,
@@ -81,18 +81,22 @@ from rigs.scene.springs import (
     STUCK,
 )
 from rigs.scene.tip import ROUNDING, tip_step
+from rigs.scene.turning import raised, slides_on
+
+_STEADY = 1.25
+"""Mean speed of a step over that of the next one up to which a parabola through them tells more."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  # type: ignore[no-untyped-def]
-    """Find what becomes of a block's tips if sensor and plate move linearly; the state stays.
+def respond(flat, field, law, first, count, sensor, plate_y, swerve, h, decay, gain):  # type: ignore[no-untyped-def]
+    """Find what becomes of a block's tips in a step; the state stays.
 
     Args:
         flat: a block (`rigs.scene.rows`); END_MODE to GAIN are written.
         first, count: the block's first tip, and how many it has.
         sensor: x, y, depth (mm) at the end of the step, and the two slopes of depth, (5,).
         plate_y: height of the plate at the end of the step, mm.
-        h, decay, gain: as in `rigs.scene.tip.tip_step`.
+        swerve, h, decay, gain: as in `rigs.scene.tip.tip_step`.
     """
     w = block_of(flat)
     if _approach(w, law, sensor[0], sensor[1], sensor[2], sensor[3], sensor[4], plate_y, decay,
@@ -103,13 +107,13 @@ def respond(flat, field, law, first, count, sensor, plate_y, h, decay, gain):  #
     for _ in range(ITERATIONS):
         if _bend(w) == 0:
             break
-    slide, alone = _decide(w, law, decay, gain)
+    slide, alone = _decide(w, law, decay, gain, swerve)
     if slide > 0:
-        alone += slide_on(w, field, law, first, count, h, decay)
+        alone += slide_on(w, field, law, first, count, h, swerve, decay, gain)
     if alone > 0:
         for j in range(count):
             if w[END_MODE, j] == ALONE:
-                tip_step(w, field, law, first + j, j, h, decay, gain)
+                tip_step(w, field, law, first + j, j, h, swerve, decay, gain)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -162,7 +166,7 @@ def _bend(w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
+def _decide(w, law, decay, gain, swerve):  # type: ignore[no-untyped-def]
     """The forces if all tips stick, and which do; how many slide on, and go on alone."""
     slide, alone = 0, 0
     static = 1.0 + law.static_excess
@@ -174,23 +178,26 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
         old_x, old_y = w[BASE_X, j] - place_x, w[BASE_Y, j] - place_y
         branch_x, branch_y = w[BRANCH_X, j] * decay, w[BRANCH_Y, j] * decay
         soft, bent, stretch = w[SOFT, j], w[END_BENT, j], w[STRETCH, j]
+        damp = w[TABLE + ACROSS, j] * law.damping_s
         force, normal, _, _ = column(
             bent, w[TABLE + BENDING, j], w[TABLE + SHORTER, j], w[PRESSED, j], w[TABLE + ALONG, j]
         )
         secant = force / stretch if stretch > 0.0 else 0.0
         trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
-        trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
+        trial_y = secant * new_y + branch_y + soft * (new_y - old_y) + damp * swerve
         grip, _ = grip_between(w[PATH, j], w[KNOT, j], w[C0, j], w[C1, j], w[C2, j], w[C3, j])
         from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
-        before = grip * w[NORMAL, j]
-        outwards = from_x * (trial_x - from_x) + from_y * (trial_y - from_y)
-        keeps_on = mode == SLIDING and outwards >= before * (grip * normal - before)
-        limit = grip * normal * (1.0 if keeps_on else static)
+        before, after = grip * w[NORMAL, j], grip * normal
+        keeps_on = mode == SLIDING and slides_on(
+            from_x, from_y, trial_x - from_x, trial_y - from_y, before, after, law.strengthening
+        )
+        limit = after * (1.0 if keeps_on else static)
         size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
         touches = mode != FREE and deep > 0.0 and w[PRESSED, j] > 0.0
         free = (mode != FREE and not touches) or deep <= 0.0
         sticks = touches and size <= limit * ROUNDING
-        slides = touches and keeps_on and not sticks
+        fresh = w[SLID_S, j] == 0.0 and law.strengthening > 0.0 and law.damping_s == 0.0
+        slides = touches and keeps_on and not sticks and not fresh
         end = SLIDING if slides else ALONE
         end = STUCK if sticks else end
         end = FREE if free else end
@@ -200,7 +207,7 @@ def _decide(w, law, decay, gain):  # type: ignore[no-untyped-def]
         w[END_FORCE_Y, j] = 0.0 if free else trial_y
         w[END_NORMAL, j], w[END_BENT, j] = 0.0 if free else normal, 0.0 if free else bent
         w[SLIP, j], w[SHARE, j], w[GAIN, j] = 0.0, -1.0, gain
-        w[LIMIT, j], w[BEFORE, j] = grip * normal, before
+        w[BEFORE, j], w[AFTER, j] = raised(from_x, from_y, before, after)
         w[SEEKS, j] = 1.0 if slides else 0.0
         slide += 1 if slides else 0
         alone += 1 if end == ALONE else 0
@@ -233,8 +240,9 @@ def settle(flat, law, start_s, h, decay):  # type: ignore[no-untyped-def]
         w[NORMAL, j], w[BENT, j] = w[END_NORMAL, j], w[END_BENT, j]
         slip, share = w[SLIP, j], w[SHARE, j]
         w[SLIPPED, j] = start_s + share * h if share >= 0.0 else w[SLIPPED, j]
-        slid_s = h * (1.0 - max(share, 0.0)) if slip > 0.0 else 0.0
-        even = slid_s > 0.0 and w[SLID_S, j] == slid_s
-        w[EARLIER, j] = w[SPEED, j] if even else -1.0
-        w[SLID_S, j], w[SPEED, j] = slid_s, slip / slid_s if slid_s > 0.0 else 0.0
+        speed, earlier = slip / h, w[SPEED, j]
+        # a tip that just let go, or slows down this fast, is not as it was a step ago
+        steady = slip > 0.0 and share < 0.0 and earlier <= _STEADY * speed
+        w[EARLIER, j] = earlier if steady and w[SLID_S, j] == h else -1.0
+        w[SLID_S, j], w[SPEED, j] = h if steady else 0.0, speed
         w[PATH, j] += slip

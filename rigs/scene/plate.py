@@ -1,9 +1,12 @@
 """A plate that falls on its slider while tips stick to it and let go.
 
-The plate's speed is the one unknown of an implicit time step (Moreau 1988; Jean 1999: velocities
-at the end of the step, forces by projection onto friction cones). Forces fall monotonically with
-the plate's speed, so one scalar equation with a bracket round its root decides the step, however
-many tips change between stick and slip in it. Regularised friction would let a held plate creep.
+The plate's speed at the end of a step is the one unknown (Moreau 1988; Jean 1999: velocities at
+the end, forces by projection onto friction cones). Height and momentum are those of the mean speed
+and the mean force of both ends, so that onsets are of second order in the step. A plate so light
+that its own swing is faster than the steps takes speed and force of the end alone: of first order,
+but without ringing. Forces fall monotonically with the plate's speed, so one scalar equation with a
+bracket round its root decides the step, however many tips change between stick and slip in it.
+Regularised friction would let a held plate creep.
 """
 
 from __future__ import annotations
@@ -15,18 +18,19 @@ from rigs.scene.column import relaxing
 from rigs.scene.contact import move_tips, record
 from rigs.scene.lanes import respond
 from rigs.scene.rows import END_FORCE_Y, LANES, block_of, gather, spread
+from rigs.scene.springs import ACROSS, FORCE_Y
 
 _ITERATIONS = 200
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pull(lanes, n, field, law, sensor, plate_y, h, decay, gain):  # type: ignore[no-untyped-def]
+def _pull(lanes, n, field, law, sensor, plate_y, swerve, h, decay, gain):  # type: ignore[no-untyped-def]
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N."""
     total = 0.0
     for k in range(lanes.shape[0]):
         first = k * LANES
         count = min(n - first, LANES)
-        respond(lanes[k], field, law, first, count, sensor, plate_y, h, decay, gain)
+        respond(lanes[k], field, law, first, count, sensor, plate_y, swerve, h, decay, gain)
         w = block_of(lanes[k])
         for j in range(count):
             total += w[END_FORCE_Y, j]
@@ -34,23 +38,37 @@ def _pull(lanes, n, field, law, sensor, plate_y, h, decay, gain):  # type: ignor
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(lanes, n, field, law, sensor, motion, h, decay, gain, mass, weight, stiction):  # type: ignore[no-untyped-def]
-    """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N."""
+def _solve(  # type: ignore[no-untyped-def]
+    lanes, n, field, law, sensor, motion, h, decay, gain, mass, weight, stiction, new, pulls
+):
+    """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N.
+
+    Args:
+        weight: mean over the step.
+        new: share of the end's speed and force in their means.
+        pulls: upward force of the tips when the step begins.
+    """
     inertia = mass * 1e-3 / h  # N per mm/s
-    plate_y, speed = motion[0], motion[1]
-    rest = _pull(lanes, n, field, law, sensor, plate_y, h, decay, gain)
-    push = rest - weight + inertia * speed
+    plate_y, speed = motion[0] + (1.0 - new) * motion[1] * h, motion[1]
+    weight -= (1.0 - new) * pulls
+    rest = _pull(
+        lanes, n, field, law, sensor, plate_y, (1.0 - new) * speed, h, decay, gain
+    )  # fmt: skip
+    push = new * rest - weight + inertia * speed
     if abs(push) <= stiction:
         return 0.0
     drag = stiction if push > 0.0 else -stiction
-    # f(v) = inertia (v - speed) + weight + drag - pull(v h) grows with v; its root lies between 0
+    # f(v) = inertia (v - speed) + weight + drag - pull(v) grows with v; its root lies between 0
     # and the speed that the plate would have if the tips' force stayed as it is at rest
     zero, far = 0.0, (push - drag) / inertia
     f_zero, f_far = drag - push, np.nan
     v = speed if min(zero, far) < speed < max(zero, far) else far
     for _ in range(_ITERATIONS):
         f = inertia * (v - speed) + weight + drag
-        f -= _pull(lanes, n, field, law, sensor, plate_y + v * h, h, decay, gain)
+        f -= new * _pull(
+            lanes, n, field, law, sensor, plate_y + new * v * h, (1.0 - new) * (speed - v), h,
+            decay, gain,
+        )  # fmt: skip
         if f == 0.0:
             return v
         if (f > 0.0) == (f_zero > 0.0):
@@ -77,37 +95,70 @@ def advance_free(  # type: ignore[no-untyped-def]
     """Advance tips and plate together until the steps end or the plate meets its stop.
 
     Args:
-        t_ns: when the first step begins and when each ends, rising, int64, (m + 1,).
+        t_ns: when the first step begins and when each ends, rising, int64, (m + 1,); the time at
+            which the plate meets its stop is written in place of the end of that step.
         sensor: as in `rigs.scene.contact.advance`, (m, 5).
         motion: height (mm) and upward speed (mm/s) of the plate, (2,); written in place.
         mass: kg.
-        weight: what the catch leaves of the plate's weight at the end of each step, N, (m,).
+        weight: what the catch leaves of the plate's weight at those times, N, (m + 1,).
         stiction: dry friction of the slider, N.
         stop: height of the stop, mm.
         track, load: as in `rigs.scene.contact.advance`.
 
     Returns:
-        steps taken; less than m when the plate came to rest on its stop in the last of them.
+        steps taken, and whether the plate came to rest on its stop in the last of them.
     """
     n, lanes = state.shape[0], spread(table, field, state)
-    step_ns, h, decay, gain = np.int64(0), 0.0, 1.0, 1.0
+    step_ns, h, decay, gain, new, stiffness = np.int64(0), 0.0, 1.0, 1.0, 0.5, 0.0
+    for i in range(n):
+        stiffness += table[i, ACROSS]
     for k in range(sensor.shape[0]):
         if t_ns[k + 1] - t_ns[k] != step_ns:
             step_ns = t_ns[k + 1] - t_ns[k]
             h = step_ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
+            new = 0.5 if 1e3 * stiffness * h * h <= mass else 1.0
+        pulls = 0.0
+        for i in range(n):
+            pulls += block_of(lanes[i // LANES])[FORCE_Y, i % LANES]
+        before = motion[1]
         speed = _solve(
-            lanes, n, field, law, sensor[k], motion, h, decay, gain, mass, weight[k], stiction
-        )
-        height = motion[0] + speed * h
+            lanes, n, field, law, sensor[k], motion, h, decay, gain, mass,
+            new * weight[k + 1] + (1.0 - new) * weight[k], stiction, new, pulls,
+        )  # fmt: skip
+        mean = new * speed + (1.0 - new) * before
+        height = motion[0] + mean * h
         landed = height <= stop
         if landed:
-            height, speed = stop, 0.0
-        move_tips(lanes, n, field, law, sensor[k], height, t_ns[k] * 1e-9, h, decay, gain)
-        motion[0], motion[1] = height, speed
+            at = sensor[k].copy()
+            share = _lands_at(motion[0] - stop, mean * h, (mean - speed) * h)
+            ns = min(max(np.int64(np.ceil(share * step_ns)), np.int64(1)), step_ns)
+            share = ns / step_ns
+            if k > 0:
+                at[:] = sensor[k - 1] + share * (sensor[k] - sensor[k - 1])
+            t_ns[k + 1] = t_ns[k] + ns
+            h = ns * 1e-9
+            decay, gain = relaxing(h, law.relaxation_s)
+            height, swerve, motion[1] = stop, (mean - speed) * share, 0.0
+        else:
+            at, swerve, motion[1] = sensor[k], mean - speed, speed
+        move_tips(lanes, n, field, law, at, height, swerve, t_ns[k] * 1e-9, h, decay, gain)
+        motion[0] = height
         record(lanes, n, height, track[k], load[k])
         if landed:
             gather(lanes, state)
-            return k + 1
+            return k + 1, True
     gather(lanes, state)
-    return sensor.shape[0]
+    return sensor.shape[0], False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lands_at(above, rise, bow):  # type: ignore[no-untyped-def]
+    """Share of a step at which a plate that was `above` its stop meets it.
+
+    Its height changes by s `rise` + s (1 - s) `bow` in a share s of the step, all in mm.
+    """
+    # -bow s^2 + (rise + bow) s + above = 0, the first root
+    half = 0.5 * (rise + bow)
+    root = np.sqrt(max(half * half + bow * above, 0.0))
+    return above / (root - half) if root > half else 1.0

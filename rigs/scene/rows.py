@@ -29,12 +29,11 @@ TABLE = STATES
     KNOT, C0, C1, C2, C3, WANTED,
     # what becomes of the tip (`rigs.scene.tip.tip_step`)
     END_MODE, END_X, END_Y, END_FORCE_X, END_FORCE_Y, END_NORMAL, END_BENT, SLIP, SHARE, GAIN,
-    # of a tip that seeks its bend (`rigs.scene.sliding`)
-    LOW, HIGH, SEEKS, STRETCH, LIMIT, BEFORE, UNIT_X, UNIT_Y, REST_X, REST_Y,
-    QUICK, LAG, MISS, MISS_SLOPE, NEW_NORMAL, NORMAL_SLOPE, NEW_STRETCH, STRETCH_SLOPE,
-    AHEAD, TURNS, STRAIGHT, ASKEW, GRIP, GRIP_SLOPE, TOP, BOTTOM, WAY,
-) = range(STATES + CONSTANTS, STATES + CONSTANTS + 48)  # fmt: skip
-ROWS = STATES + CONSTANTS + 48
+    # of a tip that seeks its bend, and of one that seeks its slip (`rigs.scene.sliding`)
+    LOW, HIGH, SEEKS, STRETCH, BEFORE, AFTER, UNIT_X, UNIT_Y, TOP, BOTTOM, WAY,
+    AHEAD, ASIDE, REST_X, REST_Y, SOFT_X, SOFT_Y, QUICK, LAG, GRIP, GRIP_SLOPE, FAR,
+) = range(STATES + CONSTANTS, STATES + CONSTANTS + 43)  # fmt: skip
+ROWS = STATES + CONSTANTS + 43
 
 ALONE = 3.0
 """END_MODE of a tip that must be computed alone."""

@@ -1,9 +1,13 @@
-"""The bend of a tip that slides: what its slip leaves of the stretch, with friction by the slip.
+"""The slip of a tip in one step: how far along its direction, with friction by the slip.
 
-One Newton step in three parts, shared by the tip that is computed alone (`rigs.scene.tip`) and by
-those computed side by side (`rigs.scene.sliding_lanes`), so that both give the same bits. No
-branches, for the latter. Where it does not get there, because friction has a kink at rest,
-`slid_surely` does, slowly.
+The unknowns are the slip and the bend, the equations that spring and base together are as long as
+the stretch that is left, and that the force lies on the friction cone at the end of the slip. One
+Newton step for both, shared by the tip that is computed alone (`rigs.scene.tip`) and by those
+computed side by side (`rigs.scene.sliding_lanes`), so that both give the same bits. No branches,
+for the latter. Where it does not get there, because friction has a kink at rest or falls more
+steeply than the spring pulls, `slid_surely` does, slowly.
+
+All vectors are split along the slip and across it; across it the tip does not move.
 """
 
 from __future__ import annotations
@@ -11,15 +15,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import CLOSE, ITERATIONS, column
-from rigs.scene.friction import grip_at
+from rigs.scene.column import CLOSE, ITERATIONS, bend_for, column
+from rigs.scene.friction import KNOT_MM, grip_at
 from rigs.scene.smooth import logarithm
-from rigs.scene.turning import unit
 
 PASSES = 8
-"""Newton steps that many tips try side by side; two do while rows are close."""
-TRIES = 24
-"""Newton steps that one tip tries."""
+"""Newton steps that are tried; two do while rows are close."""
+_MARCH_MM = KNOT_MM / 8.0
+"""How far apart places are at which the balance of a tip is looked at one by one."""
+_MOST_PLACES = 4096.0
+_CLOSE_SPEED = 1e-4
+"""A change of the speed, over that at which friction begins to rise, like `CLOSE`."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -38,149 +44,207 @@ def strengthened(grip, slope, slip, quick, lag, law):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def stretched(  # type: ignore[no-untyped-def]
-    bent, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, pressing, bending,
-    shortening, compliance,
+def along_slip(  # type: ignore[no-untyped-def]
+    new_x, new_y, old_x, old_y, branch_x, branch_y, soft, damp, per_s, swerve, unit_x, unit_y,
+    quick, lag,
 ):  # fmt: skip
-    """What a bend and a force mean for each other, and the slip that they leave.
-
-    The force turns the stretch, by what relaxes and damps, and so decides on the slip, which
-    decides on the friction, that is the force.
+    """What `pulled` is told of a tip whose slip has the direction `unit`.
 
     Args:
-        bent: the bend, mm.
-        force: tangential, N.
-        new_x, new_y: of the base from where the tip stood, mm.
-        unit_x, unit_y: direction of the force.
-        rest_x, rest_y, soft: what relaxation and damping take of it, N, and per stretch, N/mm.
-        pressed, pressing, bending, shortening, compliance: as in `column`.
+        new_x, new_y, old_x, old_y: stretch at both ends of the step if the tip did not slip, mm.
+        branch_x, branch_y: what is left of the relaxing branch, N.
+        soft, damp: stiffness of that branch for this step, N/mm, and of the damper, N s/mm.
+        per_s: one over the length of the step, 1/s.
+        swerve: the base's speed along y at the end of the step over its mean one, mm/s.
 
     Returns:
-        what the spring pulls more than the force does, N, and its slope over the bend; normal
-        force and its slope; stretch, mm, and its slope; share of the force along the stretch;
-        how the stretch turns with the force, rad/N; slip, mm, and its shares along and across the
-        stretch.
+        `ahead` to `soft_y` of `pulled`.
     """
-    spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
-    stretch, stretch_slope = bent + compliance * spring, 1.0 + compliance * slope
-    pull_x, pull_y = force * unit_x + rest_x, force * unit_y + rest_y
-    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
-    pulls = pull > 0.0
-    per_pull = 1.0 / pull if pulls else 0.0
-    towards_x = pull_x * per_pull if pulls else unit_x
-    towards_y = pull_y * per_pull if pulls else unit_y
-    ahead = towards_x * unit_x + towards_y * unit_y
-    turns = (towards_x * unit_y - towards_y * unit_x) * per_pull
-    slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
-    slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
-    per_slip = 1.0 / slip if slip > 0.0 else 0.0
-    straight = (slip_x * towards_x + slip_y * towards_y) * per_slip
-    askew = (slip_y * towards_x - slip_x * towards_y) * per_slip
+    rate_x, rate_y = (new_x - old_x) * per_s, (new_y - old_y) * per_s + swerve
+    x, y = branch_x - soft * old_x + damp * rate_x, branch_y - soft * old_y + damp * rate_y
+    ahead, aside = new_x * unit_x + new_y * unit_y, new_y * unit_x - new_x * unit_y
+    rest_x, rest_y = x * unit_x + y * unit_y, y * unit_x - x * unit_y
+    # the damper feels what is left of the base's speed when the tip's is taken away
     return (
-        spring + soft * stretch - pull, slope + soft * stretch_slope, normal, normal_slope,
-        stretch, stretch_slope, ahead, turns, slip, straight, askew,
+        ahead, aside, rest_x - damp * (lag + quick * ahead), rest_y, soft + damp * quick, soft,
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def begun(  # type: ignore[no-untyped-def]
+    moved_x, moved_y, unit_x, unit_y, slides, bent, bending, shortening, compliance, pressed,
+    pressing, rough,
+):  # fmt: skip
+    """Slip and bend at which the search begins, and the longest slip that is believed, mm.
+
+    `slides` and `bent` are as they were foreseen. A tip that slips much farther than its base moved
+    jumped over rough friction: the search may have missed where it is caught first.
+    """
+    moved = moved_x * unit_x + moved_y * unit_y
+    _, _, slope, _ = column(bent, bending, shortening, pressed, pressing)
+    change = (moved - slides) / (1.0 + compliance * slope)
+    known = slides >= 0.0
+    slip = slides if known else moved
+    after = bent + (change if known else 0.0)
+    far = 2.0 * max(moved, _MARCH_MM)
+    return (
+        slip if slip > 0.0 else 0.0, after if after > 0.0 else 0.0, far if rough else np.inf,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def onto_cone(force_x, force_y, unit_x, unit_y, limit):  # type: ignore[no-untyped-def]
+    """A force along and across the slip, made as large as `limit`, in x and y."""
+    size = np.sqrt(force_x * force_x + force_y * force_y)
+    scale = limit / size if size > 0.0 else 0.0
+    x, y = force_x * scale, force_y * scale
+    return x * unit_x - y * unit_y, x * unit_y + y * unit_x
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def pulled(  # type: ignore[no-untyped-def]
+    slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening
+):
+    """Force of a tip that slipped and is bent, and its normal force, N.
+
+    Args:
+        slip, bent: mm.
+        ahead, aside: stretch along the slip and across it before the slip, mm.
+        rest_x, rest_y, soft_x, soft_y: what relaxation and damping add, N, and per stretch, N/mm.
+        pressed, pressing, bending, shortening: as in `column`.
+
+    Returns:
+        force along the slip and across it; normal force.
+    """
+    left = ahead - slip
+    spring, normal, _, _ = column(bent, bending, shortening, pressed, pressing)
+    stretch = np.sqrt(left * left + aside * aside)
+    secant = spring / stretch if stretch > 0.0 else 0.0
+    return (secant + soft_x) * left + rest_x, (secant + soft_y) * aside + rest_y, normal
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def slide_step(  # type: ignore[no-untyped-def]
-    bent, high, force, miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead,
-    turns, straight, askew, grip, grip_slope,
+    slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
+    shortening, compliance, grip, grip_slope, quick, weak,
 ):  # fmt: skip
-    """One Newton step towards the bend whose slip leaves the force on the friction cone.
+    """One Newton step towards the slip that leaves the force on the friction cone.
 
     Args:
-        high: the most that the bend can be, mm.
-        miss to askew: from `stretched`.
+        slip to shortening: as in `pulled`.
+        compliance: of what is in series with the bend, mm/N.
         grip, grip_slope: friction at the end of the slip, and its slope over it, 1/mm.
+        quick, weak: slope of the speed over the slip, 1/s, and the speed at which friction begins
+            to rise, mm/s.
 
     Returns:
-        bend, force, stretch and normal force after it, and whether that is it.
+        slip, bend, whether that is it, whether it may become it, and how fast the force falls to
+        the cone with the slip, N/mm.
     """
-    # force = grip normal, to first order in the changes of force and bend
-    off = grip * normal - force
-    force_slope = grip * normal_slope - normal * grip_slope * stretch_slope * straight
-    own = 1.0 + normal * grip_slope * stretch * askew * turns
-    per_own = 1.0 / own if own > 0.1 else 1.0
-    miss -= ahead * per_own * off
-    steepness = miss_slope - ahead * per_own * force_slope
-    after = bent - miss / steepness
-    inside = steepness > 0.0 and 0.0 <= after <= high
-    after = after if inside else 0.5 * (bent + (0.0 if miss > 0.0 else high))
-    change = after - bent
-    more = (off + force_slope * change) * per_own
-    # the next changes would be of the order of the squares of these: rounding
-    found = abs(change) <= CLOSE * after and abs(turns * more) <= CLOSE
-    return (
-        after, max(force + more, 0.0), stretch + stretch_slope * change,
-        normal + normal_slope * change, found,
+    left = ahead - slip
+    spring, normal, slope, normal_slope = column(bent, bending, shortening, pressed, pressing)
+    stretch = np.sqrt(left * left + aside * aside)
+    per_stretch = 1.0 / stretch
+    cosine, sine, secant = left * per_stretch, aside * per_stretch, spring * per_stretch
+    force_x, force_y = (secant + soft_x) * left + rest_x, (secant + soft_y) * aside + rest_y
+    force = np.sqrt(force_x * force_x + force_y * force_y)
+    per_force = 1.0 / force
+    unit_x, unit_y = force_x * per_force, force_y * per_force
+    # to first order in the changes of slip and bend
+    per_open = 1.0 / (1.0 + compliance * slope)
+    miss = bent + compliance * spring - stretch
+    by_bend = ((unit_x * cosine + unit_y * sine) * slope - grip * normal_slope) * per_open
+    steepness = (
+        by_bend * cosine + unit_x * soft_x + secant * sine * (unit_x * sine - unit_y * cosine)
+        + grip_slope * normal
     )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _miss(  # type: ignore[no-untyped-def]
-    bent, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed,
-    pressing, bending, shortening, compliance, field, i, path, quick, lag, law,
-):  # fmt: skip
-    """What the spring pulls more than friction holds, N; force, N; stretch, mm; normal force."""
-    spring, normal, _, _ = column(bent, bending, shortening, pressed, pressing)
-    stretch = bent + compliance * spring
-    slip_x, slip_y = new_x - stretch * towards_x, new_y - stretch * towards_y
-    slip = np.sqrt(slip_x * slip_x + slip_y * slip_y)
-    grip, _ = grip_at(field, i, path + slip)
-    grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
-    force = grip * normal
-    pull_x, pull_y = force * unit_x + rest_x, force * unit_y + rest_y
-    pull = np.sqrt(pull_x * pull_x + pull_y * pull_y)
-    return spring + soft * stretch - pull, force, stretch, normal
+    change = (force - grip * normal - by_bend * miss) / steepness
+    bend = -(miss + cosine * change) * per_open
+    # the next changes would be of the order of the squares of these: rounding
+    found = (
+        abs(change) <= CLOSE * stretch and abs(bend) <= CLOSE * stretch
+        and abs(change) * quick <= _CLOSE_SPEED * weak
+    )  # fmt: skip
+    slip, bent = slip + change, bent + bend
+    # what friction holds pulls along the slip
+    hopeful = steepness > 0.0 and slip >= 0.0 and bent >= 0.0 and force_x > 0.0
+    return slip, bent, found, hopeful, steepness
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slid_surely(  # type: ignore[no-untyped-def]
-    high, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, pressing, bending,
-    shortening, compliance, field, i, path, quick, lag, law,
+    guess, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening,
+    compliance, field, i, path, quick, lag, law,
 ):  # fmt: skip
-    """What `slide_step` looks for, by regula falsi for one direction of the stretch after another.
+    """The first slip on the way after which friction holds the force; slip, bend, in mm.
+
+    Places are tried one after another, and the one that is too far is approached by regula falsi.
+    """
+    bent, slip, below, above = guess, 0.0, 0.0, 0.0
+    low, high, side = 0.0, -1.0, 0
+    rough = field.shape[1] > 1
+    most = max(abs(ahead), 1e-9)
+    march = most / 16.0
+    if rough:
+        march = max(min(march, _MARCH_MM), most / _MOST_PLACES)
+    # a spring that is let go may carry its tip beyond the place under its base
+    tries = int(2.0 * most / march) + 2
+    for _ in range(tries + ITERATIONS):
+        left = ahead - slip
+        stretch = np.sqrt(left * left + aside * aside)
+        bent = bend_for(stretch, bent, bending, shortening, compliance, pressed, pressing)
+        force_x, force_y, normal = pulled(
+            slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
+            shortening,
+        )  # fmt: skip
+        grip, _ = grip_at(field, i, path + slip)
+        grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
+        over = np.sqrt(force_x * force_x + force_y * force_y) - grip * normal
+        if over > 0.0 and force_x > 0.0:
+            low, below = slip, over
+            above = 0.5 * above if side == 1 else above
+            side = 1
+        else:
+            high, above = slip, min(over, -1e-300)
+            below = 0.5 * below if side == -1 else below
+            side = -1
+        if high < 0.0:
+            if slip >= 2.0 * most:
+                break
+            slip += march
+            continue
+        if high - low <= 1e-15 * most or abs(over) <= 1e-16:
+            break
+        slip = (low * above - high * below) / (above - below)
+        slip = slip if low < slip < high else 0.5 * (low + high)
+    return slip, bent
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def relaxed_speed(force, rise, before, after, steepness, slid_s, law):  # type: ignore[no-untyped-def]
+    """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds tell nothing, mm/s.
+
+    With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
+    while rates are constant: a linear equation for e^-x, solved exactly, because a tip that lets go
+    may be a thousand times as fast at first as at the end of the step.
+
+    Args:
+        force, rise: size of the force, and by how much it rises if the tip does not slip, N.
+        before, after: the cone's radii at both ends if it does not, N.
+        steepness: see `slide_step`.
 
     Returns:
-        bend, force, stretch, normal force.
+        the speed; negative: friction falls with the slip faster than the spring pulls.
     """
-    bent, stretch, normal = high, 0.0, 0.0
-    for _ in range(ITERATIONS):
-        towards_x, towards_y = unit(force * unit_x + rest_x, force * unit_y + rest_y)
-        before = force
-        left, right, below, above, side = 0.0, high, 0.0, 0.0, 0
-        for _ in range(ITERATIONS):
-            known = below < 0.0 < above
-            bent = (left * above - right * below) / (above - below) if known else bent
-            bent = bent if left < bent < right else 0.5 * (left + right)
-            miss, force, stretch, normal = _miss(
-                bent, towards_x, towards_y, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft,
-                pressed, pressing, bending, shortening, compliance, field, i, path, quick, lag,
-                law,
-            )  # fmt: skip
-            if miss > 0.0:
-                right, above = bent, miss
-                below = 0.5 * below if side == 1 else below
-                side = 1
-            else:
-                left, below = bent, miss
-                above = 0.5 * above if side == -1 else above
-                side = -1
-            if abs(miss) <= 1e-15 * force or right - left <= 1e-15 * high:
-                break
-        if abs(force - before) <= 1e-14 * force:
-            break
-    return bent, force, stretch, normal
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y):  # type: ignore[no-untyped-def]
-    """The stretch as a vector, and the slip that it leaves, mm."""
-    # a direction that lags behind by a hair would make the way longer, step by step
-    towards_x, towards_y = unit(force * unit_x + rest_x, force * unit_y + rest_y)
-    x, y = stretch * towards_x, stretch * towards_y
-    return x, y, np.sqrt((new_x - x) * (new_x - x) + (new_y - y) * (new_y - y))
+    scale = 1.0 / (law.strengthening * 0.5 * (before + after))
+    over = max((force / before - 1.0) / law.strengthening, 0.0)
+    a = (rise - (after - before) * force / before) * scale
+    b = law.weak_mm_s * steepness * scale * slid_s
+    # the sum may be negative: the speed grows
+    sum_, slow = a + b, np.exp(-over)
+    gain = -np.expm1(-sum_) / sum_ if sum_ != 0.0 else 1.0
+    slow = slow * np.exp(-sum_) + b * gain
+    return max(law.weak_mm_s * (1.0 / slow - 1.0), 0.0) if b > 0.0 else -1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

@@ -35,13 +35,16 @@ from rigs.scene.rows import (
     TO_Y,
 )
 from rigs.scene.sliding import (
-    TRIES,
+    PASSES,
+    along_slip,
+    begun,
     foreseen,
-    slid,
+    onto_cone,
+    pulled,
+    relaxed_speed,
     slid_surely,
     slide_step,
     strengthened,
-    stretched,
 )
 from rigs.scene.springs import (
     ACROSS,
@@ -70,19 +73,20 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
-from rigs.scene.turning import dragged, leaves_at, turned
+from rigs.scene.turning import chord, dragged, leaves_at, raised, slides_on, turned
 
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _excess(share, w, law, j, limit, new_x, new_y, h):  # type: ignore[no-untyped-def]
+def _excess(share, w, law, j, limit, new_x, new_y, h, swerve):  # type: ignore[no-untyped-def]
     """Force less `limit` times normal force of a tip that has stuck up to a share of a step, N."""
     decay, gain = relaxing(max(share * h, 1e-12), law.relaxation_s)
     old_x = w[BASE_X, j] - w[PLACE_X, j]
     old_y = w[BASE_Y, j] - w[PLACE_Y, j]
     move_x, move_y = share * (new_x - old_x), share * (new_y - old_y)
+    move_y -= swerve * h * share * (1.0 - share)
     x, y = old_x + move_x, old_y + move_y
     along, was = w[TABLE + ALONG, j], w[INDENTATION, j]
     bending, shortening = w[TABLE + BENDING, j], w[TABLE + SHORTER, j]
@@ -96,30 +100,30 @@ def _excess(share, w, law, j, limit, new_x, new_y, h):  # type: ignore[no-untype
     )
     force, normal, _, _ = column(bent, bending, shortening, pressed, along)
     secant = force / stretch if stretch > 0.0 else 0.0
-    # what damps is proportional to the speed, and that is constant
-    soft = w[TABLE + ACROSS, j] * (law.maxwell * gain + law.damping_s / max(share * h, 1e-12))
-    fx = secant * x + w[BRANCH_X, j] * decay + soft * move_x
-    fy = secant * y + w[BRANCH_Y, j] * decay + soft * move_y
+    soft, damp = w[TABLE + ACROSS, j] * law.maxwell * gain, w[TABLE + ACROSS, j] * law.damping_s
+    rate_x, rate_y = (new_x - old_x) / h, (new_y - old_y) / h + swerve * (2.0 * share - 1.0)
+    fx = secant * x + w[BRANCH_X, j] * decay + soft * move_x + damp * rate_x
+    fy = secant * y + w[BRANCH_Y, j] * decay + soft * move_y + damp * rate_y
     return np.sqrt(fx * fx + fy * fy) - limit * normal
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lets_go_at(guess, w, law, j, limit, new_x, new_y, h):  # type: ignore[no-untyped-def]
+def _lets_go_at(guess, w, law, j, limit, new_x, new_y, h, swerve):  # type: ignore[no-untyped-def]
     """Share of a step at which a stuck tip's force meets its cone: a root of the law itself.
 
     While a tip sticks its force is a known function of time, relaxation included, so that the
     slip is located exactly in steps of any length (regula falsi, Illinois).
     """
     low, high = 0.0, 1.0
-    below = _excess(low, w, law, j, limit, new_x, new_y, h)
-    above = _excess(high, w, law, j, limit, new_x, new_y, h)
+    below = _excess(low, w, law, j, limit, new_x, new_y, h, swerve)
+    above = _excess(high, w, law, j, limit, new_x, new_y, h, swerve)
     if below >= 0.0 or above <= 0.0:
         return guess
     share, side = guess, 0
     for _ in range(ITERATIONS):
         if not low < share < high:
             share = 0.5 * (low + high)
-        miss = _excess(share, w, law, j, limit, new_x, new_y, h)
+        miss = _excess(share, w, law, j, limit, new_x, new_y, h, swerve)
         if miss > 0.0:
             high, above = share, miss
             below = 0.5 * below if side == 1 else below
@@ -142,11 +146,13 @@ def _end(w, j, mode, x, y, force_x, force_y, normal, bent, slip, share, gain):  
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-def]
-    """Where tip `i` in lane `j` is after its base moved linearly within `h` seconds.
+def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-untyped-def]
+    """Where tip `i` in lane `j` is after its base moved within `h` seconds.
 
-    `decay` and `gain` are the relaxing branch's exact factors for linear motion over `h`. What
-    is read: the state, TO_X, TO_Y and DEEP. What is written: END_MODE to GAIN, that is mode,
+    The base moves linearly, but for `swerve`: its speed along y at the end of the step over its
+    mean one, mm/s, changing linearly. `decay` and `gain` are the relaxing branch's exact factors
+    for linear motion over `h`. What is read: the state, TO_X, TO_Y and DEEP. What is written:
+    END_MODE to GAIN, that is mode,
     place, force, normal force, bend, slip (mm), the share of the step at which the tip went
     from stick to slip (negative if it did not), and the gain since it touched.
     """
@@ -177,21 +183,22 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     new_x, new_y = base_x - place_x, base_y - place_y
     branch_x, branch_y = w[BRANCH_X, j] * decay, w[BRANCH_Y, j] * decay
     soft = w[TABLE + ACROSS, j] * (maxwell * gain + law.damping_s / h)
+    damp = w[TABLE + ACROSS, j] * law.damping_s
     stretch = np.sqrt(new_x * new_x + new_y * new_y)
     bent = bend_for(stretch, w[BENT, j], bending, shortening, compliance, pressed, along)
     force, normal, _, _ = column(bent, bending, shortening, pressed, along)
     secant = force / stretch if stretch > 0.0 else 0.0
     trial_x = secant * new_x + branch_x + soft * (new_x - old_x)
-    trial_y = secant * new_y + branch_y + soft * (new_y - old_y)
+    trial_y = secant * new_y + branch_y + soft * (new_y - old_y) + damp * swerve
     path = w[PATH, j]
     grip, _ = grip_at(field, i, path)
     from_x, from_y = w[FORCE_X, j], w[FORCE_Y, j]
     drive_x, drive_y = trial_x - from_x, trial_y - from_y
-    static, before = 1.0 + law.static_excess, grip * w[NORMAL, j]
-    # a sliding tip slides on if the drive takes its force outwards faster than the cone grows
-    outwards = from_x * drive_x + from_y * drive_y
-    keeps_on = mode == SLIDING and outwards >= before * (grip * normal - before)
-    limit = grip * normal * (1.0 if keeps_on else static)
+    static, before, after = 1.0 + law.static_excess, grip * w[NORMAL, j], grip * normal
+    keeps_on = mode == SLIDING and slides_on(
+        from_x, from_y, drive_x, drive_y, before, after, law.strengthening
+    )
+    limit = after * (1.0 if keeps_on else static)
     size = np.sqrt(trial_x * trial_x + trial_y * trial_y)
     if size <= limit * ROUNDING:
         _end(w, j, STUCK, place_x, place_y, trial_x, trial_y, normal, bent, 0.0, -1.0, gain)
@@ -200,60 +207,69 @@ def tip_step(w, field, law, i, j, h, decay, gain):  # type: ignore[no-untyped-de
     if not keeps_on:
         share = leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
         if mode == STUCK and w[INDENTATION, j] > 0.0 and 0.0 < share < 1.0:
-            share = _lets_go_at(share, w, law, j, static * grip, new_x, new_y, h)
+            share = _lets_go_at(share, w, law, j, static * grip, new_x, new_y, h, swerve)
         left = 1.0 - share
         from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
-        before += share * (grip * normal - before)
+        before += share * (after - before)
         share = touched + (1.0 - touched) * share
     if law.exact_turns:
+        start, end = raised(from_x, from_y, before, after) if keeps_on else (before, after)
         ux, uy, top, bottom, way = dragged(
-            from_x, from_y, left * drive_x, left * drive_y, before, grip * normal
+            from_x, from_y, trial_x - from_x, trial_y - from_y, start, end
         )
-        unit_x, unit_y = turned(ux, uy, top, bottom, way)
+        ux, uy = turned(ux, uy, top, bottom, way)
+        unit_x, unit_y = chord(from_x, from_y, trial_x, trial_y, ux, uy, end)
     else:
         unit_x, unit_y = trial_x / size, trial_y / size
-    # with the force F n on the cone, the spring's share of it points along F n + rest; the slip
-    # left by a bend decides on the coefficient of friction, and so on F
-    rest_x, rest_y = soft * old_x - branch_x, soft * old_y - branch_y
     slid_s = left * (1.0 - touched) * h
     quick, lag, slides = 0.0, 0.0, -1.0
     if slid_s > 0.0:
         earlier_s = w[SLID_S, j] if keeps_on else 0.0
         quick, lag, slides = foreseen(slid_s, 1.0 / slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
-    moved = (new_x - old_x) * unit_x + (new_y - old_y) * unit_y
-    guess = w[BENT, j]
-    _, _, slope, _ = column(guess, bending, shortening, pressed, along)
-    guess += (moved - slides) / (1.0 + compliance * slope) if slides >= 0.0 else 0.0
-    high = bent
-    bent = min(max(guess, 0.0), high)
-    first, found = np.sqrt(from_x * from_x + from_y * from_y), False
-    force, stretch, tried = first, 0.0, 0
-    while not found and tried < TRIES:
-        (
-            miss, miss_slope, normal, normal_slope, stretch, stretch_slope, ahead, turns, slip,
-            straight, askew,
-        ) = stretched(
-            bent, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
-            bending, shortening, compliance,
+    ahead, aside, rest_x, rest_y, soft_x, soft_y = along_slip(
+        new_x, new_y, old_x, old_y, branch_x, branch_y, w[TABLE + ACROSS, j] * maxwell * gain, damp,
+        1.0 / h, swerve, unit_x, unit_y, quick, lag,
+    )  # fmt: skip
+    slip, bend, far = begun(
+        new_x - old_x, new_y - old_y, unit_x, unit_y, slides, w[BENT, j], bending, shortening,
+        compliance, pressed, along, field.shape[1] > 1,
+    )  # fmt: skip
+    if keeps_on and w[SLID_S, j] > 0.0:
+        pass
+    elif law.strengthening > 0.0 and law.damping_s == 0.0 and before > 0.0 and slid_s > 0.0:
+        first = np.sqrt(from_x * from_x + from_y * from_y)
+        grip, grip_slope = grip_at(field, i, path)
+        _, _, _, _, steepness = slide_step(
+            0.0, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
+            shortening, compliance, grip, grip_slope, 0.0, law.weak_mm_s,
         )  # fmt: skip
+        speed = relaxed_speed(first, size - first, before, after, steepness, slid_s, law)
+        quick, lag = (0.0, speed) if speed >= 0.0 else (quick, lag)
+    found, hopeful, tried = False, True, 0
+    while not found and hopeful and tried < PASSES:
         grip, grip_slope = grip_at(field, i, path + slip)
         grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
-        bent, force, stretch, normal, found = slide_step(
-            bent, high, force, miss, miss_slope, normal, normal_slope, stretch, stretch_slope,
-            ahead, turns, straight, askew, grip, grip_slope,
+        slip, bend, found, hopeful, _ = slide_step(
+            slip, bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
+            shortening, compliance, grip, grip_slope, quick, law.weak_mm_s,
         )  # fmt: skip
+        hopeful = hopeful and slip <= far
+        found = found and hopeful
         tried += 1
     if not found:
-        bent, force, stretch, normal = slid_surely(
-            high, first, new_x, new_y, unit_x, unit_y, rest_x, rest_y, soft, pressed, along,
-            bending, shortening, compliance, field, i, path, quick, lag, law,
+        slip, bend = slid_surely(
+            bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
+            shortening, compliance, field, i, path, quick, lag, law,
         )  # fmt: skip
-    x, y, slip = slid(stretch, force, new_x, new_y, unit_x, unit_y, rest_x, rest_y)
+    force_x, force_y, normal = pulled(
+        slip, bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
+        shortening,
+    )  # fmt: skip
     # the force lies on the cone of the way that is told, to the last bit
     grip, _ = grip_at(field, i, path + slip)
     grip, _ = strengthened(grip, 0.0, slip, quick, lag, law)
-    limit = grip * normal
+    force_x, force_y = onto_cone(force_x, force_y, unit_x, unit_y, grip * normal)
     _end(
-        w, j, SLIDING, base_x - x, base_y - y, limit * unit_x, limit * unit_y, normal, bent, slip,
-        share, gain,
+        w, j, SLIDING, place_x + slip * unit_x, place_y + slip * unit_y, force_x, force_y, normal,
+        bend, slip, share, gain,
     )  # fmt: skip

@@ -44,5 +44,5 @@ def test_growing_and_forgetting_keep_what_is_asked_for() -> None:
     assert history.end_ns == 8999
     assert 0 < history.begin_ns <= 8899
     assert history.at(np.array([8899], np.int64))[0, 0] == 8899
-    history.shrink(10)
+    history.shrink(10, 8989)
     assert history.end_ns == 8989

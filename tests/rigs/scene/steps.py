@@ -53,6 +53,7 @@ def fall(
     weight: np.ndarray | float | None = None,
     stiction: float = 0.0,
     h: float = H,
+    t_ns: np.ndarray | None = None,
 ) -> tuple[np.ndarray, int]:
     """Track of a released plate under `sensor` (depth alone, or x, y, depth), and steps taken."""
     steps, n = len(sensor), len(springs.gap)
@@ -62,9 +63,11 @@ def fall(
     else:
         full[:, : sensor.shape[1]] = sensor
     pull = np.broadcast_to(mass * 9.81 if weight is None else weight, steps).astype(float)
+    pull = np.concatenate([[2 * pull[0] - pull[min(1, steps - 1)]], pull])
     track, load = np.zeros((steps, track_width(n))), np.zeros((steps, 3 * n))
-    done = advance_free(
-        springs.table, springs.friction, springs.law, tips.state, times(steps, h), full, motion,
+    rows = times(steps, h) if t_ns is None else t_ns
+    done, _ = advance_free(
+        springs.table, springs.friction, springs.law, tips.state, rows, full, motion,
         mass, pull, stiction, -25.0, track, load,
     )  # fmt: skip
     return track[:done], done

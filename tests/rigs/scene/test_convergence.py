@@ -40,6 +40,25 @@ def test_the_force_over_rough_friction_is_the_first_balance_on_the_way() -> None
         assert run.loads[row, 0] == pytest.approx(k * (way - slid), abs=1e-10)
 
 
+@pytest.mark.parametrize("step_mm", [0.02, 0.004])
+@pytest.mark.parametrize("tip", [0, 1])
+def test_a_tip_that_jumps_over_very_rough_friction_is_caught_where_it_first_can_be(
+    tip: int, step_mm: float
+) -> None:
+    # friction varies by 30 % over 0.2 mm: the first place on a dense grid at which friction holds
+    skin = ideal_skin()
+    knots = friction_knots(skin, MU, 0.3, 0.2, 3)
+    run = run_slide(make_springs(skin, knots, 1), 2.8, 1.0, 0.0, length_mm=11.0, step_mm=step_mm)
+    k, normal = skin.tangential_n_per_mm[tip], run.loads[0, 3 * tip + 2]
+    way = np.arange(0.0, 11.0, 2e-4)
+    field = friction_field(knots)
+    grip = np.array([grip_at(field, tip, place)[0] for place in way])
+    for at_mm in np.arange(4.0, 11.001, 0.1):
+        slid = way[np.argmax(grip * normal >= k * (at_mm - way))]
+        row = round(at_mm / step_mm)
+        assert run.loads[row, 3 * tip] / k == pytest.approx(at_mm - slid, abs=4e-4)
+
+
 def test_the_whole_law_is_of_second_order_in_its_step() -> None:
     springs = make_springs(ideal_skin(), friction_knots(ideal_skin(), MU, 0.05, 0.5, 3), 3, **RICH)
     fine = run_slide(springs, 2.8, 1.0, 30.0, step_mm=0.0005)

@@ -46,14 +46,14 @@ def steps_one_by_one(table, field, law, state, sensor, plate_y, h):  # type: ign
         for b in range(lanes.shape[0]):
             # places and depths of all lanes, idle ones included
             respond(
-                lanes[b], field, law, b * LANES, 0, at, plate_y[k], h, decay, gain
+                lanes[b], field, law, b * LANES, 0, at, plate_y[k], 0.0, h, decay, gain
             )  # fmt: skip
             w = block_of(lanes[b])
             for j in range(min(n - b * LANES, LANES)):
                 lx, ly = w[TABLE + LAYOUT_X, j], w[TABLE + LAYOUT_Y, j]
                 w[TO_X, j], w[TO_Y, j] = at[0] + lx, at[1] + ly - plate_y[k]
                 w[DEEP, j] = at[2] + at[3] * lx + at[4] * ly - w[TABLE + GAP, j]
-                tip_step(w, field, law, b * LANES + j, j, h, decay, gain)
+                tip_step(w, field, law, b * LANES + j, j, h, 0.0, decay, gain)
             settle(lanes[b], law, k * h, h, decay)
         gather(lanes, state)
         states[k] = state
@@ -70,7 +70,7 @@ def steps_side_by_side(table, field, law, state, sensor, plate_y, h):  # type: i
         for b in range(lanes.shape[0]):
             respond(
                 lanes[b], field, law, b * LANES, min(n - b * LANES, LANES), sensor[k],
-                plate_y[k], h, decay, gain,
+                plate_y[k], 0.0, h, decay, gain,
             )  # fmt: skip
             settle(lanes[b], law, k * h, h, decay)
         gather(lanes, state)
