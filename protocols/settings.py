@@ -28,8 +28,15 @@ class Labelling(StrictModel):
     """Which onsets rule downstream; both are kept (docs/labels.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
+    reference: Literal["hold_start", "hold_end"] = "hold_start"
+    """From where the paper's rule counts displacements: from the start of the recorded hold, as in
+    the paper, so that a slip in the hold counts; or from its end, just before the motion."""
     reference_ms: float = Field(default=200.0, gt=0, le=1e6)
-    """The markers' reference positions are their means over this last part of the hold."""
+    """The markers' reference positions are their means over this part of the hold; a frame's length
+    takes the first frame (or the last)."""
+    hold_slip_px: float | None = Field(default=1.0, gt=0, le=100)
+    """A marker that moved further than this in the recorded hold leaves the trial's onsets in
+    doubt, pixels; null: none does."""
 
 
 class Windows(StrictModel):

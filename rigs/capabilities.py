@@ -261,9 +261,10 @@ class Simulation(Protocol):
     def sink(self, sink: Sink) -> Sink:
         """`sink` as this world lets it be written: its disk may be full."""
 
-    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
         """What really happened in the trial that just ran (JSON), times in ns of the sync box.
 
         Args:
             reference_arm_ns: arm controller time from which displacements are counted.
+            hold_arm_ns: when the recorded hold began, where they are wanted from there too.
         """

@@ -202,7 +202,8 @@ class Rig:
                     ways.append(self._way(times, began, at, speed))
             truth = None
             if self.simulation is not None:
-                truth = self.simulation.truth(reference)
+                hold = next(times.start_ns for times, kept in steps if kept)
+                truth = self.simulation.truth(reference, hold)
             return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(ways))
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:

@@ -2,8 +2,8 @@
 
 A label is what everything downstream is measured against: a wrong one costs more than a missing
 one. An onset is in doubt where a marker that could have changed it was out of sight, where its
-place was too uncertain to say when it crossed the line, and where the camera moved while too little
-stood still to tell by how much.
+place was too uncertain to say when it crossed the line, where the camera moved while too little
+stood still to tell by how much, and where a marker slipped in the hold.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ def doubts(
 
 
 def unseen(
-    frame_ns: Ints, displacement: Floats, onsets: Onsets, centre: int, not_before_ns: int
-) -> Doubts:
+    frame_ns: Ints, displacement: Floats, onsets: Onsets, centre: int, not_before_ns: int,
+    motion_ns: int | None = None,
+) -> Doubts:  # fmt: skip
     """Whether markers that were hidden, torn off or never seen could have changed the onsets.
 
     A marker that is out of sight and comes back where it was has not slipped; one that comes back
@@ -61,8 +62,11 @@ def unseen(
     Args:
         frame_ns: (n,) int64. displacement: (n, m) px, NaN where a marker was not seen.
         onsets: by whatever rule.
-        not_before_ns: start of the motion; a marker never seen at rest is unseen from here on.
+        not_before_ns: when slips begin to count; a marker never seen at rest is unseen from here
+            on.
+        motion_ns: start of the motion, from which the words count; by default the same.
     """
+    origin_ns = not_before_ns if motion_ns is None else motion_ns
     if not len(frame_ns):
         return NO_DOUBTS
     last_ns = int(frame_ns[-1])
@@ -78,8 +82,8 @@ def unseen(
         seen = max(int(frame_ns[at_rest][-1]), not_before_ns) if at_rest.any() else not_before_ns
         if marker == centre and until - seen > MAX_UNSEEN_NS:
             gross = (
-                f"the centre marker could not be followed from {_s(seen - not_before_ns)} "
-                f"to {_s(until - not_before_ns)} after the motion began"
+                f"the centre marker could not be followed from {_s(seen - origin_ns)} "
+                f"to {_s(until - origin_ns)} after the motion began"
             )
         if min(until, incipient) - seen > MAX_UNSEEN_NS:
             found.append((seen, marker))
@@ -87,7 +91,7 @@ def unseen(
         return Doubts(None, gross)
     seen, marker = min(found)
     reason = (
-        f"marker {marker} could not be followed from {_s(seen - not_before_ns)} after the motion "
+        f"marker {marker} could not be followed from {_s(seen - origin_ns)} after the motion "
         "began, and may have slipped first"
     )
     return Doubts(reason, gross)
@@ -117,6 +121,21 @@ def uncertain(
         marker = int(earliest.argmin())
         incipient = f"marker {marker}'s place is only known to {_worst(sigma, marker)} px"
     return Doubts(incipient, gross)
+
+
+def slipped_in_hold(hold_slip_px: Floats, limit_px: float | None) -> Doubts:
+    """Doubts of a trial whose hold was none: both onsets, where a marker moved in it by too much.
+
+    Args:
+        hold_slip_px: (m,) how far each marker moved in the hold, NaN where unknown.
+        limit_px: None where no slip is too much.
+    """
+    known = np.nan_to_num(hold_slip_px)
+    if limit_px is None or not (known > limit_px).any():
+        return NO_DOUBTS
+    marker = int(known.argmax())
+    reason = f"marker {marker} moved by {known[marker]:.1f} px in the hold, before the motion"
+    return Doubts(reason, reason)
 
 
 def _worst(sigma: Floats, marker: int) -> str:

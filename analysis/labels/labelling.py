@@ -13,20 +13,36 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
-from analysis.labels.doubts import Doubts, uncertain, unseen
-from analysis.labels.onsets import Onsets, offsets, paper_onsets
+from analysis.labels.doubts import Doubts, slipped_in_hold, uncertain, unseen
+from analysis.labels.onsets import Onsets, mean_places, on_plate, paper_onsets
 from analysis.labels.places import SURE_PX, Places, places_of
 from analysis.labels.slip_times import SlipTimes, slip_times
 from protocols.settings import Labelling
 from storage.recording import Recording
 
 F64 = npt.NDArray[np.float64]
-VERSION = 3
+VERSION = 4
 
+Reference = Literal["hold_start", "hold_end"]
 Results = tuple[dict[str, Any], dict[str, Any]]
 """A result's JSON and its arrays."""
 LOST_SHARE = 0.05
 """A marker that is lost in more of the frames than this is named in the flags."""
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Onsets by the paper's rule, with displacements counted from one end of the hold.
+
+    Attributes:
+        onsets: on the trial's time line. doubts: why one is not known although the seen markers
+            give one.
+        displacement_px: (n, m) float64, NaN where a marker was lost.
+    """
+
+    onsets: Onsets
+    doubts: Doubts
+    displacement_px: F64
 
 
 @dataclass(frozen=True)
@@ -35,23 +51,40 @@ class Label:
 
     Attributes:
         rule: which onsets rule.
-        paper: by the paper's rule, on the trial's time line. slips: by change points.
-        paper_doubts, slip_doubts: why an onset is not known although the seen markers give one.
+        reference: from where the paper's rule counts.
+        references: by the paper's rule, counted from either end of the hold. slips: by change
+            points, with slip_doubts.
         frame_ns: (n,) int64, middle of exposure of every frame on the time line.
-        displacement_px: (n, m) float64, NaN where a marker was lost.
+        hold_slip_px: (m,) float64, how far each marker moved in the hold, from its first to its
+            last part; NaN where unknown.
     """
 
     rule: Literal["paper", "change_point"]
-    paper: Onsets
-    paper_doubts: Doubts
+    reference: Reference
+    references: dict[Reference, Counted]
     slips: SlipTimes
     slip_doubts: Doubts
     frame_ns: npt.NDArray[np.int64]
-    displacement_px: F64
+    hold_slip_px: F64
     places: Places
     camera: CameraShift
     start_ns: int
     source: str
+
+    @property
+    def paper(self) -> Onsets:
+        """By the paper's rule, counted from the reference."""
+        return self.references[self.reference].onsets
+
+    @property
+    def paper_doubts(self) -> Doubts:
+        """Of those."""
+        return self.references[self.reference].doubts
+
+    @property
+    def displacement_px(self) -> F64:
+        """(n, m) float64 from the reference, NaN where a marker was lost."""
+        return self.references[self.reference].displacement_px
 
     @property
     def onsets(self) -> Onsets:
@@ -85,6 +118,8 @@ class Label:
             f"marker {marker} was lost in {lost[marker]:.0%} of the frames"
             for marker in np.flatnonzero(lost > LOST_SHARE)
         ]
+        if self.doubts.incipient is not None and "in the hold" in self.doubts.incipient:
+            found.append(self.doubts.incipient)
         if self.places.plate_lost:
             found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
         if self.places.tilted:
@@ -96,6 +131,7 @@ class Label:
         onsets, doubts = self.onsets, self.doubts
         return {
             "rule": self.rule,
+            "reference": self.reference,
             "incipient_ns": None if doubts.incipient else onsets.incipient_ns,
             # without the first slip nothing is made of the second
             "gross_ns": None if doubts.incipient or doubts.gross else onsets.gross_ns,
@@ -103,11 +139,18 @@ class Label:
             "first_marker": onsets.first_marker,
             "per_marker_ns": onsets.per_marker_ns.tolist(),
             "paper": _onsets_json(self.paper, self.paper_doubts),
+            "references": {
+                name: _onsets_json(counted.onsets, counted.doubts)
+                for name, counted in self.references.items()
+            },
             "change_point": {
                 **_onsets_json(self.slips.onsets, self.slip_doubts),
                 "low_ns": self.slips.low_ns.tolist(),
                 "high_ns": self.slips.high_ns.tolist(),
             },
+            "hold_slip_px": [
+                None if np.isnan(px) else round(px, 3) for px in self.hold_slip_px.tolist()
+            ],
             "markers_lost": self.markers_lost,
             "plate_lost": self.places.plate_lost,
             "camera_moved_px": round(self.camera.largest_px, 3),
@@ -172,9 +215,10 @@ def label_places(
 ) -> Label:
     """Both rules over a trial's places.
 
-    Displacements count from the markers' mean positions over the last part of the hold; in
-    trials with a sliding plate they are taken relative to the plate's own marker. A marker whose
-    place is not known to a quarter of a pixel is not seen in that frame.
+    Displacements count from the markers' mean positions over the first part of the hold, with
+    which the recording begins, or over its last; in trials with a sliding plate they are taken
+    relative to the plate's own marker. A marker that is hidden there counts from the other part.
+    A marker whose place is not known to a quarter of a pixel is not seen in that frame.
 
     Args:
         frame_ns: (n,) int64 on the time line. start_ns: of the slide or retraction.
@@ -183,11 +227,11 @@ def label_places(
     Raises:
         ValueError: there is no frame in the hold.
     """
-    reference = (frame_ns < start_ns) & (frame_ns >= start_ns - int(settings.reference_ms * 1e6))
     sure = places.sigma <= SURE_PX
-    xy = np.where(sure[..., None], places.flat_xy, np.nan)
-    away = offsets(xy, reference, places.flat_plate)
+    xy = on_plate(np.where(sure[..., None], places.flat_xy, np.nan), places.flat_plate)
     sigma = np.where(sure, places.sigma, np.nan)
+    ends = hold_ends(frame_ns, start_ns, settings.reference_ms)
+    away = xy - _either(*(mean_places(xy, frames) for frames in ends.values()))
     camera = no_shift(len(frame_ns))
     if places.plate is None:
         camera = camera_shift(away)
@@ -195,27 +239,73 @@ def label_places(
         sigma = np.hypot(sigma, camera.sigma[:, None])
     else:
         sigma = np.hypot(sigma, places.plate.sigma[:, None])
-    moved = np.hypot(away[..., 0], away[..., 1])
-    paper = paper_onsets(frame_ns, moved, centre, settings, start_ns)
-    slips = slip_times(frame_ns, away, sigma, centre, start_ns, exposure_ns, settings.threshold_px)
+    first, last = (mean_places(away, frames) for frames in ends.values())
+    hold_slip_px = np.hypot(*(last - first).T)
+    held = slipped_in_hold(hold_slip_px, settings.hold_slip_px)
     knocked = _knocked(frame_ns, camera)
-    paper_doubts = unseen(frame_ns, moved, paper, centre, start_ns).or_else(
-        uncertain(frame_ns, moved, sigma, paper, centre, settings.threshold_px, start_ns)
+
+    def counted(from_px: F64, not_before_ns: int) -> Counted:
+        moved = away - from_px
+        moved = np.hypot(moved[..., 0], moved[..., 1])
+        paper = paper_onsets(frame_ns, moved, centre, settings, not_before_ns)
+        doubts = (
+            held.or_else(unseen(frame_ns, moved, paper, centre, not_before_ns, start_ns))
+            .or_else(
+                uncertain(
+                    frame_ns, moved, sigma, paper, centre, settings.threshold_px, not_before_ns
+                )
+            )
+            .or_else(knocked(paper))
+        )
+        return Counted(paper, doubts, moved)
+
+    references: dict[Reference, Counted] = {
+        "hold_start": counted(_either(first, last), int(frame_ns[0])),
+        "hold_end": counted(_either(last, first), start_ns),
+    }
+    # a change point is found near the slip, and so counts from just before the motion
+    near = away - _either(last, first)
+    slips = slip_times(frame_ns, near, sigma, centre, start_ns, exposure_ns, settings.threshold_px)
+    moved = references["hold_end"].displacement_px
+    slip_doubts = (
+        held.or_else(unseen(frame_ns, moved, slips.onsets, centre, start_ns))
+        .or_else(slips.doubts())
+        .or_else(knocked(slips.onsets))
     )
-    slip_doubts = unseen(frame_ns, moved, slips.onsets, centre, start_ns).or_else(slips.doubts())
     return Label(
         settings.rule,
-        paper,
-        paper_doubts.or_else(knocked(paper)),
+        settings.reference,
+        references,
         slips,
-        slip_doubts.or_else(knocked(slips.onsets)),
+        slip_doubts,
         frame_ns,
-        moved,
+        hold_slip_px,
         places,
         camera,
         start_ns,
         source,
     )
+
+
+def hold_ends(
+    frame_ns: npt.NDArray[np.int64], start_ns: int, reference_ms: float
+) -> dict[Reference, npt.NDArray[np.bool_]]:
+    """Frames of the first and the last part of the hold, with which a recording begins, (n,) each.
+
+    Args:
+        frame_ns: (n,) int64. start_ns: of the motion. reference_ms: length of each part.
+    """
+    held, length_ns = frame_ns < start_ns, int(reference_ms * 1e6)
+    return {
+        "hold_start": held & (frame_ns < frame_ns[:1] + length_ns),
+        "hold_end": held & (frame_ns >= start_ns - length_ns),
+    }
+
+
+def _either(places: F64, others: F64) -> F64:
+    """(m, 2) places, and where they are unknown the others."""
+    result: F64 = np.where(np.isnan(places), others, places)
+    return result
 
 
 def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:

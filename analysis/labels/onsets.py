@@ -1,9 +1,9 @@
 """The ground truth: when the first marker slips, and when the centre does.
 
 The rule is the paper's and is kept literal: a marker slips in the first frame in which it is more
-than 2 pixels from where it stood before the motion. Every accuracy and latency the project reports
-rests on these two times, so the rule stands alone here, over plain arrays, with nothing smoothed
-and nothing guessed: a frame in which a marker was not seen says nothing about it.
+than 2 pixels from where it stood when the recording began. Every accuracy and latency the project
+reports rests on these two times, so the rule stands alone here, over plain arrays, with nothing
+smoothed and nothing guessed: a frame in which a marker was not seen says nothing about it.
 """
 
 from __future__ import annotations
@@ -37,40 +37,24 @@ class Onsets:
     per_marker_ns: NDArray[np.int64]
 
 
-def offsets(
-    xy: NDArray[np.float64],
-    reference_frames: slice | NDArray[np.bool_],
-    plate_xy: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """How far each marker is from its reference position, as vectors, pixels.
-
-    The reference position is the mean over the reference frames in which the marker was seen. With
-    a plate both are taken relative to the plate's own marker, so that what remains is the motion of
-    the papilla on the plate.
+def mean_places(xy: NDArray[np.float64], frames: slice | NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean place of each marker over the frames in which it was seen, (m, 2) pixels.
 
     Args:
         xy: (n, m, 2) marker positions, pixels, NaN where a marker was not seen.
-        reference_frames: a slice of frames or an (n,) mask: the end of the hold.
-        plate_xy: (n, 2) position of the plate's marker, pixels, NaN where it is unknown.
+        frames: a slice of frames or an (n,) mask.
 
     Returns:
-        (n, m, 2) float64, NaN where the marker or the plate is unknown in that frame, or in all of
-        the reference frames.
+        NaN for a marker that was seen in none of them.
 
     Raises:
-        ValueError: shapes that do not fit, or no reference frame.
+        ValueError: shapes that do not fit, or no frame.
     """
     if xy.ndim != 3 or xy.shape[2] != 2:
         raise ValueError(f"xy has the shape {xy.shape}: must be (frames, markers, 2)")
-    if plate_xy is not None:
-        if plate_xy.shape != (xy.shape[0], 2):
-            raise ValueError(f"plate_xy has the shape {plate_xy.shape}, not {(xy.shape[0], 2)}")
-        xy = xy - plate_xy[:, None, :]
-    if not isinstance(reference_frames, slice) and (
-        reference_frames.dtype != np.bool_ or reference_frames.shape != xy.shape[:1]
-    ):
+    if not isinstance(frames, slice) and (frames.dtype != np.bool_ or frames.shape != xy.shape[:1]):
         raise ValueError(f"reference_frames must be a slice or a mask of {xy.shape[0]} frames")
-    reference = xy[reference_frames]
+    reference = xy[frames]
     if reference.shape[0] == 0:
         raise ValueError("no reference frame: the recording starts after the hold")
     seen = np.asarray(np.isfinite(reference).all(axis=2))
@@ -78,9 +62,25 @@ def offsets(
     # sums about one frame's value: the mean of equal positions must be that position to the bit
     first = reference[seen.argmax(axis=0), np.arange(xy.shape[1])]
     total = np.where(seen[:, :, None], reference - first, 0.0).sum(axis=0)
-    at_rest = first + total / np.maximum(count, 1)[:, None]
-    at_rest[count == 0] = np.nan
-    return xy - at_rest
+    mean: NDArray[np.float64] = first + total / np.maximum(count, 1)[:, None]
+    mean[count == 0] = np.nan
+    return mean
+
+
+def on_plate(xy: NDArray[np.float64], plate_xy: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Markers relative to the plate's own marker, so that what remains is motion on the plate.
+
+    Args:
+        xy: (n, m, 2) pixels. plate_xy: (n, 2) pixels, or None where no plate slides.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    if plate_xy is None:
+        return xy
+    if plate_xy.shape != (xy.shape[0], 2):
+        raise ValueError(f"plate_xy has the shape {plate_xy.shape}, not {(xy.shape[0], 2)}")
+    return xy - plate_xy[:, None, :]
 
 
 def displacements(
@@ -88,8 +88,13 @@ def displacements(
     reference_frames: slice | NDArray[np.bool_],
     plate_xy: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Lengths of `offsets`, (n, m), with the same arguments and errors."""
-    moved = offsets(xy, reference_frames, plate_xy)
+    """How far each marker is from its mean place over the reference frames, (n, m) pixels.
+
+    NaN where the marker or the plate is unknown in that frame, or in all of the reference frames.
+    Arguments and errors as for `mean_places` and `on_plate`.
+    """
+    xy = on_plate(xy, plate_xy)
+    moved = xy - mean_places(xy, reference_frames)
     return np.hypot(moved[:, :, 0], moved[:, :, 1])
 
 
@@ -107,7 +112,7 @@ def paper_onsets(
         displacement: (n, m) pixels, NaN where unknown (never a slip).
         centre: index of the centre marker.
         settings: `threshold_px`; a displacement equal to it is no slip.
-        not_before_ns: frames earlier than this are not looked at (the hold).
+        not_before_ns: frames earlier than this are not looked at.
 
     Raises:
         ValueError: shapes that do not fit, times out of order, or no such marker.

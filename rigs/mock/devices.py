@@ -41,7 +41,9 @@ class MockDevices:
         """Where streams go in this world, whose disk may be full."""
         return on_disk(sink, self.world)
 
-    def truth(self, reference_true_ns: int, threshold_px: float = 2.0) -> dict[str, Any]:
+    def truth(
+        self, reference_true_ns: int, hold_true_ns: int | None = None, threshold_px: float = 2.0
+    ) -> dict[str, Any]:
         """What really happened since `reference_true_ns`, and what the clocks truly showed.
 
         See `truth_of` and `clocks_of` in `rigs.mock.truth`.
@@ -52,7 +54,7 @@ class MockDevices:
             (self.world.now_ns if stopped_ns is None else stopped_ns),
         )
         return {
-            **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px),
+            **truth_of(self.world, self.sync.clock, reference_true_ns, threshold_px, hold_true_ns),
             "clocks": clocks_of(self.world, self.sync.clock, recorded_ns, self.timing.frames),
         }
 

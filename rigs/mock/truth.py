@@ -22,7 +22,11 @@ SLIP_MM = 1e-6
 
 
 def truth_of(
-    world: World, box: ClockMap, reference_true_ns: int, threshold_px: float = 2.0
+    world: World,
+    box: ClockMap,
+    reference_true_ns: int,
+    threshold_px: float = 2.0,
+    hold_true_ns: int | None = None,
 ) -> dict[str, Any]:
     """Onsets after the start of the slide or retraction, on the sync box's clock.
 
@@ -31,20 +35,49 @@ def truth_of(
         reference_true_ns: start of the step `slide` or `retract`; displacements are measured from
             where the tips were then.
         threshold_px: displacement in the outside picture that counts as slip.
+        hold_true_ns: start of the recorded hold, where it is wanted from there too.
 
     Returns:
         JSON, times in ns or None: `per_papilla_ns`, when each marker's displacement relative to
         the plate exceeded the threshold; `incipient_ns`, the first of them; `gross_ns`, the
         centre's; `first_slip_ns` and `slip_per_papilla_ns`, when tips physically began to slide;
         `reference_ns`; `threshold_mm`; `level` of physics; and `simulated`, which is true.
+        With `hold_true_ns` also `from_hold`: the same times and reference, everything counted
+        from the start of the hold, and `hold_slip_mm`, how far each marker moved in the hold.
         Markers' displacements are taken as linear between the rows; the onsets of sliding are
         located within them.
 
     Raises:
-        RigError: the reference is older than the history that is kept (minutes).
+        RigError: a reference is older than the history that is kept (minutes).
     """
     world.advance()
     threshold_mm = threshold_px / world.settings.frame_camera.px_per_mm
+    found = {
+        "simulated": True,
+        "level": world.settings.scene.level,
+        "threshold_mm": threshold_mm,
+        **_counted_from(world, box, reference_true_ns, threshold_mm),
+    }
+    if hold_true_ns is not None:
+        found["from_hold"] = {
+            **_counted_from(world, box, hold_true_ns, threshold_mm),
+            "hold_slip_mm": _moved_mm(world, hold_true_ns, reference_true_ns),
+        }
+    return found
+
+
+def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
+    """How far each marker is from where it stood on the plate, from one true time to another."""
+    n = len(world.physics.tips.state)
+    places = world.physics.track.at(np.array([start_ns, end_ns], np.int64))[:, : 2 * n]
+    moved = (places[1] - places[0]).reshape(n, 2)
+    return [float(mm) for mm in np.hypot(moved[:, 0], moved[:, 1])]
+
+
+def _counted_from(
+    world: World, box: ClockMap, reference_true_ns: int, threshold_mm: float
+) -> dict[str, Any]:
+    """Onsets after a true time, displacements from where the tips were then; see `truth_of`."""
     history = world.physics.track
     if reference_true_ns < history.begin_ns:
         raise RigError("simulation", "the trial is too long: its beginning is forgotten")
@@ -67,9 +100,6 @@ def truth_of(
     markers = [on_box(there(i, true_ns)) for i, true_ns in enumerate(crossed)]
     slips = [on_box(there(i, true_ns)) for i, true_ns in enumerate(began)]
     return {
-        "simulated": True,
-        "level": world.settings.scene.level,
-        "threshold_mm": threshold_mm,
         "reference_ns": box.to_reference(reference_true_ns),
         "incipient_ns": min((t for t in markers if t is not None), default=None),
         "gross_ns": markers[0],

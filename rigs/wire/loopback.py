@@ -104,9 +104,9 @@ class Loopback:
         """`sink` itself: the disk is a real one."""
         return sink
 
-    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
-        """What really happened after that moment of the arm controller's clock."""
-        found: dict[str, Any] = self._ask("truth", reference_arm_ns)
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+        """What really happened after these moments of the arm controller's clock."""
+        found: dict[str, Any] = self._ask("truth", reference_arm_ns, hold_arm_ns)
         return found
 
     # -- Plate and Operator ----------------------------------------------------------------

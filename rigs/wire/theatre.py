@@ -181,14 +181,24 @@ class Theatre:
         self._sent.clear()
         self._stamps_us.clear()
 
-    def truth(self, reference_arm_ns: int) -> dict[str, Any]:
-        """What really happened after that moment of the clock that the arm's times are told by."""
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+        """What really happened after these moments of the clock that the arm's times are told by.
+
+        See `rigs.mock.truth.truth_of`.
+        """
         self.turn()
-        if self._arm_by_host:
-            total_ns = reference_arm_ns - self._origin_ns
-        else:
-            total_ns = self._arm_clock.to_device(reference_arm_ns)
-        return truth_of(self.world, self._box.clock, total_ns - self.world.past_ns)
+
+        def true_ns(arm_ns: int) -> int:
+            if self._arm_by_host:
+                total_ns = arm_ns - self._origin_ns
+            else:
+                total_ns = int(self._arm_clock.to_device(arm_ns))
+            return total_ns - self.world.past_ns
+
+        hold_ns = None if hold_arm_ns is None else true_ns(hold_arm_ns)
+        return truth_of(
+            self.world, self._box.clock, true_ns(reference_arm_ns), hold_true_ns=hold_ns
+        )
 
     def sent(self) -> Counter[str]:
         """What was sent since the trial began, by stream; pulses of the box since its last ARM."""

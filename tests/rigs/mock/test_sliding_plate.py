@@ -1,9 +1,18 @@
 """The plate on its slider: it slips, falls, and is caught."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from protocols import Plan, Trial
+from protocols.hashing import hash_integer
+from protocols.plan import load_plan
+from rigs.build import build_rig
 from rigs.mock.devices import MockDevices, build_mock
+from rigs.rig_file import load_rig_file
+from storage.streams import Unheeded
+from tests.conftest import ROOT
 from tests.rigs.mock.driving import SMALL, gravity
 
 
@@ -47,3 +56,64 @@ def test_catching_stops_the_plate_where_it_is() -> None:
     devices.clock.wait(1.0)
     devices.world.advance()
     assert heights_mm(devices)[1][-1] == 0.0
+
+
+QUARTER_MM = 0.025
+"""A quarter of the 2 px at which a papilla counts as slipped, at 20 px/mm."""
+HEAVY = {"gravity": "mass=0.245kg", "disturbance": "disturbance=100", "pilot_gravity": "0.245kg"}
+
+
+def hold_still(plan: Plan, trial: Trial) -> dict[str, Any]:
+    """Run a trial on the simulated rig, as a campaign's first attempt, and check its hold."""
+    rig = build_rig(load_rig_file(ROOT / "rigs" / "rehearsal.yaml")[0])
+    rig.connect()
+    try:
+        for task in plan.changeovers(None, trial):
+            rig.operator.ask(task.kind, task.prompt, task.expected)
+        seed = hash_integer(trial.seed, 0)
+        truth = rig.run_trial(plan.program(trial), Unheeded(), seed, None, 100).truth
+    finally:
+        rig.close()
+    assert truth is not None
+    held = truth["from_hold"]
+    assert max(held["hold_slip_mm"]) < QUARTER_MM, trial.id
+    assert held["first_slip_ns"] > truth["reference_ns"], trial.id
+    assert held["reference_ns"] == pytest.approx(truth["reference_ns"] - 2e9, abs=1e7)
+    for onset in ("incipient_ns", "gross_ns"):  # where displacements count from does not matter
+        assert held[onset] == pytest.approx(truth[onset], abs=1e6)
+    return held
+
+
+@pytest.mark.parametrize("name", HEAVY)
+def test_the_heaviest_trials_of_shipped_protocols_hold_still(name: str) -> None:
+    plan = load_plan(ROOT / "protocols" / f"{name}.yaml")
+    heavy = [trial for trial in plan if HEAVY[name] in trial.id]
+    for trial in heavy[:: len(heavy) // 3]:
+        hold_still(plan, trial)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", HEAVY)
+def test_all_trials_of_shipped_protocols_hold_still(name: str) -> None:
+    plan = load_plan(ROOT / "protocols" / f"{name}.yaml", ["disturbance=125"] * (name[0] == "d"))
+    for trial in plan:
+        hold_still(plan, trial)
+
+
+def test_the_truth_from_the_hold_sees_a_slip_that_the_truth_from_the_motion_hides() -> None:
+    devices = build_mock(SMALL)
+    devices.world.mass_kg = 0.26
+    gravity(devices, 5)
+    track = devices.world.physics.track
+    t_ns, rows = track.between(0, track.end_ns)
+    released = int(t_ns[np.flatnonzero(rows[:, -1] < 0.0)[0]])
+    motion = released + 2_000_000_000
+    found = devices.truth(motion, released)
+    held = found["from_hold"]
+    n = len(held["per_papilla_ns"])
+    tips = track.at(np.array([released, motion]))[:, : 2 * n].reshape(2, n, 2)
+    np.testing.assert_allclose(held["hold_slip_mm"], np.linalg.norm(tips[1] - tips[0], axis=1))
+    threshold = 2.0 / SMALL.frame_camera.px_per_mm
+    assert max(held["hold_slip_mm"]) > 0.2 * threshold
+    assert held["first_slip_ns"] < found["reference_ns"] <= found["first_slip_ns"]
+    assert held["incipient_ns"] <= found["incipient_ns"]
