@@ -13,6 +13,7 @@ from protocols.quantity import (
     Millimetres,
     PositiveMillimetres,
     PositivePercent,
+    PositivePixels,
     PositiveSeconds,
     PositiveSpeed,
 )
@@ -94,6 +95,10 @@ class Gates(StrictModel):
     """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
     speed_deviation: PositivePercent = Decimal(10)
     """How far the speed may be from the one asked for, anywhere along the way."""
+    hold_slip: PositivePixels | None = None
+    """How far a papilla's marker may move in the recorded hold, on a plate that slides relative to
+    the plate; looked at where the rig hands over tracks. Videos are only tracked by `label`, which
+    doubts the trial by `analysis.labelling.hold_slip_px`. Left out, it is not looked at."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
     """How often a trial is taken again before it is set aside."""
     reference: ReferenceGate | None = None

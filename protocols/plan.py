@@ -186,8 +186,9 @@ class Plan:
         """The `collection:` section as JSON data, defaults written out."""
         data: dict[str, Any] = self.protocol.collection.model_dump(mode="json", by_alias=True)
         gates = self.protocol.collection.gates
-        if gates.reference is None:  # hashes of protocols from before it came stay
-            data["gates"].pop("reference")
+        for name in ("reference", "hold_slip"):
+            if getattr(gates, name) is None:  # hashes of protocols from before it came stay
+                data["gates"].pop(name)
         if gates.speed_deviation == Gates().speed_deviation:  # the same
             data["gates"].pop("speed_deviation")
         return data

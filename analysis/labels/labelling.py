@@ -12,10 +12,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
+from analysis.labels.camera_shift import CameraShift
 from analysis.labels.doubts import Doubts, slipped_in_hold, uncertain, unseen
-from analysis.labels.onsets import Onsets, mean_places, on_plate, paper_onsets
-from analysis.labels.places import SURE_PX, Places, places_of
+from analysis.labels.onsets import Onsets, paper_onsets
+from analysis.labels.places import Places, places_of
+from analysis.labels.rest import Reference, offsets
 from analysis.labels.slip_times import SlipTimes, slip_times
 from protocols.settings import Labelling
 from storage.recording import Recording
@@ -23,7 +24,6 @@ from storage.recording import Recording
 F64 = npt.NDArray[np.float64]
 VERSION = 4
 
-Reference = Literal["hold_start", "hold_end"]
 Results = tuple[dict[str, Any], dict[str, Any]]
 """A result's JSON and its arrays."""
 LOST_SHARE = 0.05
@@ -218,7 +218,6 @@ def label_places(
     Displacements count from the markers' mean positions over the first part of the hold, with
     which the recording begins, or over its last; in trials with a sliding plate they are taken
     relative to the plate's own marker. A marker that is hidden there counts from the other part.
-    A marker whose place is not known to a quarter of a pixel is not seen in that frame.
 
     Args:
         frame_ns: (n,) int64 on the time line. start_ns: of the slide or retraction.
@@ -227,45 +226,29 @@ def label_places(
     Raises:
         ValueError: there is no frame in the hold.
     """
-    sure = places.sigma <= SURE_PX
-    xy = on_plate(np.where(sure[..., None], places.flat_xy, np.nan), places.flat_plate)
-    sigma = np.where(sure, places.sigma, np.nan)
-    ends = hold_ends(frame_ns, start_ns, settings.reference_ms)
-    away = xy - _either(*(mean_places(xy, frames) for frames in ends.values()))
-    camera = no_shift(len(frame_ns))
-    if places.plate is None:
-        camera = camera_shift(away)
-        away = away - camera.px[:, None, :]
-        sigma = np.hypot(sigma, camera.sigma[:, None])
-    else:
-        sigma = np.hypot(sigma, places.plate.sigma[:, None])
-    first, last = (mean_places(away, frames) for frames in ends.values())
-    hold_slip_px = np.hypot(*(last - first).T)
-    held = slipped_in_hold(hold_slip_px, settings.hold_slip_px)
-    knocked = _knocked(frame_ns, camera)
+    found = offsets(places, frame_ns, start_ns, settings.reference_ms)
+    held = slipped_in_hold(found.hold_slip_px, settings.hold_slip_px)
+    knocked = _knocked(frame_ns, found.camera)
 
-    def counted(from_px: F64, not_before_ns: int) -> Counted:
-        moved = away - from_px
-        moved = np.hypot(moved[..., 0], moved[..., 1])
-        paper = paper_onsets(frame_ns, moved, centre, settings, not_before_ns)
-        doubts = (
-            held.or_else(unseen(frame_ns, moved, paper, centre, not_before_ns, start_ns))
-            .or_else(
-                uncertain(
-                    frame_ns, moved, sigma, paper, centre, settings.threshold_px, not_before_ns
-                )
-            )
-            .or_else(knocked(paper))
+    def counted(reference: Reference, from_ns: int) -> Counted:
+        away = found.counted_from(reference)
+        moved = np.hypot(away[..., 0], away[..., 1])
+        paper = paper_onsets(frame_ns, moved, centre, settings, from_ns)
+        lost = unseen(frame_ns, moved, paper, centre, from_ns, start_ns)
+        vague = uncertain(
+            frame_ns, moved, found.sigma, paper, centre, settings.threshold_px, from_ns
         )
-        return Counted(paper, doubts, moved)
+        return Counted(paper, held.or_else(lost).or_else(vague).or_else(knocked(paper)), moved)
 
     references: dict[Reference, Counted] = {
-        "hold_start": counted(_either(first, last), int(frame_ns[0])),
-        "hold_end": counted(_either(last, first), start_ns),
+        "hold_start": counted("hold_start", int(frame_ns[0])),
+        "hold_end": counted("hold_end", start_ns),
     }
-    # a change point is found near the slip, and so counts from just before the motion
-    near = away - _either(last, first)
-    slips = slip_times(frame_ns, near, sigma, centre, start_ns, exposure_ns, settings.threshold_px)
+    # change points are found near the slip, and so count from just before the motion
+    slips = slip_times(
+        frame_ns, found.counted_from("hold_end"), found.sigma, centre, start_ns, exposure_ns,
+        settings.threshold_px,
+    )  # fmt: skip
     moved = references["hold_end"].displacement_px
     slip_doubts = (
         held.or_else(unseen(frame_ns, moved, slips.onsets, centre, start_ns))
@@ -279,33 +262,12 @@ def label_places(
         slips,
         slip_doubts,
         frame_ns,
-        hold_slip_px,
+        found.hold_slip_px,
         places,
-        camera,
+        found.camera,
         start_ns,
         source,
     )
-
-
-def hold_ends(
-    frame_ns: npt.NDArray[np.int64], start_ns: int, reference_ms: float
-) -> dict[Reference, npt.NDArray[np.bool_]]:
-    """Frames of the first and the last part of the hold, with which a recording begins, (n,) each.
-
-    Args:
-        frame_ns: (n,) int64. start_ns: of the motion. reference_ms: length of each part.
-    """
-    held, length_ns = frame_ns < start_ns, int(reference_ms * 1e6)
-    return {
-        "hold_start": held & (frame_ns < frame_ns[:1] + length_ns),
-        "hold_end": held & (frame_ns >= start_ns - length_ns),
-    }
-
-
-def _either(places: F64, others: F64) -> F64:
-    """(m, 2) places, and where they are unknown the others."""
-    result: F64 = np.where(np.isnan(places), others, places)
-    return result
 
 
 def _knocked(frame_ns: npt.NDArray[np.int64], camera: CameraShift) -> Any:

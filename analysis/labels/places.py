@@ -75,7 +75,10 @@ def places_of(recording: Recording) -> Places:
         video = track_video(recording.frames(), layout, with_plate)
         return from_tracks(video.markers, video.plate, tuple(geometry["frame_px"]))
     if recording.has_tracks:
-        return _handed_over(recording, with_plate)
+        tracks = recording.tracks()
+        if with_plate and tracks.plate_px is None:
+            raise ValueError(f"{recording.trial_id}: its tracks lack the plate's marker")
+        return handed_over(tracks.markers_px, tracks.plate_px if with_plate else None)
     raise ValueError(f"{recording.trial_id}: has neither video nor tracks to label from")
 
 
@@ -89,19 +92,18 @@ def from_tracks(
     return Places(markers.xy, markers.sigma, markers.quality, plate, plane)
 
 
-def _handed_over(recording: Recording, with_plate: bool) -> Places:
-    tracks = recording.tracks()
-    seen = np.asarray(np.isfinite(tracks.markers_px).all(axis=2))
+def handed_over(markers_px: F64, plate_px: F64 | None) -> Places:
+    """Places as a camera hands them over.
+
+    Args:
+        markers_px: (n, m, 2), NaN where a marker was not seen. plate_px: (n, 2), likewise, or None.
+    """
+    seen = np.asarray(np.isfinite(markers_px).all(axis=2))
     sigma, quality = np.where(seen, TRACKS_PX, np.nan), seen.astype(np.float64)
-    if not with_plate:
-        return Places(tracks.markers_px, sigma, quality)
-    if tracks.plate_px is None:
-        raise ValueError(f"{recording.trial_id}: its tracks lack the plate's marker")
-    ok = np.asarray(np.isfinite(tracks.plate_px).all(axis=1))
+    if plate_px is None:
+        return Places(markers_px, sigma, quality)
+    ok = np.asarray(np.isfinite(plate_px).all(axis=1))
     plate = PlateTrack(
-        tracks.plate_px,
-        np.full((len(ok), 4, 2), np.nan),
-        ok,
-        np.where(ok, TRACKS_PLATE_PX, np.nan),
+        plate_px, np.full((len(ok), 4, 2), np.nan), ok, np.where(ok, TRACKS_PLATE_PX, np.nan)
     )
-    return Places(tracks.markers_px, sigma, quality, plate)
+    return Places(markers_px, sigma, quality, plate)

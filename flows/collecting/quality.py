@@ -13,13 +13,17 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from analysis.labels.places import handed_over
+from analysis.labels.rest import offsets
 from analysis.timeline.synchronise import TrialSync, streams_of, synchronise
 from flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
 from protocols.conditions import Gates
+from protocols.settings import Labelling
 from protocols.timing import Timing
 from rigs.rig import TrialRun
+from storage.columns import TRACKS
 from storage.hdf5 import StreamReader
-from storage.streams import I64
+from storage.streams import I64, StepTimes
 from storage.writer import DATA
 
 UNVOUCHED_S = 0.3
@@ -75,6 +79,7 @@ def assess(
         streams = streams_of(reader, mid_exposure_ns)
         event_us = reader.event_times()
         pose_mm = reader.column("poses/xyz")
+        tracks = [reader.column(name) for name in TRACKS if reader.has(name)]
     sync = synchronise(streams, timing, rate_hz)
     results = _sync_gates(sync, gates, run, mid_exposure_ns is not None)
     if mid_exposure_ns is not None:
@@ -93,6 +98,13 @@ def assess(
         "limit": gates.event_burst,
         "passed": burst <= gates.event_burst,
     }
+    if gates.hold_slip is not None and tracks:
+        slip, slip_limit = _hold_slip_px(streams.frame_ns, tracks, sync, run), gates.hold_slip
+        results["hold_slip_px"] = {
+            "value": slip,
+            "limit": float(slip_limit),
+            "passed": 0 <= slip <= float(slip_limit),
+        }
     away = path_deviation_mm(streams.pose_ns, pose_mm, run.ways)
     away_limit = float(gates.path_deviation)
     results["path_deviation_mm"] = {
@@ -181,7 +193,7 @@ def _event_gap(event_us: I64, sync: TrialSync, run: TrialRun) -> float:
     """
     if "events" not in sync.devices or "arm" not in sync.devices or not len(event_us):
         return -1.0
-    moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
+    moving = _moving(run)
     arm, events = (sync.devices[name].map for name in ("arm", "events"))
     start, end = (
         int(events.to_device(int(arm.to_reference(t)))) // 1000
@@ -190,6 +202,32 @@ def _event_gap(event_us: I64, sync: TrialSync, run: TrialRun) -> float:
     inside = event_us[np.searchsorted(event_us, start) : np.searchsorted(event_us, end, "right")]
     edges = np.concatenate([[start], inside, [end]])
     return float(np.max(np.diff(edges))) / 1e6
+
+
+def _moving(run: TrialRun) -> StepTimes:
+    """The slide or the retraction."""
+    return next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
+
+
+def _hold_slip_px(frame_ns: I64, tracks: list[Any], sync: TrialSync, run: TrialRun) -> float:
+    """How far the marker that moved most in the recorded hold did so, px.
+
+    -1 when it cannot be told, because a clock has no map or no marker was seen at both ends.
+
+    Args:
+        tracks: markers (n, m, 2), and perhaps the plate's marker (n, 2), px.
+    """
+    if "frames" not in sync.devices or "arm" not in sync.devices:
+        return -1.0
+    times = np.asarray(sync.devices["frames"].map.to_reference(frame_ns))
+    start_ns = int(sync.devices["arm"].map.to_reference(_moving(run).start_ns))
+    held = times < start_ns
+    if not held.any():
+        return -1.0
+    markers, plate = (*(column[held].astype(np.float64) for column in tracks), None)[:2]
+    places = handed_over(markers, plate)
+    moved = offsets(places, times[held], start_ns, Labelling().reference_ms).hold_slip_px
+    return float(np.nanmax(moved)) if np.isfinite(moved).any() else -1.0
 
 
 @njit(cache=True, nogil=True)

@@ -228,9 +228,9 @@ def test_a_disturbance_is_sideways_motion_at_its_share_of_the_speed() -> None:
         side = 1 if dict(trial.condition)["side"] == "right" else -1
         retract = next(s for s in plan.program(trial).steps if s.phase == "retract")
         assert isinstance(retract, Move)
-        assert retract.to.x_mm == pytest.approx(side * share * 3.6)
-        seconds = 3.6 / 0.5
-        assert retract.speed_mm_s * seconds == pytest.approx(3.6 * (1 + share**2) ** 0.5)
+        assert retract.to.x_mm == pytest.approx(side * share * 4.2)
+        seconds = 4.2 / 0.5
+        assert retract.speed_mm_s * seconds == pytest.approx(4.2 * (1 + share**2) ** 0.5)
 
 
 def test_people_are_asked_in_outer_blocks_only() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from flows.planning.changes import MOST, differences, told
 from flows.planning.orders import describe_campaign, make_order
@@ -91,11 +92,26 @@ def test_hashes_of_protocols_that_ship_stay() -> None:
     """Campaigns that were begun before a key came go on."""
     known = {
         "kinematic": "a3e25ea978e4264238f892545d9bf72cd3fdedd908a3109a2e7768918d960a4b",
+        "gravity": "321273f535d61abbd06e7e85b4047352b8591c8e5e62aad11694544842f27e2b",
+        "disturbance": "447dae83d2d994b5459cf17d5c125a2a71602de61ee25bd8de5f72ce32c4fd55",
+    }
+    for name, expected in known.items():
+        assert load_plan(ROOT / "protocols" / f"{name}.yaml").collection_hash == expected
+
+
+def test_hashes_of_protocols_that_shipped_before_stay(tmp_path: Path) -> None:
+    """Those that pressed to 3.4 mm, and knew no gate on slips in the hold."""
+    known = {
         "gravity": "216c0d7da5cdb00f69778b43dc3ee162182afd0e40aecd176d9ba4a4651909de",
         "disturbance": "373b0f9ad136bbd656036b6b4ebbefa777a53ba8925e8781a5f1bcca7a0652b2",
     }
     for name, expected in known.items():
-        assert load_plan(ROOT / "protocols" / f"{name}.yaml").collection_hash == expected
+        data = yaml.safe_load((ROOT / "protocols" / f"{name}.yaml").read_text())
+        collection = data["collection"]
+        collection["motion"][2]["depth"] = "3.4 mm"
+        collection["motion"][6]["distance"] = collection["limits"]["depth"] = "3.6 mm"
+        del collection["gates"]["hold_slip"]
+        assert load_plan(write(tmp_path / f"{name}.yaml", data)).collection_hash == expected
 
 
 def test_a_changed_rig_and_levels_that_are_gone_are_said(tmp_path: Path) -> None:
