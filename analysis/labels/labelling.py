@@ -28,6 +28,8 @@ Results = tuple[dict[str, Any], dict[str, Any]]
 """A result's JSON and its arrays."""
 LOST_SHARE = 0.05
 """A marker that is lost in more of the frames than this is named in the flags."""
+HOLD_SLIP_PX = 1.0
+"""One that moved further than this in the hold is counted there."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +120,9 @@ class Label:
             f"marker {marker} was lost in {lost[marker]:.0%} of the frames"
             for marker in np.flatnonzero(lost > LOST_SHARE)
         ]
-        if self.doubts.incipient is not None and "in the hold" in self.doubts.incipient:
-            found.append(self.doubts.incipient)
+        slipped = self.hold_slip_px[self.hold_slip_px > HOLD_SLIP_PX]
+        if len(slipped):
+            found.append(f"markers that moved in the hold: {len(slipped)}, by {slipped.max():.1f} px")
         if self.places.plate_lost:
             found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
         if self.places.tilted:

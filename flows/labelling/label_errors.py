@@ -12,13 +12,15 @@ from storage.derived import Derived
 from storage.store import Store
 
 KINDS = ("incipient", "gross")
+REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
 """The step of `flows.labelling.label_check`, and where its own store stands."""
 _TRUTH = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
 }
-"""What a rule's onset is held against: the true crossing, or the true start of the slip."""
+"""What a rule's onset is held against: the true crossing, counted from the same end of the hold, or
+the true start of the slip in the motion."""
 
 
 def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
@@ -68,6 +70,40 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     }
 
 
+def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+    """Slips in the hold by campaign, and how far apart onsets from its two ends are.
+
+    For each campaign `trials`; `slipped`, how many moved by more than `limit_px` (the protocol's
+    `analysis.labelling.hold_slip_px`); `most_px`; and `apart_ms`, a spread by kind of the paper's
+    onset counted from the hold's end less the one from its start, doubted or not. Labels from
+    before they knew both ends are left out.
+    """
+    found = {}
+    for item in campaigns:
+        labels = Derived.of(store, LABELS, item.name)
+        known = [label for trial, _ in item.trials for label in (labels.read(trial.id),)]
+        known = [label for label in known if "references" in label]
+        if not known:
+            continue
+        most = [max((px for px in label["hold_slip_px"] if px is not None), default=0.0)
+                for label in known]  # fmt: skip
+        limit = item.settings.labelling.hold_slip_px
+        apart: dict[str, list[float]] = {kind: [] for kind in KINDS}
+        for label in known:
+            for kind in KINDS:
+                start, end = (label["references"][at][f"{kind}_ns"] for at in REFERENCES)
+                if start is not None and end is not None:
+                    apart[kind].append((end - start) / 1e6)
+        found[item.name] = {
+            "trials": len(known),
+            "slipped": sum(limit is not None and px > limit for px in most),
+            "limit_px": limit,
+            "most_px": max(most),
+            "apart_ms": {kind: spread(values) for kind, values in apart.items()},
+        }
+    return found
+
+
 def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, list[float]]]:
     """Every trial's distance of each rule's onset from its own truth, ms, by rule and kind.
 
@@ -109,8 +145,11 @@ def _cases(store: Store, campaigns: list[Collected]) -> Any:
             label = labels.read(trial.id)
             centre = int(recording.record["geometry"]["centre"])
             for rule, keys in _TRUTH.items():
+                told = truth
+                if truth is not None and rule == "paper" and label.get("reference") == "hold_start":
+                    told = truth.get("from_hold", truth)  # records from before know the motion's
                 for kind in KINDS:
-                    true = None if truth is None else truth.get(keys[kind])
+                    true = None if told is None else told.get(keys[kind])
                     yield rule, kind, label, true[centre] if isinstance(true, list) else true
 
 

@@ -65,7 +65,11 @@ def section(
         "How exact the labels are",
         said,
         [_figure(store, campaigns, simulated)],
-        [Table(columns, rows, "One frame is 10 ms."), *_doubted(store, campaigns)],
+        [
+            Table(columns, rows, "One frame is 10 ms."),
+            *_holds(summary["labels"]["holds"]),
+            *_doubted(store, campaigns),
+        ],
     )
 
 
@@ -138,6 +142,35 @@ def _doubted(store: Store, campaigns: list[Collected]) -> list[Table]:
     return [
         Table(("campaign", "onset", "trials", "in doubt because"), rows, "Doubted onsets are none.")
     ]
+
+
+def _holds(holds: dict[str, Any]) -> list[Table]:
+    """Slips in the hold, and what it would matter from which end displacements count."""
+    if not holds:
+        return []
+    rows = [
+        [
+            name,
+            str(found["trials"]),
+            str(found["slipped"]),
+            number(found["most_px"], 2),
+            *(
+                number(found["apart_ms"][kind][key], 0)
+                for kind in KINDS
+                for key in ("median", "max_abs")
+            ),
+        ]
+        for name, found in holds.items()
+    ]
+    columns = (
+        "campaign", "trials", "slipped in the hold", "most (px)", "incipient apart, median (ms)",
+        "largest (ms)", "gross apart, median (ms)", "largest (ms)",
+    )  # fmt: skip
+    words = (
+        "Slips in the recorded hold leave a trial's onsets in doubt. Apart: the paper's onset with "
+        "displacements counted from the hold's end less the one counted from its start."
+    )
+    return [Table(columns, rows, words)]
 
 
 def _ruling(summary: dict[str, Any]) -> str:

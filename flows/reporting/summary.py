@@ -6,7 +6,7 @@ from collections import Counter
 from importlib.metadata import version
 from typing import Any
 
-from flows.labelling.label_errors import read_check
+from flows.labelling.label_errors import holds_compared, read_check
 from flows.learning import other_networks
 from flows.learning.train import training_settings
 from flows.learning.window_baselines import EVALUATION, beside
@@ -89,6 +89,7 @@ def make_summary(
             "source": _sources(campaigns),
             "reviewed": evaluation.get("reviewed"),
             "check": read_check(store),
+            "holds": holds_compared(store, campaigns),
         },
         "detection": evaluation["detection"],
         "choices": evaluation["choices"],

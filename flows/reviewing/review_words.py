@@ -78,7 +78,7 @@ def flags(shown: Shown) -> str:
         limit = "" if gate["limit"] is None else f" (limit {gate['limit']:g})"
         cells.append((f"<td{mark}>{escape(name)}</td>", f"{_plain(gate['value'])}{limit}"))
     label = shown.label
-    for name in ("source", "rule", "markers_lost", "plate_lost", "camera_moved_px"):
+    for name in ("source", "rule", "reference", "markers_lost", "plate_lost", "camera_moved_px"):
         if label.get(name) is not None:
             cells.append((f"<td>{name}</td>", escape(_plain(label[name]))))
     if label.get("quality"):

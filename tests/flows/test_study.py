@@ -94,6 +94,12 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Out
     assert {"min", "mean", "std", "median", "detected_first"} <= set(lead)
     assert summary["disturbance"]["trials"] == 0
     assert summary["labels"]["source"] == {"video": 0, "tracks": 8}
+    for campaign, trials in (("tiny", 6), ("tiny_gravity", 2)):
+        held = summary["labels"]["holds"][campaign]
+        assert (held["trials"], held["slipped"], held["limit_px"]) == (trials, 0, 1.0)
+        assert held["most_px"] < 0.1
+        assert held["apart_ms"]["incipient"]["n"] == trials
+        assert held["apart_ms"]["incipient"]["max_abs"] <= 10.0  # a frame, by noise
     assert summary["sync"]["grade"] == "hardware trigger"
     assert summary["quality"] == {
         "planned": 8, "committed": 8, "retaken": 0, "quarantined": 0, "interrupted": 0
