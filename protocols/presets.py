@@ -34,6 +34,7 @@ class Value:
 
 PAPER = (
     Value("labelling.rule", "paper", "published", "rule of the labels"),
+    Value("labelling.reference", "hold_start", "published", "displacements count from"),
     Value("labelling.threshold_px", 2.0, "published", "displacement that is slip (px)"),
     Value("windows.length_ms", 30, "published", "window (ms)"),
     Value("windows.step_ms", 1, "published", "time step (ms)"),

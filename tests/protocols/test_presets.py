@@ -15,6 +15,7 @@ from tests.conftest import ROOT
 
 PUBLISHED: dict[str, Any] = {
     "labelling.rule": "paper",
+    "labelling.reference": "hold_start",
     "labelling.threshold_px": 2,
     "windows.length_ms": 30,
     "windows.step_ms": 1,
