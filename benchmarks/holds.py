@@ -70,6 +70,8 @@ CANDIDATES = (
     Candidate("3.8 mm", 3.8),
     Candidate("3.8 mm, release over 2 s, settling 3 s", 3.8, release=2.0, settle=3.0),
     Candidate("3.9 mm", 3.9),
+    Candidate("3.9 mm, found 0.05 mm too shallow", 3.85),
+    Candidate("3.9 mm, skin 6", 3.9, scene={"skin": {"seed": 6}}),
     Candidate("**4.0 mm**", 4.0),
     Candidate("4.0 mm, found 0.05 mm too shallow", 3.95),
     *(Candidate(f"4.0 mm, skin {n}", 4.0, scene={"skin": {"seed": n}}) for n in range(2, 7)),
