@@ -122,7 +122,8 @@ class Label:
         ]
         slipped = self.hold_slip_px[self.hold_slip_px > HOLD_SLIP_PX]
         if len(slipped):
-            found.append(f"markers that moved in the hold: {len(slipped)}, by {slipped.max():.1f} px")
+            most = slipped.max()
+            found.append(f"markers that moved in the hold: {len(slipped)}, by {most:.1f} px")
         if self.places.plate_lost:
             found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
         if self.places.tilted:
