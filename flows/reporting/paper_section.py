@@ -16,7 +16,6 @@ from analysis.pictures.report import Section, Table, number, percent
 Json = dict[str, Any]
 
 _COLUMNS = ("figure", "paper")
-_OF_ONE = ("95 % over trials", "n")
 _DIFFERENCES = ("setting", "paper", "here", "the paper's value is")
 _SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
 """A difference that no setting makes."""
@@ -28,12 +27,11 @@ def section(summary: Json) -> Section:
     simulated = " (simulated)" if summary["simulated"] else ""
     networks = {f"here{simulated}": summary}
     networks |= {f"{_title(found)}{simulated}": found for found in summary["networks"].values()}
-    columns = [*_COLUMNS, *(name for title in networks for name in (title, *_OF_ONE))]
+    columns = [*_COLUMNS, *networks]
     each = [[*_windows(found), *_times(found)] for found in networks.values()]
-    rows = [
-        [*same[0][: len(_COLUMNS)], *(cell for row in same for cell in row[len(_COLUMNS) :])]
-        for same in zip(*each, strict=True)
-    ]
+    same = list(zip(*each, strict=True))
+    rows = [[*row[0][:2], *(_with_interval(*of[2:4]) for of in row)] for row in same]
+    counts = [[row[0][0], *(of[4] for of in row)] for row in same]
     said = summary["paper"]
     differences = [
         [row["setting"], row["paper"], row["here"], row["source"]] for row in said["differences"]
@@ -44,16 +42,17 @@ def section(summary: Json) -> Section:
             "The paper's figures were measured by its authors on their own robot and skin; those "
             f"of this report are {kind}. They are different things of the same name: a figure that "
             "agrees proves nothing about the other, and where they differ either may be right.",
-            f"The paper does not say, and here is assumed: {'; '.join(said['assumed'])}.",
+            f"The paper does not say the following; the values here: {'; '.join(said['assumed'])}.",
             *(_how(found) for found in summary["networks"].values()),
         ],
         (),
         [
             Table(
                 columns, rows,
-                "Intervals draw whole trials again, windows of a trial together. Accuracy of raw "
-                "spike counts, ties shared.",
+                "In brackets 95 % over trials, windows of a trial together. Accuracy of raw spike "
+                "counts, ties shared.",
             ),
+            Table(["figure", *networks], counts, "How many windows and trials each figure is of."),
             Table(
                 _DIFFERENCES, [*differences, _SCANNED],
                 "In which settings the network here"
@@ -62,6 +61,10 @@ def section(summary: Json) -> Section:
             ),
         ],
     )  # fmt: skip
+
+
+def _with_interval(value: str, interval: str) -> str:
+    return value if interval == "–" else f"{value} ({interval})"
 
 
 def _title(network: Json) -> str:

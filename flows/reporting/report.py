@@ -32,7 +32,7 @@ from storage.files import make_folder, read_json, write_json, write_text
 from storage.store import Store, safe_name
 
 STEP = "report"
-VERSION = 8
+VERSION = 10
 
 
 def report_folder(store: Store) -> Path:

@@ -153,10 +153,12 @@ def _paper(campaigns: list[Collected]) -> dict[str, Any]:
          "source": each.source}
         for each, here in settings.overrides
     ]  # fmt: skip
-    assumed = [f"{each.words} {_said(at(settings, each.key))}" for each in PAPER
+    assumed = [f"{each.words}: {_said(at(settings, each.key))}" for each in PAPER
                if each.source == "assumed"]  # fmt: skip
     if depths:
-        assumed.append(f"press depth of gravity and disturbance trials {', '.join(sorted(depths))}")
+        assumed.append(
+            f"press depth of gravity and disturbance trials: {', '.join(sorted(depths))}"
+        )
     return {"preset": settings.preset, "differences": rows, "assumed": assumed}
 
 

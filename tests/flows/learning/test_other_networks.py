@@ -17,8 +17,10 @@ from analysis.nets.dataset import trial_windows
 from analysis.nets.network import spike_counts
 from analysis.nets.training import restore
 from flows.labelling.reviewed import Labels
+from flows.learning.evaluate import evaluate, evaluation_of
 from flows.learning.other_networks import STEP, judge_model
 from flows.learning.samples import load_samples
+from flows.learning.train import train
 from flows.planning.orders import Order
 from flows.reporting.report import read_summary, report
 from flows.running.campaigns import collected
@@ -66,6 +68,30 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
         read_summary(store)["networks"]["preset-paper"]["kinematic"]["accuracy"]
         == (expected["accuracy"])
     )
+
+
+def test_the_preset_by_itself_is_the_network_that_stood_beside(
+    store: Store, tmp_path: Path
+) -> None:
+    beside = Derived.of(store, STEP).read("preset-paper")
+    shutil.copytree(store.folder, tmp_path / "store")
+    for item in collected(Store.open(tmp_path / "store")):
+        file = item.campaign.protocol_file
+        data = yaml.safe_load(file.read_text())
+        data["analysis"]["preset"] = "paper"
+        file.write_text(yaml.safe_dump(data))
+    alone = Store.open(tmp_path / "store")
+    campaigns = collected(alone)
+    assert train(alone, campaigns)["done"] == 1
+    models = alone.folder / "models"
+    assert (models / "seed0.pt").read_bytes() == (models / "paper-seed0.pt").read_bytes()
+    assert evaluate(alone, campaigns)["done"] == 1
+    _, found = evaluation_of(alone)
+    assert found["windows"]["accuracy"] == beside["windows"]["accuracy"]
+    assert found["trials"] == beside["trials"]
+    report(alone, campaigns)
+    said = read_summary(alone)["paper"]
+    assert (said["preset"], said["differences"]) == ("paper", [])
 
 
 def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
