@@ -108,7 +108,7 @@ def check(job: tuple[RigFile, Plan, Trial, dict[str, Any], bool]) -> Checked:
     size = rig.frame_px(plan)
     assert size is not None
     label = label_places(
-        from_tracks(markers, plate, size), frame_ns, 0, Labelling(), centre=0,
+        from_tracks(markers, plate, size), frame_ns, (0, int(frame_ns[-1])), Labelling(), centre=0,
         exposure_ns=2 * rig.scene.frame_camera.exposure_us * 500, source="video",
     )  # fmt: skip
     off = markers.xy - np.concatenate(true.places)

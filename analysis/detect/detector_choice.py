@@ -15,10 +15,8 @@ import numpy as np
 from scipy.special import betaincinv
 
 from analysis.detect.detectors import Detector, Evidence, Labelled, Levels, decide, first_above
-from analysis.detect.latency import (
-    TrialLatency,
-    score_trial,
-)
+from analysis.detect.latency import TrialLatency, score_trial
+from analysis.detect.true_slip import TrueSlip
 
 
 @dataclass(frozen=True)
@@ -26,13 +24,12 @@ class Judged:
     """A trial's evidence with its true onsets."""
 
     evidence: Evidence
-    incipient_ns: int
-    gross_ns: int
+    slip: TrueSlip
 
 
 def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
     """What a detector makes of trials."""
-    return [Judged(detector.hear(t.heard), t.incipient_ns, t.gross_ns) for t in trials]
+    return [Judged(detector.hear(t.heard), t.slip) for t in trials]
 
 
 def allowed_early(rate: float, trials: int) -> int:
@@ -66,7 +63,7 @@ def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> L
 
     incipient = level(
         [
-            _highest(t.evidence.incipient, t.evidence, 0, t.incipient_ns - false_early_ns)
+            _highest(t.evidence.incipient, t.evidence, 0, t.slip.incipient_ns - false_early_ns)
             for t in trials
         ]
     )
@@ -77,7 +74,7 @@ def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> L
             highest.append(-np.inf)
             continue
         gross = t.evidence.gross_after(first)
-        highest.append(_highest(gross, t.evidence, first + 1, t.gross_ns - false_early_ns))
+        highest.append(_highest(gross, t.evidence, first + 1, t.slip.gross_ns - false_early_ns))
     return Levels(incipient, level(highest))
 
 
@@ -89,20 +86,17 @@ def _highest(values: Any, evidence: Evidence, start: int, before_ns: int) -> flo
 
 def outcomes(trials: Sequence[Judged], levels: Levels, false_early_ns: int) -> list[TrialLatency]:
     """Each trial's detections against its true onsets."""
-    return [
-        score_trial(decide(t.evidence, levels), t.incipient_ns, t.gross_ns, false_early_ns)
-        for t in trials
-    ]
+    return [score_trial(decide(t.evidence, levels), t.slip, false_early_ns) for t in trials]
 
 
 def merit(scored: Sequence[TrialLatency]) -> tuple[float, float]:
-    """Median and 95th percentile incipient latency, ms, with a missed onset as infinitely late.
+    """Median and 95th percentile incipient latency, ms; a missed or late one counts as infinite.
 
     So a detector cannot better its median by missing what is hard. False early trials are left
     out: they are bounded apart.
     """
     late = [
-        np.inf if t.missed_incipient else t.latency_incipient_ms
+        np.inf if t.latency_incipient_ms is None else t.latency_incipient_ms
         for t in scored
         if not t.false_early_incipient
     ]

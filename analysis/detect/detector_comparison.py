@@ -93,7 +93,7 @@ def thinned(trial: Labelled, every: int) -> Labelled:
     """A trial with each `every`-th of its windows, the first one among them."""
     heard = trial.heard
     kept = Heard(heard.counts[::every], heard.events[::every], heard.end_ns[::every])
-    return Labelled(kept, trial.incipient_ns, trial.gross_ns)
+    return Labelled(kept, trial.slip)
 
 
 def _detectors(
@@ -168,7 +168,7 @@ def _summary(
     for trial, score in zip(trials, scored, strict=True):
         found = decide(trial.evidence, levels).incipient_ns
         if score.false_early_incipient and found is not None:
-            before.append((trial.incipient_ns - found) / 1e6)
+            before.append((trial.slip.incipient_ns - found) / 1e6)
     return {
         "false_early_before_ms": sorted(before),
         "false_early_rate": {"value": early / len(scored), "low": low, "high": high},

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from analysis.detect.detection import Found, lead_of
 from analysis.detect.hidden_markov import Chain, fit_chain, forward, log_odds
 from analysis.detect.sequential import cusum
+from analysis.detect.true_slip import TrueSlip
 from analysis.detect.window_likelihood import Likelihood, fit_histograms, fit_logistic
 from analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, NO_SLIP
 
@@ -55,16 +56,15 @@ class Heard:
 
 @dataclass(frozen=True)
 class Labelled:
-    """A trial with its true onsets, nanoseconds on the time line of its windows."""
+    """A trial with its true slip, on the time line of its windows."""
 
     heard: Heard
-    incipient_ns: int
-    gross_ns: int
+    slip: TrueSlip
 
     def states(self, length_ns: int) -> IntArray:
         """The class that each window of this length holds most of, by its middle; int64 (n,)."""
         middle = self.heard.end_ns - length_ns // 2
-        return (middle >= self.incipient_ns).astype(np.int64) + (middle >= self.gross_ns)
+        return (middle >= self.slip.incipient_ns).astype(np.int64) + (middle >= self.slip.gross_ns)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """How late a detector is, and how far ahead of gross slip, without rewarding false alarms.
 
 A detector that cries slip at once would have the best latency and the longest lead. So each
-detection is first judged: missed, false early, or counted; only the counted ones have times, and
-the three numbers always add up to the trials.
+detection is first judged: missed, false early, late, or counted; only the counted ones have times,
+and the four numbers always add up to the trials. Without the bound on late ones a detector that
+says gross slip for as long as the plate lies still would miss nothing.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from analysis.detect.detection import Found
+from analysis.detect.true_slip import TrueSlip, is_false_early, is_late
 
 Summary = dict[str, float | int | None]
 
@@ -24,57 +26,68 @@ class TrialLatency:
 
     Attributes:
         latency_incipient_ms: detection minus true onset; negative down to the tolerance where it
-            came early; None where missed or false early.
+            came early; None where missed, false early or late.
         latency_gross_ms: the same for gross slip.
-        lead_ms: true gross onset minus incipient detection; negative where the detection came
-            after gross slip began; None where the incipient detection is missed or false early.
+        lead_ms: true gross onset minus incipient detection, above zero; None where the incipient
+            detection is not counted.
+        late_incipient_ms, late_gross_ms: a late detection minus the event's end, zero or more;
+            None where it is not late.
         missed_incipient, missed_gross: there was no detection.
         false_early_incipient, false_early_gross: it came before the true onset by more than the
             tolerance.
-        detected_first: the incipient detection counts and came before gross slip began.
     """
 
     latency_incipient_ms: float | None
     latency_gross_ms: float | None
     lead_ms: float | None
+    late_incipient_ms: float | None
+    late_gross_ms: float | None
     missed_incipient: bool
     missed_gross: bool
     false_early_incipient: bool
     false_early_gross: bool
-    detected_first: bool
+
+    @property
+    def uncounted(self) -> tuple[int, int, int, int]:
+        """Numbers, 0 or 1, against a choice's bounds: false early, then missed or late, by onset.
+
+        Incipient slip stands before gross slip.
+        """
+        return (
+            int(self.false_early_incipient),
+            int(self.false_early_gross),
+            int(self.missed_incipient or self.late_incipient_ms is not None),
+            int(self.missed_gross or self.late_gross_ms is not None),
+        )
 
 
-def score_trial(
-    detections: Found, incipient_ns: int, gross_ns: int, false_early_ns: int
-) -> TrialLatency:
-    """Judge one trial.
+def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
+    """Judge one trial; see `analysis.detect.true_slip`.
 
     Args:
         detections: what the detector said.
-        incipient_ns, gross_ns: true onsets, on the same time line, nanoseconds.
+        slip: what is true, on the same time line.
         false_early_ns: a detection earlier than the true onset by MORE than this is false.
 
     Raises:
-        ValueError: gross slip truly begins before incipient slip, or a negative tolerance.
+        ValueError: a negative tolerance.
     """
-    if gross_ns < incipient_ns:
-        raise ValueError(f"gross onset {gross_ns} ns is before incipient onset {incipient_ns} ns")
     if false_early_ns < 0:
         raise ValueError(f"false_early_ns = {false_early_ns}: must not be negative")
-    incipient, early_incipient = _judge(detections.incipient_ns, incipient_ns, false_early_ns)
-    gross, early_gross = _judge(detections.gross_ns, gross_ns, false_early_ns)
-    lead = None
-    if incipient is not None and detections.incipient_ns is not None:
-        lead = _ms(gross_ns - detections.incipient_ns)
+    found, gross_found = detections.incipient_ns, detections.gross_ns
+    early, late, counted = _judge(found, slip.incipient_ns, slip.gross_ns, false_early_ns)
+    early_gross, late_gross, gross = _judge(gross_found, slip.gross_ns, slip.end_ns, false_early_ns)
+    lead = None if counted is None or found is None else _ms(slip.gross_ns - found)
     return TrialLatency(
-        latency_incipient_ms=incipient,
+        latency_incipient_ms=counted,
         latency_gross_ms=gross,
         lead_ms=lead,
-        missed_incipient=detections.incipient_ns is None,
-        missed_gross=detections.gross_ns is None,
-        false_early_incipient=early_incipient,
+        late_incipient_ms=late,
+        late_gross_ms=late_gross,
+        missed_incipient=found is None,
+        missed_gross=gross_found is None,
+        false_early_incipient=early,
         false_early_gross=early_gross,
-        detected_first=lead is not None and lead > 0,
     )
 
 
@@ -82,18 +95,16 @@ def summarise_latency(trials: Sequence[TrialLatency]) -> dict[str, Summary]:
     """Latency over trials: ``{"incipient": {...}, "gross": {...}}``.
 
     Each holds mean, std, median, p95, min, max (milliseconds) over the n counted detections, and
-    missed and false_early; ``n + missed + false_early`` is the number of trials.
+    missed, late and false_early; the four numbers add up to the trials.
     """
     return {
         "incipient": {
             **_describe([t.latency_incipient_ms for t in trials]),
-            "missed": sum(t.missed_incipient for t in trials),
-            "false_early": sum(t.false_early_incipient for t in trials),
+            **_not_counted(trials, "incipient"),
         },
         "gross": {
             **_describe([t.latency_gross_ms for t in trials]),
-            "missed": sum(t.missed_gross for t in trials),
-            "false_early": sum(t.false_early_gross for t in trials),
+            **_not_counted(trials, "gross"),
         },
     }
 
@@ -101,24 +112,32 @@ def summarise_latency(trials: Sequence[TrialLatency]) -> dict[str, Summary]:
 def summarise_lead(trials: Sequence[TrialLatency]) -> Summary:
     """Lead over trials: min, mean, std, median, p95, max (milliseconds) over n counted leads.
 
-    A late incipient detection stays in, as a negative lead; ``detected_first`` counts the
-    positive ones. ``n + missed + false_early`` is the number of trials.
+    ``detected_first`` is n under the name that readers look for; missed, late and false_early are
+    those of the incipient detection.
     """
+    found = _describe([t.lead_ms for t in trials])
+    return {**found, "detected_first": found["n"], **_not_counted(trials, "incipient")}
+
+
+def _not_counted(trials: Sequence[TrialLatency], kind: str) -> dict[str, int]:
     return {
-        **_describe([t.lead_ms for t in trials]),
-        "detected_first": sum(t.detected_first for t in trials),
-        "missed": sum(t.missed_incipient for t in trials),
-        "false_early": sum(t.false_early_incipient for t in trials),
+        "missed": sum(getattr(t, f"missed_{kind}") for t in trials),
+        "late": sum(getattr(t, f"late_{kind}_ms") is not None for t in trials),
+        "false_early": sum(getattr(t, f"false_early_{kind}") for t in trials),
     }
 
 
-def _judge(found: int | None, true: int, tolerance: int) -> tuple[float | None, bool]:
-    """(latency in ms or None, whether it was false early)."""
+def _judge(
+    found: int | None, onset: int, end: int, tolerance: int
+) -> tuple[bool, float | None, float | None]:
+    """Whether it was false early; by how much it was late, and its latency if it counts, in ms."""
     if found is None:
-        return None, False
-    if found < true - tolerance:
-        return None, True
-    return _ms(found - true), False
+        return False, None, None
+    if is_false_early(found, onset, tolerance):
+        return True, None, None
+    if is_late(found, end):
+        return False, _ms(found - end), None
+    return False, None, _ms(found - onset)
 
 
 def _ms(difference_ns: int) -> float:

@@ -16,22 +16,46 @@ import numpy.typing as npt
 
 from analysis.detect.detection import lead_of
 from analysis.detect.detector_choice import allowed_early
+from analysis.detect.true_slip import NEVER, is_false_early, is_late
 from analysis.nets.metrics import GROSS, INCIPIENT
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
-
-NEVER = np.iinfo(np.int64).max
-"""The time of what was not detected."""
+Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Trials:
-    """True onsets of trials and what counts as too early, int64 (n,), ns."""
+    """True slip of trials and what counts as too early, int64 (n,), ns."""
 
     incipient_ns: I64
     gross_ns: I64
+    end_ns: I64
     tolerance_ns: I64
+
+    def uncounted(self, found: I64) -> Uncounted:
+        """What of detections does not count.
+
+        Args:
+            found: int64 (n, ..., 2), incipient and gross, `NEVER` where there is none.
+        """
+        onset, over = (
+            np.stack(pair, axis=-1).reshape(len(found), *[1] * (found.ndim - 2), 2)
+            for pair in ((self.incipient_ns, self.gross_ns), (self.gross_ns, self.end_ns))
+        )
+        tolerance = self.tolerance_ns.reshape(len(found), *[1] * (found.ndim - 1))
+        return Uncounted(
+            is_false_early(found, onset, tolerance), found == NEVER, is_late(found, over)
+        )
+
+
+@dataclass(frozen=True)
+class Uncounted:
+    """Masks over detections, (n, ..., 2) as these: at most one is true of each."""
+
+    false_early: Mask
+    missed: Mask
+    late: Mask
 
 
 @dataclass(frozen=True)
@@ -43,9 +67,12 @@ class Figures:
         gross_mean_ms: the same of gross slip.
         lead_min_ms: shortest lead of gross slip's true onset over a counted detection.
         missed, missed_gross: shares of trials without a detection.
+        late, late_gross: shares of trials whose detection came after the event.
         false_early, false_early_gross: shares of trials whose detection came too early.
         false_early_either: of trials where either did.
         missed_either: of trials where either is missing.
+        late_either: of trials where either came late.
+        lost_either: of trials where either is missing or late.
         trials: how many.
     """
 
@@ -56,6 +83,10 @@ class Figures:
     missed: float
     missed_gross: float
     missed_either: float
+    late: float
+    late_gross: float
+    late_either: float
+    lost_either: float
     false_early: float
     false_early_gross: float
     false_early_either: float
@@ -100,30 +131,24 @@ def _first(lead: F64, margin: float, start: int) -> int | None:
 
 def worth(found: I64, trials: Trials) -> Figures:
     """One pair's detections int64 (n, 2) against the true onsets of n trials, n at least 1."""
-    incipient, gross = (found[:, k] for k in (0, 1))
-    missed, missed_gross = incipient == NEVER, gross == NEVER
-    early = incipient < trials.incipient_ns - trials.tolerance_ns
-    early_gross = gross < trials.gross_ns - trials.tolerance_ns
-    counted, counted_gross = ~(missed | early), ~(missed_gross | early_gross)
-    late = (incipient - trials.incipient_ns)[counted] / 1e6
-    late_gross = (gross - trials.gross_ns)[counted_gross] / 1e6
-    lead = (trials.gross_ns - incipient)[counted] / 1e6
-
-    def share(which: npt.NDArray[np.bool_]) -> float:
-        return float(which.mean())
-
+    out = trials.uncounted(found)
+    counted = ~(out.false_early | out.missed | out.late)
+    incipient, gross = (found[:, k][counted[:, k]] for k in (0, 1))
+    late = (incipient - trials.incipient_ns[counted[:, 0]]) / 1e6
+    late_gross = (gross - trials.gross_ns[counted[:, 1]]) / 1e6
+    lead = (trials.gross_ns[counted[:, 0]] - incipient) / 1e6
+    shares = {}
+    for name, mask in vars(out).items():
+        shares[name], shares[f"{name}_gross"] = mask.mean(axis=0).tolist()
+        shares[f"{name}_either"] = float(mask.any(axis=1).mean())
     return Figures(
         mean_ms=float(late.mean()) if late.size else None,
         p95_ms=float(np.percentile(late, 95)) if late.size else None,
         gross_mean_ms=float(late_gross.mean()) if late_gross.size else None,
         lead_min_ms=float(lead.min()) if lead.size else None,
-        missed=share(missed),
-        missed_gross=share(missed_gross),
-        missed_either=share(missed | missed_gross),
-        false_early=share(early),
-        false_early_gross=share(early_gross),
-        false_early_either=share(early | early_gross),
+        lost_either=float((out.missed | out.late).any(axis=1).mean()),
         trials=len(found),
+        **shares,
     )
 
 
@@ -134,20 +159,18 @@ def choose_pair(
 
     Args:
         found: int64 (n, smoothings, margins, 2), n at least 1.
-        rate: share of the trials that may be false early, and missed, for either onset.
+        rate: share of the trials that may be false early, and missed or late, for either onset.
     """
-    incipient, gross = found[..., 0], found[..., 1]
-    true = trials.incipient_ns[:, None, None]
-    tolerance = trials.tolerance_ns[:, None, None]
-    early = incipient < true - tolerance
-    early_gross = gross < trials.gross_ns[:, None, None] - tolerance
-    missed, missed_gross = incipient == NEVER, gross == NEVER
-    late = np.where(missed, np.inf, (np.where(missed, true, incipient) - true) / 1e6)
+    out = trials.uncounted(found)
+    early, lost = out.false_early, out.missed | out.late
+    incipient = found[..., 0]
+    latency = (incipient - trials.incipient_ns[:, None, None]) / 1e6
+    late = np.where(lost[..., 0], np.inf, latency)
     allowed = allowed_early(rate, len(found))
 
     def rank(s: int, m: int) -> tuple[float, ...]:
-        amiss = [int(e[:, s, m].sum()) for e in (early, early_gross, missed, missed_gross)]
-        values = np.sort(late[:, s, m][~early[:, s, m]])
+        amiss = [*early[:, s, m].sum(axis=0).tolist(), *lost[:, s, m].sum(axis=0).tolist()]
+        values = np.sort(late[:, s, m][~early[:, s, m, 0]])
         median = float(np.median(values)) if values.size else np.inf
         high = np.inf
         if values.size:

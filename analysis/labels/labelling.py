@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.labels.camera_shift import CameraShift
-from analysis.labels.doubts import Doubts, slipped_in_hold, uncertain, unseen
-from analysis.labels.onsets import Onsets, paper_onsets
+from analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
+from analysis.labels.onsets import Onsets, paper_onsets, rest_time
 from analysis.labels.places import Places, places_of
 from analysis.labels.rest import Reference, offsets
 from analysis.labels.slip_times import SlipTimes, slip_times
@@ -22,7 +22,7 @@ from protocols.settings import Labelling
 from storage.recording import Recording
 
 F64 = npt.NDArray[np.float64]
-VERSION = 4
+VERSION = 5
 
 Results = tuple[dict[str, Any], dict[str, Any]]
 """A result's JSON and its arrays."""
@@ -59,6 +59,9 @@ class Label:
         frame_ns: (n,) int64, middle of exposure of every frame on the time line.
         hold_slip_px: (m,) float64, how far each marker moved in the hold, from its first to its
             last part; NaN where unknown.
+        start_ns, stop_ns: of the slide or retraction.
+        rest_ns: where the plate came to rest after that began; None where none moved, or it was
+            not seen to rest.
     """
 
     rule: Literal["paper", "change_point"]
@@ -71,6 +74,8 @@ class Label:
     places: Places
     camera: CameraShift
     start_ns: int
+    stop_ns: int
+    rest_ns: int | None
     source: str
 
     @property
@@ -97,6 +102,14 @@ class Label:
     def doubts(self) -> Doubts:
         """Of the ones that rule."""
         return self.paper_doubts if self.rule == "paper" else self.slip_doubts
+
+    @property
+    def end_ns(self) -> int:
+        """Where slip ended: the plate came to rest after gross onset, or the motion ended."""
+        gross = self.onsets.gross_ns
+        if self.rest_ns is not None and (gross is None or self.rest_ns > gross):
+            return min(self.rest_ns, self.stop_ns)
+        return self.stop_ns
 
     @property
     def markers_lost(self) -> int:
@@ -126,6 +139,8 @@ class Label:
             found.append(f"markers that moved in the hold: {len(slipped)}, by {most:.1f} px")
         if self.places.plate_lost:
             found.append(f"the plate's marker was not seen in {self.places.plate_lost} frames")
+        if self.places.plate is not None and self.onsets.gross_ns is not None and not self.rest_ns:
+            found.append("the plate was not seen to rest: its slip ends with the motion")
         if self.places.tilted:
             found.append("the plate is seen askew: displacements are in its plane")
         return found
@@ -139,6 +154,7 @@ class Label:
             "incipient_ns": None if doubts.incipient else onsets.incipient_ns,
             # without the first slip nothing is made of the second
             "gross_ns": None if doubts.incipient or doubts.gross else onsets.gross_ns,
+            "end_ns": self.end_ns,
             "doubts": _doubts_json(doubts),
             "first_marker": onsets.first_marker,
             "per_marker_ns": onsets.per_marker_ns.tolist(),
@@ -194,12 +210,12 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
         ValueError: the trial has neither video nor tracks, or its markers cannot be told apart.
     """
     frame_ns = recording.frame_times()
-    start_ns = recording.step(recording.motion_phase)[0]
+    motion_ns = recording.step(recording.motion_phase)
     timing = recording.record.get("timing") or {}
     return label_places(
         places_of(recording),
         frame_ns,
-        start_ns,
+        motion_ns,
         settings,
         centre=int(recording.record["geometry"]["centre"]),
         exposure_ns=2 * int(timing.get("mid_exposure_ns") or 0),
@@ -210,7 +226,7 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
 def label_places(
     places: Places,
     frame_ns: npt.NDArray[np.int64],
-    start_ns: int,
+    motion_ns: tuple[int, int],
     settings: Labelling,
     *,
     centre: int,
@@ -224,12 +240,13 @@ def label_places(
     relative to the plate's own marker. A marker that is hidden there counts from the other part.
 
     Args:
-        frame_ns: (n,) int64 on the time line. start_ns: of the slide or retraction.
+        frame_ns: (n,) int64 on the time line. motion_ns: start and end of slide or retraction.
         exposure_ns: how long the shutter was open.
 
     Raises:
         ValueError: there is no frame in the hold.
     """
+    start_ns, stop_ns = motion_ns
     found = offsets(places, frame_ns, start_ns, settings.reference_ms)
     held = slipped_in_hold(found.hold_slip_px, settings.hold_slip_px)
     knocked = _knocked(frame_ns, found.camera)
@@ -248,6 +265,9 @@ def label_places(
         "hold_start": counted("hold_start", int(frame_ns[0])),
         "hold_end": counted("hold_end", start_ns),
     }
+    rest_ns, moving = None, frame_ns >= start_ns
+    if (plate := places.flat_plate) is not None and moving.any():
+        rest_ns = rest_time(frame_ns[moving], plate[moving], settings.threshold_px, MAX_UNSEEN_NS)
     # change points are found near the slip, and so count from just before the motion
     slips = slip_times(
         frame_ns, found.counted_from("hold_end"), found.sigma, centre, start_ns, exposure_ns,
@@ -270,6 +290,8 @@ def label_places(
         places,
         found.camera,
         start_ns,
+        stop_ns,
+        rest_ns,
         source,
     )
 

@@ -1,4 +1,4 @@
-"""The ground truth: when the first marker slips, and when the centre does.
+"""The ground truth: when the first marker slips, when the centre does, when a plate rests again.
 
 The rule is the paper's and is kept literal: a marker slips in the first frame in which it is more
 than 2 pixels from where it stood when the recording began. Every accuracy and latency the project
@@ -145,3 +145,26 @@ def paper_onsets(
         first_marker=int(in_first.argmax()),
         per_marker_ns=np.where(slipped, frame_ns[frame], NO_ONSET).astype(np.int64),
     )
+
+
+def rest_time(
+    frame_ns: NDArray[np.int64], xy: NDArray[np.float64], within_px: float, unseen_ns: int
+) -> int | None:
+    """The time of the first frame from which on something stays where it ends up, ns.
+
+    The threshold that tells a slip's beginning tells its end: a place no farther than `within_px`
+    from the last one. What is still moving in the last frames comes to rest there.
+
+    Args:
+        frame_ns: (n,) int64, the frames' times, strictly increasing.
+        xy: (n, 2) places, pixels, NaN where unknown.
+        unseen_ns: with nothing seen for longer than this at the end, it may move out of sight.
+
+    Returns:
+        None where it never went farther, or where it was not seen at the end.
+    """
+    seen = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    if not len(seen) or frame_ns[-1] - frame_ns[seen[-1]] > unseen_ns:
+        return None
+    away = np.flatnonzero(np.hypot(*(xy[seen] - xy[seen[-1]]).T) > within_px)
+    return int(frame_ns[seen[away[-1] + 1]]) if len(away) else None

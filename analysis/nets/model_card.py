@@ -168,10 +168,10 @@ def latency_table(detection: Mapping[str, Any]) -> list[str]:
     for experiment, found in detection.items():
         for onset, values in found["latency_ms"].items():
             times = [ms(values[name]) for name in ("mean", "median", "max")]
-            lost = [values["missed"], values["false_early"]]
+            lost = [values[name] for name in ("missed", "late", "false_early")]
             rows.append([experiment, onset, found["trials"], *times, *lost])
     columns = ["experiment", "onset", "trials", "mean ms", "median ms", "most ms"]
-    return table([*columns, "missed", "false early"], rows)
+    return table([*columns, "missed", "late", "false early"], rows)
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

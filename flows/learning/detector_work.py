@@ -8,6 +8,7 @@ from typing import Any
 from analysis.detect.detector_comparison import Parts, compare
 from analysis.detect.detectors import Heard, Labelled
 from analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
+from analysis.detect.true_slip import TrueSlip, true_slip
 from flows.labelling.reviewed import Labels
 from flows.learning.detector_trials import Wanted, heard, want
 from flows.running.campaigns import Collected, training_campaigns
@@ -22,8 +23,7 @@ class Known:
 
     wanted: Wanted
     label: str
-    incipient_ns: int
-    gross_ns: int
+    slip: TrueSlip
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ def detector_work(
         found: list[Known] = []
         for item in used:
             for _, recording in item.of_split(split):
-                label = labels.read(item, recording)
-                if label["incipient_ns"] is None or label["gross_ns"] is None:
+                slip = true_slip(labels.read(item, recording))
+                if slip is None:
                     continue
                 if most is not None and len(found) >= most:
                     return found
@@ -134,8 +134,7 @@ def detector_work(
                     Known(
                         hear(item.name, recording, stride_ms, carried),
                         labels.key(item, recording),
-                        label["incipient_ns"],
-                        label["gross_ns"],
+                        slip,
                     )
                 )
         return found
@@ -177,13 +176,9 @@ def _parts(store: Store, known: dict[str, list[Known]] | None) -> Parts | None:
 
 def _labelled(store: Store, trial: Known) -> Labelled:
     arrays = heard(store, trial.wanted)
-    return Labelled(
-        Heard(arrays["counts"], arrays["events"], arrays["end_ns"]),
-        trial.incipient_ns,
-        trial.gross_ns,
-    )
+    return Labelled(Heard(arrays["counts"], arrays["events"], arrays["end_ns"]), trial.slip)
 
 
 def _counted(store: Store, trial: Known) -> Counted:
     arrays = heard(store, trial.wanted)
-    return Counted(arrays["counts"], arrays["end_ns"], trial.incipient_ns, trial.gross_ns)
+    return Counted(arrays["counts"], arrays["end_ns"], trial.slip)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from flows.running.cluster import Cluster
 
 STEP = "evaluation"
-VERSION = 3
+VERSION = 4
 NAME = "evaluation"
 FORMAT = [VERSION, window_scores.VERSION]
 """Stands in an evaluation, so that who reads it knows that its keys are those of today."""

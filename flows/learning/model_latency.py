@@ -7,6 +7,7 @@ from typing import Any
 
 from analysis.detect.detection import detect
 from analysis.detect.latency import score_trial, summarise_latency
+from analysis.detect.true_slip import true_slip
 from analysis.nets import dataset, training
 from analysis.nets.quantised import Quantised, chip_run, quantised_net
 from analysis.nets.training import Fitted
@@ -37,15 +38,14 @@ def latencies(
         rule = rules[item.name]
         for _, recording in item.of_split("test"):
             on_trial()
-            label = labels.read(item, recording)
-            onsets = (label["incipient_ns"], label["gross_ns"])
-            if None in onsets:
+            slip = true_slip(labels.read(item, recording))
+            if slip is None:
                 continue
             x, end_ns = dataset.trial_windows(recording, fitted.windows)
             both = fast.counts(x), chip_run(chip, x.dense()).counts
             for rows, counts in zip(found, both, strict=True):
                 said = detect(counts, end_ns, rule)
-                scored = score_trial(said, *onsets, round(rule.false_early_ms * 1e6))
+                scored = score_trial(said, slip, round(rule.false_early_ms * 1e6))
                 rows.setdefault(item.experiment, []).append(scored)
     real, chips = map(_summary, found)
     return real, chips

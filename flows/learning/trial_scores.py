@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from analysis.detect.detection import detect
 from analysis.detect.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from analysis.detect.true_slip import true_slip
 from flows.running.campaigns import Collected
 from protocols import Trial
 from protocols.settings import Detection
@@ -28,22 +29,23 @@ def score_row(
     """Onsets, detections and latency of a trial; ``latency`` is None without both onsets.
 
     Args:
-        label: with ``incipient_ns`` and ``gross_ns``, None where there is none.
+        label: see `analysis.detect.true_slip.true_slip`.
         counts, end_ns: spikes of consecutive windows (n, 3), and where these end (n,), ns.
     """
     detections = detect(counts, end_ns, settings)
-    incipient, gross = label["incipient_ns"], label["gross_ns"]
+    slip = true_slip(label)
     latency = None
-    if incipient is not None and gross is not None:
+    if slip is not None:
         tolerance = round(settings.false_early_ms * 1e6)
-        latency = asdict(score_trial(detections, incipient, gross, tolerance))
+        latency = asdict(score_trial(detections, slip, tolerance))
     return {
         "campaign": item.name,
         "experiment": item.experiment,
         "trial": trial.id,
         "condition": item.plan.describe(trial),
-        "incipient_ns": incipient,
-        "gross_ns": gross,
+        "incipient_ns": label["incipient_ns"],
+        "gross_ns": label["gross_ns"],
+        "end_ns": None if slip is None else slip.end_ns,
         "detected_incipient_ns": detections.incipient_ns,
         "detected_gross_ns": detections.gross_ns,
         "latency": latency,

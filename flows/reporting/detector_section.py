@@ -25,8 +25,8 @@ _COLUMNS = (
     "false early in validation",
     "false early in test (95 %)",
     "incipient, median / 95 % (ms)",
-    "missed",
-    "gross, median (ms)",
+    "missed, late",
+    "gross, median (ms); missed, late",
     "lead, median (ms)",
 )
 
@@ -136,16 +136,21 @@ def _tables(entries: list[tuple[dict[str, Any], str]], trials: int) -> list[Tabl
 
 
 def _cells(rate: dict[str, Any]) -> list[str]:
-    test, incipient = rate["test"], rate["test"]["latency_ms"]["incipient"]
+    test = rate["test"]
+    incipient, gross = (test["latency_ms"][kind] for kind in ("incipient", "gross"))
     share = test["false_early_rate"]
     return [
         str(rate["validation"]["latency_ms"]["incipient"]["false_early"]),
         f"{incipient['false_early']} ({100 * share['low']:.0f} to {percent(share['high'], 0)})",
         f"{number(incipient['median'], 0)} / {number(incipient['p95'], 0)}",
-        str(incipient["missed"]),
-        number(test["latency_ms"]["gross"]["median"], 0),
+        _lost(incipient),
+        f"{number(gross['median'], 0)}; {_lost(gross)}",
         number(test["lead_ms"]["median"], 0),
     ]
+
+
+def _lost(found: dict[str, Any]) -> str:
+    return f"{found['missed']}, {found['late']}"
 
 
 def _best(entries: list[tuple[dict[str, Any], str]]) -> list[str]:

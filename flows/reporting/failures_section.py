@@ -16,7 +16,7 @@ MOST = 60
 """Rows of the table; `summary.json` has all trials."""
 _FAILED = ("missed", "false_early", "late", "without_onsets")
 """Outcomes of an incipient detection that are failures, the worst first."""
-_GROSS = ("missed", "false_early")
+_GROSS = ("missed", "late", "false_early")
 _COLUMNS = (
     "look at the trial", "what went wrong", "incipient latency (ms)", "gross latency (ms)",
     "lead (ms)",
@@ -72,8 +72,14 @@ def _wrong(row: Json) -> list[str]:
     if row["outcome"] in _FAILED:
         found.append(f"incipient {WORDS[row['outcome']]}")
     if row["gross"] in _GROSS:
-        found.append(f"gross {WORDS[row['gross']]}")
+        found.append(f"gross {_gross_word(row)}")
     return found
+
+
+def _gross_word(row: Json) -> str:
+    if row["gross"] == "late":
+        return f"late, {row['late_gross_ms']:.0f} ms after it ended"
+    return WORDS[row["gross"]]
 
 
 def _rank(row: Json) -> int:

@@ -29,12 +29,17 @@ _NAMES = {
     "latency_gross_ms": "gross latency",
     "lead_ms": "lead",
 }
-_STATISTICS = ("n", "mean", "median", "p95", "std", "min", "max", "missed", "false_early")
+_STATISTICS = ("n", "mean", "median", "p95", "std", "min", "max", "missed", "late",
+               "false_early")  # fmt: skip
 _HEADINGS = ("n", "mean (95 %)", "median (95 %)", "95th percentile (95 %)", "std", "min", "max",
-             "missed", "false early")  # fmt: skip
+             "missed", "late", "false early")  # fmt: skip
 _DOTS = "A dot is a trial, the diamond the mean, the bar its 95 % interval over trials"
 _LATE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
 """Which entry of a trial says why a value is missing."""
+_LATE_WORDS = (
+    "Incipient slip ends where gross slip begins, and gross slip where the plate comes to rest or "
+    "the slide ends: a detection from then on is late, and counts neither as latency nor as lead."
+)
 
 
 def kinematic(
@@ -63,7 +68,8 @@ def kinematic(
         "Detection latency, kinematic test trials",
         [
             "Detection minus true onset. A detection more than 30 ms before the true onset is a "
-            "false early detection: it is counted, and it has no latency.",
+            f"false early detection: it is counted, and it has no latency. {_LATE_WORDS}",
+            *_late_words("kinematic", summary),
             *_choice(evaluation, campaigns, "kinematic"),
             *(text for name in shown for text in _trends(found, name)),
         ],
@@ -102,8 +108,9 @@ def gravity(
         "Gravity trials: a plate slips by its own weight",
         [
             _lead_words("gravity", summary),
-            "Lead is the true gross onset minus the incipient detection. A false early detection "
-            "is no lead; a detection after gross slip began has a negative one.",
+            "Lead is the true gross onset minus the incipient detection. A false early or late "
+            f"detection is no lead. {_LATE_WORDS}",
+            *_late_words("gravity", summary),
             *_choice(evaluation, campaigns, "gravity"),
             *(text for name in VALUES for text in _trends(found, name)),
         ],
@@ -139,6 +146,7 @@ def disturbance(
             _lead_words("disturbance", summary),
             f"Mean and standard deviation of the lead: {_plus_minus(summary)} here, "
             f"{mean.value:.0f} ± {DISTURBANCE_LEAD_STD_MS:.0f} ms in the paper (on its robot).",
+            *_late_words("disturbance", summary),
             *_choice(evaluation, campaigns, "disturbance"),
             *(text for name in VALUES for text in _trends(found, name)),
         ],
@@ -188,7 +196,8 @@ def _lacking(rows: Sequence[Json], quantity: str) -> str:
     if quantity not in _LATE:
         count = sum(row[quantity] is None for row in rows)
         return f"{count} without onset" if count else ""
-    short = {"missed": "missed", "false_early": "early", "without_onsets": "no onset"}
+    short = {"missed": "missed", "late": "late", "false_early": "early",
+             "without_onsets": "no onset"}  # fmt: skip
     causes = [row[_LATE[quantity]] for row in rows if row[quantity] is None]
     return ", ".join(f"{causes.count(k)} {word}" for k, word in short.items() if k in causes)
 
@@ -202,6 +211,20 @@ def _lead_words(experiment: str, summary: Json) -> str:
         f"before gross slip{'; ' + others if others else ''}. The smallest lead is "
         f"{number(lead['min'], 0, 'ms')}, the mean {_with(lead['mean'], span, 0)} ms."
     )
+
+
+def _late_words(experiment: str, summary: Json) -> list[str]:
+    """By how much late detections came after their events; nothing where none was late."""
+    words = []
+    for kind in ("incipient", "gross"):
+        late = [
+            row[f"late_{kind}_ms"]
+            for row in summary["trials"]
+            if row["experiment"] == experiment and row[f"late_{kind}_ms"] is not None
+        ]
+        if late:
+            words.append(f"{kind}: {len(late)}, by {min(late):.0f} to {max(late):.0f} ms")
+    return [f"Late after the event: {'; '.join(words)}."] if words else []
 
 
 def _plus_minus(summary: Json) -> str:

@@ -140,7 +140,8 @@ def _times(summary: Json) -> list[list[str]]:
                 f"{PAPER[f'{kind}_latency'].text} after onset",
                 number(found["mean"], 0, "ms"),
                 _span(span),
-                f"{found['n']} trials; {found['missed']} missed, {found['false_early']} early",
+                f"{found['n']} trials; {found['missed']} missed, {found['late']} late, "
+                f"{found['false_early']} early",
             ]
         )
     lead, accounts = summary["gravity"]["lead_ms"], summary["gravity"]["accounted"]

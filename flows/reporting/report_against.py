@@ -40,8 +40,10 @@ _SHARES = {
     "detected_first": ("outcome", "detected before gross slip"),
     "false_early": ("outcome", "incipient false early"),
     "missed": ("outcome", "incipient missed"),
+    "late": ("outcome", "incipient late"),
     "gross_false_early": ("gross", "gross false early"),
     "gross_missed": ("gross", "gross missed"),
+    "gross_late": ("gross", "gross late"),
 }
 
 

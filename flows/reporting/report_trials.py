@@ -34,6 +34,8 @@ WORDS = {
     "not_taken": "not taken",
 }
 VALUES = ("duration_ms", "latency_incipient_ms", "latency_gross_ms", "lead_ms")
+LATE = ("late_incipient_ms", "late_gross_ms")
+"""By how much a late detection came after its event."""
 
 
 def outcome(row: Json) -> str:
@@ -41,11 +43,7 @@ def outcome(row: Json) -> str:
     found = row["latency"]
     if found is None:
         return "without_onsets"
-    if found["missed_incipient"]:
-        return "missed"
-    if found["false_early_incipient"]:
-        return "false_early"
-    return "detected_first" if found["detected_first"] else "late"
+    return _verdict(found, "incipient", "detected_first")
 
 
 def told(row: Json) -> Json:
@@ -61,17 +59,22 @@ def told(row: Json) -> Json:
         "outcome": outcome(row),
         "gross": _gross(row),
         "duration_ms": length,
-        **{name: found.get(name) for name in VALUES[1:]},
+        **{name: found.get(name) for name in (*VALUES[1:], *LATE)},
     }
 
 
 def _gross(row: Json) -> str:
     found = row["latency"]
-    if found is None:
-        return "without_onsets"
-    if found["missed_gross"]:
+    return "without_onsets" if found is None else _verdict(found, "gross", "detected")
+
+
+def _verdict(found: Json, kind: str, counted: str) -> str:
+    """What became of one of a trial's detections."""
+    if found[f"missed_{kind}"]:
         return "missed"
-    return "false_early" if found["false_early_gross"] else "detected"
+    if found[f"false_early_{kind}"]:
+        return "false_early"
+    return counted if found[f"late_{kind}_ms"] is None else "late"
 
 
 def accounted(campaigns: Sequence[Collected], rows: Sequence[Json], experiment: str) -> Json:

@@ -32,7 +32,7 @@ FIGURES = {
     ("test", "mean_ms"): ("mean latency (ms)", 1.0, 0),
     ("test", "p95_ms"): ("95th percentile (ms)", 1.0, 0),
     ("test", "false_early_either"): ("false early (%)", 100.0, 1),
-    ("test", "missed_either"): ("missed (%)", 100.0, 1),
+    ("test", "lost_either"): ("missed or late (%)", 100.0, 1),
     ("work", "us_per_s"): ("work (µs/s)", 1.0, 0),
     ("work", "synaptic_operations_per_s"): ("synaptic operations (million/s)", 1e-6, 2),
 }

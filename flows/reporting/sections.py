@@ -60,14 +60,15 @@ def headline(summary: Json) -> list[Number]:
         Number(
             "incipient latency",
             number(latency["median"], 0, "ms"),
-            f"median of {latency['n']}; {latency['missed']} missed, "
+            f"median of {latency['n']}; {latency['missed']} missed, {latency['late']} late, "
             f"{latency['false_early']} false early; {clock_words.short_note(summary)}"
             f"{_chosen_on_test(summary)}",
         ),
         Number(
             "gravity lead",
             number(lead["median"], 0, "ms"),
-            f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}; "
+            f"median; smallest {number(lead['min'], 0, 'ms')}, n = {lead['n']}, "
+            f"{lead['missed']} missed, {lead['late']} late; "
             f"{clock_words.short_note(summary)}{_chosen_on_test(summary)}",
         ),
         Number("clock uncertainty", uncertain, f"worst trial, {device}"),

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.detect.rule_sweep import Trials
+from analysis.detect.true_slip import true_slip
 from analysis.nets import dataset
 from analysis.nets.dataset import SampleSet
 from flows.labelling.reviewed import Labels
@@ -62,7 +63,7 @@ class Used:
     @property
     def both(self) -> bool:
         """Whether both onsets are known."""
-        return self.label["incipient_ns"] is not None and self.label["gross_ns"] is not None
+        return true_slip(self.label) is not None
 
     @property
     def named(self) -> list[str]:
@@ -167,13 +168,15 @@ class Data:
 
 
 def true_onsets(part: Sequence[Used]) -> Trials:
-    """The true onsets of trials with both, and how early is too early."""
+    """The true slip of trials with both onsets, and how early is too early."""
 
     def column(values: list[int]) -> npt.NDArray[np.int64]:
         return np.array(values, np.int64)
 
+    slips = [slip for used in part if (slip := true_slip(used.label)) is not None]
     return Trials(
-        column([used.label["incipient_ns"] for used in part]),
-        column([used.label["gross_ns"] for used in part]),
+        column([slip.incipient_ns for slip in slips]),
+        column([slip.gross_ns for slip in slips]),
+        column([slip.end_ns for slip in slips]),
         column([round(used.item.settings.detection.false_early_ms * 1e6) for used in part]),
     )

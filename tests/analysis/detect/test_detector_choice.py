@@ -17,6 +17,7 @@ from analysis.detect.detector_choice import (
 from analysis.detect.detectors import Evidence, Levels
 from analysis.detect.latency import TrialLatency
 from analysis.detect.smoothing_choice import Counted, choose_smoothing, settled
+from analysis.detect.true_slip import TrueSlip
 from protocols.settings import Detection
 
 MS = 1_000_000
@@ -28,8 +29,7 @@ def judged(incipient: list[float], gross: list[float], onset: int = 4, second: i
     ends = 30 * MS * np.arange(1, n + 1, dtype=np.int64)
     return Judged(
         Evidence(ends, np.array(incipient, float), lambda first: np.array(gross, float)),
-        onset * 30 * MS,
-        second * 30 * MS,
+        TrueSlip(onset * 30 * MS, second * 30 * MS, (n + 1) * 30 * MS),
     )
 
 
@@ -94,7 +94,7 @@ def test_an_interval_of_nothing_is_everything() -> None:
 
 def scored(latency: float | None, early: bool = False) -> TrialLatency:
     return TrialLatency(
-        latency, None, None, latency is None and not early, True, early, False, False
+        latency, None, None, None, None, latency is None and not early, True, early, False
     )
 
 
@@ -105,9 +105,12 @@ def test_a_missed_onset_is_late_and_a_false_one_is_left_out() -> None:
     assert merit([]) == (np.inf, np.inf)
 
 
-def counted(rows: list[tuple[int, int, int]], onset: int) -> Counted:
+def counted(
+    rows: list[tuple[int, int, int]], onset: int, gross: int = 99, end: int = 100
+) -> Counted:
     ends = 30 * MS * np.arange(1, len(rows) + 1, dtype=np.int64)
-    return Counted(np.array(rows), ends, onset * 30 * MS, 99 * 30 * MS)
+    slip = TrueSlip(onset * 30 * MS, gross * 30 * MS, end * 30 * MS)
+    return Counted(np.array(rows), ends, slip)
 
 
 def test_the_quickest_pair_within_the_bound_is_chosen() -> None:
@@ -129,8 +132,7 @@ def test_the_bound_holds_for_gross_slip_too() -> None:
     # one window of gross slip long before it truly begins: it fools a single window only
     quiet, slip, stray, gross = (9, 0, 0), (0, 9, 0), (0, 0, 9), (0, 0, 9)
     rows = [*[quiet] * 8, *[slip] * 8, stray, *[slip] * 8, *[gross] * 6]
-    one = counted(rows, 8)
-    trial = Counted(one.counts, one.end_ns, one.incipient_ns, 25 * 30 * MS)
+    trial = counted(rows, 8, 25)
     ask = Detection(smoothing_grid=(1, 4), margin_grid=(2.0,), false_early_rate=0.0)
     choice = choose_smoothing([trial], ask, "validation")
     assert (choice.smoothing, choice.false_early, choice.false_early_gross) == (4, 0, 0)
@@ -142,8 +144,7 @@ def test_a_margin_that_some_trials_never_reach_is_not_chosen() -> None:
 
     def trial(slip: tuple[int, int, int]) -> Counted:
         rows = [*[quiet] * 3, stray, *[quiet] * 4, *[slip] * 8, *[gross] * 8]
-        one = counted(rows, 8)
-        return Counted(one.counts, one.end_ns, one.incipient_ns, 16 * 30 * MS)
+        return counted(rows, 8, 16)
 
     trials = [trial((0, 9, 0)), trial((0, 9, 0)), trial((0, 3, 0))]
     ask = Detection(smoothing_grid=(1, 4), margin_grid=(1.0, 5.0), false_early_rate=0.0)
@@ -152,6 +153,18 @@ def test_a_margin_that_some_trials_never_reach_is_not_chosen() -> None:
     assert (choice.missed, choice.missed_gross, choice.false_early) == (0, 0, 0)
     quick = choose_smoothing(trials[:2], ask, "validation")
     assert (quick.smoothing, quick.margin) == (1, 5.0)
+
+
+def test_gross_slip_that_is_seen_after_its_end_keeps_no_bound() -> None:
+    # the plate slides for four windows and then lies still; its signal outlasts it in the average
+    quiet, slip, gross = (9, 0, 0), (0, 9, 0), (0, 0, 9)
+    rows = [*[quiet] * 4, *[slip] * 8, *[gross] * 12]
+    ask = Detection(smoothing_grid=(1, 6), margin_grid=(6.0,), false_early_rate=0.0)
+    slow = ask.model_copy(update={"smoothing_grid": (6,)})
+    late = choose_smoothing([counted(rows, 4, 12, 16)], slow, "validation")
+    assert (late.late, late.late_gross, late.missed_gross) == (0, 1, 0)
+    found = choose_smoothing([counted(rows, 4, 12, 16)], ask, "validation")
+    assert (found.smoothing, found.late_gross) == (1, 0)
 
 
 def test_where_nothing_keeps_the_bound_the_fewest_are_taken_and_said() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from analysis.detect.detector_comparison import Parts, compare, thinned
 from analysis.detect.detectors import Heard, Labelled
+from analysis.detect.true_slip import TrueSlip
 from protocols.settings import Comparison, Detection, Windows
 
 MS = 1_000_000
@@ -31,7 +32,8 @@ def trial(seed: int, stride: int) -> Labelled:
     sums = np.concatenate([np.zeros((1, 3), int), fired.cumsum(axis=0)])
     ends = np.arange(30, end + 1, stride)
     counts = sums[ends] - sums[ends - 30]
-    return Labelled(Heard(counts, counts.sum(axis=1), ends * MS), onset * MS, gross * MS)
+    slip = TrueSlip(onset * MS, gross * MS, int(ends[-1] + 1) * MS)
+    return Labelled(Heard(counts, counts.sum(axis=1), ends * MS), slip)
 
 
 def parts(validation: int = 10, test: int = 10) -> Parts:

@@ -18,6 +18,7 @@ from analysis.detect.detectors import (
     first_above,
     learn,
 )
+from analysis.detect.true_slip import TrueSlip
 from protocols.settings import Detection
 
 MS = 1_000_000
@@ -34,7 +35,8 @@ def trial(seed: int, quiet: int = 30, slipping: int = 20, sliding: int = 20) -> 
     rng = np.random.default_rng(seed)
     means = np.repeat([(9, 3, 3), (3, 9, 4), (2, 4, 9)], [quiet, slipping, sliding], axis=0)
     counts = np.minimum(rng.poisson(means), 30)
-    return Labelled(heard(counts), quiet * LENGTH, (quiet + slipping) * LENGTH)
+    first, second = quiet * LENGTH, (quiet + slipping) * LENGTH
+    return Labelled(heard(counts), TrueSlip(first, second, second + sliding * LENGTH))
 
 
 LEARNED = learn([trial(seed) for seed in range(8)], LENGTH, 30)
@@ -79,7 +81,7 @@ def test_no_windows_silent_windows_and_a_trial_without_slip(name: str) -> None:
     found = decide(detector.hear(slips.heard), Levels(level, 3.0))
     assert found.incipient_ns is not None
     assert found.gross_ns is not None
-    assert slips.incipient_ns < found.incipient_ns < slips.gross_ns < found.gross_ns
+    assert slips.slip.incipient_ns < found.incipient_ns < slips.slip.gross_ns < found.gross_ns
 
 
 @pytest.mark.parametrize("stride_ms", [30, 10])
@@ -97,7 +99,8 @@ def test_the_papers_rule_is_the_same_rule(stride_ms: int) -> None:
 
 
 def test_states_go_by_the_middle_of_a_window() -> None:
-    one = Labelled(heard(np.zeros((6, 3))), 2 * LENGTH + 15 * MS, 4 * LENGTH + 16 * MS)
+    slip = TrueSlip(2 * LENGTH + 15 * MS, 4 * LENGTH + 16 * MS, 6 * LENGTH)
+    one = Labelled(heard(np.zeros((6, 3))), slip)
     assert one.states(LENGTH).tolist() == [0, 0, 1, 1, 1, 2]
 
 

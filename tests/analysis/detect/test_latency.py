@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from analysis.detect.detection import Detections, detect
 from analysis.detect.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
+from analysis.detect.true_slip import TrueSlip, true_slip
 from protocols.settings import Detection
 
 MS = 1_000_000
@@ -21,21 +22,25 @@ def said(incipient_ns: int | None, gross_ns: int | None) -> Detections:
 
 
 def judge(incipient_ms: float | None, gross_ms: float | None) -> TrialLatency:
-    """True onsets at 1000 and 1500 ms; detections in ms after START."""
+    """True onsets at 1000 and 1500 ms, rest at 1800; detections in ms after START."""
     found = [None if v is None else START + round(v * MS) for v in (incipient_ms, gross_ms)]
-    return score_trial(said(*found), START + 1000 * MS, START + 1500 * MS, TOLERANCE)
+    return score_trial(said(*found), slip(1000, 1500, 1800), TOLERANCE)
+
+
+def slip(*ms: int) -> TrueSlip:
+    return TrueSlip(*(START + each * MS for each in ms))
 
 
 def test_a_good_detector() -> None:
     trial = judge(1088, 1570)
     assert (trial.latency_incipient_ms, trial.latency_gross_ms, trial.lead_ms) == (88, 70, 412)
-    assert trial.detected_first
+    assert trial.late_incipient_ms is trial.late_gross_ms is None
     assert not trial.missed_incipient
     assert not trial.false_early_incipient
 
 
 def test_a_nanosecond_is_not_lost() -> None:
-    trial = score_trial(said(START + 1, None), START, START + 5, 0)
+    trial = score_trial(said(START + 1, None), TrueSlip(START, START + 5, START + 9), 0)
     assert trial.latency_incipient_ms == 1e-6
     assert trial.lead_ms == 4e-6
 
@@ -49,11 +54,25 @@ def test_early_within_the_tolerance_counts_and_beyond_it_does_not() -> None:
     assert outside.latency_incipient_ms is outside.latency_gross_ms is outside.lead_ms is None
 
 
-def test_a_late_detection_is_a_negative_lead() -> None:
-    trial = judge(1600, 1700)
-    assert trial.lead_ms == -100
-    assert not trial.detected_first
-    assert not judge(1500, None).detected_first  # together is not first
+def test_a_detection_after_its_event_is_late_and_nothing_else() -> None:
+    trial = judge(1600, 1900)
+    assert (trial.late_incipient_ms, trial.late_gross_ms) == (100, 100)
+    assert trial.latency_incipient_ms is trial.latency_gross_ms is trial.lead_ms is None
+    assert not trial.missed_gross
+    assert not trial.false_early_incipient
+    # at the end itself nothing is left of the event; a nanosecond before, something is
+    assert judge(1500, 1800).late_incipient_ms == judge(1500, 1800).late_gross_ms == 0
+    before = judge(1500 - 1e-6, 1800 - 1e-6)
+    assert (before.lead_ms, before.latency_gross_ms) == (1e-6, 300 - 1e-6)
+
+
+def test_gross_slip_cried_while_the_plate_lies_still_is_not_detected() -> None:
+    # the audit's case: 8 plates that rest, and a detector that says gross slip 0.3 to 2 s later
+    after = (299, 480, 655, 810, 1100, 1400, 1700, 1959)
+    trials = [judge(1400, 1800 + ms) for ms in after]
+    found = summarise_latency(trials)["gross"]
+    assert (found["n"], found["missed"], found["late"], found["false_early"]) == (0, 0, 8, 0)
+    assert found["mean"] is None
 
 
 def run(counts: np.ndarray) -> list[TrialLatency]:
@@ -61,7 +80,7 @@ def run(counts: np.ndarray) -> list[TrialLatency]:
     end_ns = START + 30 * MS * np.arange(1, len(counts) + 1, dtype=np.int64)
     found = detect(counts, end_ns, Detection(smoothing=4, margin=2))
     onsets = [START + (300 + 30 * k) * MS for k in range(20)]
-    return [score_trial(found, t, t + 500 * MS, TOLERANCE) for t in onsets]
+    return [score_trial(found, TrueSlip(t, t + 500 * MS, t + 900 * MS), TOLERANCE) for t in onsets]
 
 
 def test_crying_incipient_at_once_earns_nothing() -> None:
@@ -89,6 +108,7 @@ def test_a_perfect_detector() -> None:
             **dict.fromkeys(("mean", "std", "median", "p95", "min", "max"), 0.0),
             "n": 5,
             "missed": 0,
+            "late": 0,
             "false_early": 0,
         }
     lead = summarise_lead(trials)
@@ -121,14 +141,25 @@ def test_every_trial_is_counted_once(found: list[tuple[int | None, int | None]])
     trials = [judge(a, b) for a, b in found]
     lead = summarise_lead(trials)
     for summary in (*summarise_latency(trials).values(), lead):
-        numbers = [summary[key] for key in ("n", "missed", "false_early")]
+        numbers = [summary[key] for key in ("n", "missed", "late", "false_early")]
         assert sum(n for n in numbers if n is not None) == len(trials)
         assert (summary["mean"] is None) == (summary["n"] == 0)
     assert lead["detected_first"] == sum((t.lead_ms or 0) > 0 for t in trials)
+    assert all(t.lead_ms is None or t.lead_ms > 0 for t in trials)
 
 
 def test_wrong_input_is_named() -> None:
     with pytest.raises(ValueError, match="before incipient onset"):
-        score_trial(said(None, None), 5, 4, 0)
+        TrueSlip(5, 4, 6)
+    with pytest.raises(ValueError, match="end 5 ns is before gross onset 6 ns"):
+        TrueSlip(4, 6, 5)
     with pytest.raises(ValueError, match="false_early_ns = -1"):
-        score_trial(said(None, None), 4, 5, -1)
+        score_trial(said(None, None), TrueSlip(4, 5, 6), -1)
+
+
+def test_a_label_tells_of_a_slip() -> None:
+    label = {"incipient_ns": 4, "gross_ns": 6, "end_ns": 9}
+    assert true_slip(label) == TrueSlip(4, 6, 9)
+    assert true_slip({**label, "gross_ns": None}) is None
+    # a person set the onset after the plate's rest
+    assert true_slip({**label, "gross_ns": 11}) == TrueSlip(4, 11, 11)

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from analysis.detect.detection import detect
 from analysis.detect.latency import score_trial, summarise_latency, summarise_lead
-from analysis.detect.rule_sweep import NEVER, Trials, choose_pair, sweep, worth
+from analysis.detect.rule_sweep import Trials, choose_pair, sweep, worth
 from analysis.detect.smoothing_choice import Counted, choose_smoothing
+from analysis.detect.true_slip import NEVER, TrueSlip
 from protocols.settings import Detection
 
 MS = 1_000_000
@@ -21,18 +22,18 @@ def trials(draw: st.DrawFn) -> list[Counted]:
     for _ in range(draw(st.integers(1, 6))):
         n = draw(st.integers(1, 20))
         flat = draw(st.lists(st.integers(0, 6), min_size=3 * n, max_size=3 * n))
-        first, second = sorted(draw(st.lists(st.integers(0, 600), min_size=2, max_size=2)))
+        times = sorted(draw(st.lists(st.integers(0, 600), min_size=3, max_size=3)))
         ends = (np.arange(n, dtype=np.int64) + 1) * 30 * MS
         counts = np.array(flat, np.int64).reshape(n, 3)
-        found.append(Counted(counts, ends, first * MS, second * MS))
+        found.append(Counted(counts, ends, TrueSlip(*(t * MS for t in times))))
     return found
 
 
 def swept(found: list[Counted]) -> tuple[np.ndarray, Trials]:
     pairs = [sweep(t.counts.astype(np.uint8), t.end_ns, SMOOTHINGS, MARGINS) for t in found]
     tolerance = np.full(len(found), 30 * MS, np.int64)
-    first, second = ([getattr(t, f"{kind}_ns") for t in found] for kind in ("incipient", "gross"))
-    return np.stack(pairs), Trials(np.array(first), np.array(second), tolerance)
+    slips = [np.array(of) for of in zip(*(vars(t.slip).values() for t in found), strict=True)]
+    return np.stack(pairs), Trials(*slips, tolerance)
 
 
 @settings(max_examples=30)
@@ -46,10 +47,7 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
             for k, one in enumerate(said):
                 told = [NEVER if v is None else v for v in (one.incipient_ns, one.gross_ns)]
                 assert each[k, s, m].tolist() == told
-            scored = [
-                score_trial(one, t.incipient_ns, t.gross_ns, 30 * MS)
-                for one, t in zip(said, found, strict=True)
-            ]
+            scored = [score_trial(one, t.slip, 30 * MS) for one, t in zip(said, found, strict=True)]
             latency, lead = summarise_latency(scored), summarise_lead(scored)
             figures, n = worth(each[:, s, m], truth), len(found)
             assert figures.mean_ms == pytest.approx(latency["incipient"]["mean"])
@@ -57,13 +55,13 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
             assert figures.gross_mean_ms == pytest.approx(latency["gross"]["mean"])
             assert figures.lead_min_ms == pytest.approx(lead["min"])
             for kind, suffix in (("incipient", ""), ("gross", "_gross")):
-                for name in ("missed", "false_early"):
+                for name in ("missed", "late", "false_early"):
                     share = getattr(figures, f"{name}{suffix}")
                     assert share * n == pytest.approx(latency[kind][name])
             either = sum(t.false_early_incipient or t.false_early_gross for t in scored)
-            lacking = sum(t.missed_incipient or t.missed_gross for t in scored)
             assert figures.false_early_either * n == pytest.approx(either)
-            assert figures.missed_either * n == pytest.approx(lacking)
+            lost = sum(any(t.uncounted[2:]) for t in scored)
+            assert figures.lost_either * n == pytest.approx(lost)
             assert figures.trials == n
 
 

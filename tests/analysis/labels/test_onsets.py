@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from analysis.labels.onsets import displacements, paper_onsets
+from analysis.labels.onsets import displacements, paper_onsets, rest_time
 from protocols.settings import Labelling
 
 MS = 1_000_000
@@ -166,3 +166,40 @@ def test_shapes_that_do_not_fit() -> None:
         paper_onsets(times(10)[::-1], np.zeros((10, 3)), 0, PAPER)
     with pytest.raises(ValueError, match="int64"):
         paper_onsets(times(10).astype(float), np.zeros((10, 3)), 0, PAPER)  # type: ignore[arg-type]
+
+
+def falling(stroke_px: float, n: int = 60) -> tuple[Floats, float]:
+    """Free fall from frame 20 on, 49 px/s/ms, onto a stop; and when it lands, ms after T0."""
+    t_ms = 10.0 * np.arange(n)
+    down = 0.5 * 0.049 * np.maximum(0.0, t_ms - 200.0) ** 2
+    landed = 200.0 + float(np.sqrt(2 * stroke_px / 0.049))
+    return np.stack((np.full(n, 300.0), 100.0 + np.minimum(down, stroke_px)), axis=1), landed
+
+
+@given(st.floats(3.0, 800.0))
+def test_a_plate_rests_where_it_lands(stroke_px: float) -> None:
+    xy, landed = falling(stroke_px)
+    found = rest_time(times(60), xy, 2.0, 30 * MS)
+    assert found is not None
+    # it is within 2 px of its stop a little before it lands; frames come every 10 ms
+    near = 200.0 + np.sqrt(2 * (stroke_px - 2.0) / 0.049)
+    assert near - 1e-6 <= (found - T0) / MS <= landed + 10.0
+
+
+def test_what_never_moved_or_went_out_of_sight_has_no_rest() -> None:
+    xy, _ = falling(100.0)
+    still = np.tile([300.0, 100.0], (60, 1))
+    assert rest_time(times(60), still, 2.0, 30 * MS) is None
+    out = xy.copy()
+    out[-5:] = np.nan
+    assert rest_time(times(60), out, 2.0, 30 * MS) is None
+    assert rest_time(times(60), np.full_like(xy, np.nan), 2.0, 30 * MS) is None
+    # a frame or two unseen at the end, or any in between, change nothing
+    out = xy.copy()
+    out[[-2, -1, 5, 22]] = np.nan
+    assert rest_time(times(60), out, 2.0, 30 * MS) == rest_time(times(60), xy, 2.0, 30 * MS)
+
+
+def test_what_still_moves_at_the_end_rests_there() -> None:
+    xy, _ = falling(1e9, 30)
+    assert rest_time(times(30), xy, 2.0, 30 * MS) == T0 + 290 * MS

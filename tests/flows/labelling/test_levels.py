@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -111,6 +112,20 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         assert b is not None
         # the same frame, or the next one where a twentieth of a pixel decides
         assert abs(a - b) / 1e6 <= 1.05 * FRAME_MS
+    assert abs(video.end_ns - tracks.end_ns) / 1e6 <= 1.05 * FRAME_MS
+    recording, found = recordings[1], tracks
+    assert found.as_json()["end_ns"] == found.end_ns
+    if make is kinematic:
+        assert found.end_ns == recording.step("slide")[1]
+    else:
+        # the plate's fastest fall is its last millisecond before the stop: read off the raw track
+        places = recording.tracks().plate_px
+        assert places is not None
+        fastest = int(np.hypot(*np.diff(places, axis=0).T).argmax())
+        after = (found.end_ns - int(found.frame_ns[fastest])) / 1e6
+        assert 0 < after <= 2 * FRAME_MS
+        assert found.onsets.gross_ns is not None
+        assert found.onsets.gross_ns < found.end_ns < recording.step("retract")[1]
 
 
 def test_mild_reflections_leave_the_labels_right(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_every_trial_is_counted_once(store: Store) -> None:
         assert accounts["detected_first"] == lead["detected_first"]
         assert accounts["missed"] == lead["missed"]
         assert accounts["false_early"] == lead["false_early"]
-        assert accounts["late"] == lead["n"] - lead["detected_first"]
+        assert accounts["late"] == lead["late"]
     assert [row["campaign"] for row in summary["trials"]].count("tiny") == 2
     known = [row["lead_ms"] for row in summary["trials"] if row["experiment"] == "gravity"]
     least = min((value for value in known if value is not None), default=None)
@@ -86,7 +86,7 @@ def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
 FOUND = {
     "latency_incipient_ms": 90.0, "latency_gross_ms": 40.0, "lead_ms": 900.0,
     "missed_incipient": False, "missed_gross": False, "false_early_incipient": False,
-    "false_early_gross": False, "detected_first": True,
+    "false_early_gross": False, "late_incipient_ms": None, "late_gross_ms": None,
 }  # fmt: skip
 
 
@@ -101,7 +101,9 @@ def judged(**changed: Any) -> Json:
 def test_what_became_of_a_trial() -> None:
     assert told(judged())["outcome"] == "detected_first"
     assert told(judged())["duration_ms"] == 1000.0
-    assert told(judged(detected_first=False, lead_ms=-20.0))["outcome"] == "late"
+    assert told(judged(late_incipient_ms=20.0, lead_ms=None))["outcome"] == "late"
+    late = told(judged(late_gross_ms=299.0, latency_gross_ms=None))
+    assert (late["gross"], late["late_gross_ms"]) == ("late", 299.0)
     assert told(judged(missed_incipient=True))["outcome"] == "missed"
     assert told(judged(false_early_incipient=True))["outcome"] == "false_early"
     assert told(judged(false_early_gross=True))["gross"] == "false_early"
@@ -222,7 +224,7 @@ def detector() -> Json:
         {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "precision": "as trained",
          "stride_ms": 30, "smoothing": 4, "margin": 2.0, "front": paper, "paper": paper,
          "test": {"strict": [0.9, 0.92], "mean_ms": [90.0, late], "p95_ms": [200.0, 210.0],
-                  "false_early_either": [0.0, 0.01], "missed_either": [0.0, 0.0]},
+                  "false_early_either": [0.0, 0.01], "lost_either": [0.0, 0.0]},
          "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]}}
         for paper, late in ((True, 100.0), (False, None))
     ]  # fmt: skip

@@ -179,7 +179,7 @@ def test_the_front_is_the_definitions(result: Any) -> None:
 
 def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
     def row(late: float, early: float, missed: float, work: float, test: float) -> dict[str, Any]:
-        figures = {"mean_ms": [late], "false_early_either": [early], "missed_either": [missed]}
+        figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
         return {
             "validation": figures,
             "test": {"mean_ms": [test]},
