@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import betaincinv
 
 from analysis.detect.detectors import Detector, Evidence, Labelled, Levels, decide, first_above
 from analysis.detect.latency import TrialLatency, score_trial
@@ -35,14 +34,6 @@ def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
 def allowed_early(rate: float, trials: int) -> int:
     """How many of so many trials may be false early: the whole number not above their share."""
     return int(np.floor(rate * trials + 1e-9))
-
-
-def interval(count: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Clopper and Pearson's exact interval of a share, 0..1; all of it without trials."""
-    tail = (1.0 - confidence) / 2
-    low = float(betaincinv(count, trials - count + 1, tail)) if count > 0 else 0.0
-    high = float(betaincinv(count + 1, trials - count, 1 - tail)) if count < trials else 1.0
-    return low, high
 
 
 def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> Levels:

@@ -15,7 +15,6 @@ import numpy as np
 from analysis.detect.detector_choice import (
     Judged,
     allowed_early,
-    interval,
     judge,
     merit,
     outcomes,
@@ -32,6 +31,7 @@ from analysis.detect.detectors import (
     learn,
 )
 from analysis.detect.latency import TrialLatency, summarise_latency, summarise_lead
+from analysis.statistics.intervals import exact_interval
 from protocols.settings import Comparison, Detection, Windows
 
 CURVE_RATE = 0.06
@@ -163,7 +163,7 @@ def _summary(
     trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
 ) -> dict[str, Any]:
     early = sum(trial.false_early_incipient for trial in scored)
-    low, high = interval(early, len(scored))
+    low, high = exact_interval(early, len(scored))
     before = []
     for trial, score in zip(trials, scored, strict=True):
         found = decide(trial.evidence, levels).incipient_ns

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
-from scipy.stats import norm
 
-from analysis.nets.metrics import Counts, Labels, check
+from analysis.nets.metrics import Counts, IntArray, Labels, check
+from analysis.nets.window_groups import share
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,31 +36,15 @@ def lead(counts: Counts) -> npt.NDArray[Any]:
     return np.asarray(ordered[:, -1] - ordered[:, -2])
 
 
-def wilson(right: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a share, 0..1; all of it where n is 0.
-
-    Raises:
-        ValueError: more right than there are.
-    """
-    if not 0 <= right <= n:
-        raise ValueError(f"{right} right of {n}")
-    if not n:
-        return 0.0, 1.0
-    z = float(norm.ppf(0.5 + level / 2))
-    share, z2 = right / n, z * z
-    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = z / (1 + z2 / n) * np.sqrt(share * (1 - share) / n + z2 / (4 * n * n))
-    low, high = float(middle - half), float(middle + half)
-    return (0.0 if not right else low), (1.0 if right == n else high)
-
-
-def by_lead(counts: Counts, labels: Labels) -> list[dict[str, Any]]:
+def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[dict[str, Any]]:
     """Share right by lead in whole spikes, from 0 (a tie, no winner, never right) up.
+
+    Args:
+        trial: integer (n,), whose window it is.
 
     Returns:
         a row for each of `EDGES` with windows: ``lead`` and ``to``, the least and the most of it
-        (None: and more), ``n``, ``right``, ``share``, and Wilson's 95 % interval ``low`` and
-        ``high``, which takes windows for independent of each other.
+        (None: and more), ``right``, and what `analysis.nets.window_groups.share` gives.
     """
     counts, labels = check(counts, labels)
     by = lead(counts)
@@ -69,13 +53,13 @@ def by_lead(counts: Counts, labels: Labels) -> list[dict[str, Any]]:
     rows = []
     for group in np.unique(place).tolist():
         there = place == group
-        n, hits = int(there.sum()), int(right[there].sum())
-        low, high = wilson(hits, n)
+        found = share(right[there].astype(np.float64), trial[there])
         rows.append(
             {
                 "lead": EDGES[group],
                 "to": EDGES[group + 1] - 1 if group + 1 < len(EDGES) else None,
-                "n": n, "right": hits, "share": hits / n, "low": low, "high": high,
+                "right": int(right[there].sum()),
+                **found,
             }
         )  # fmt: skip
     return rows

@@ -1,8 +1,8 @@
 """Accuracy of groups of windows, with intervals that know that windows of a trial go together.
 
 Fifty windows of a trial see the same papillae slip: they are right together and wrong together. An
-interval that counts them as fifty independent ones is several times too narrow. So trials are
-drawn again, not windows (the cluster bootstrap).
+interval that counts them as fifty independent ones is several times too narrow. So intervals are
+over trials (`analysis.statistics.intervals`).
 """
 
 from __future__ import annotations
@@ -14,16 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.nets.metrics import CLASSES, Counts, IntArray, Labels, check, winners
+from analysis.statistics.intervals import mean_interval, share_interval
 
 FloatArray = npt.NDArray[np.float64]
 
-DRAWS = 2000
-"""Sets of trials that are drawn for an interval."""
-
 TENTHS = 10
 """Parts of a phase."""
-
-_SEED = 20_260
 
 
 def credit(scores: Counts, labels: Labels) -> FloatArray:
@@ -39,39 +35,38 @@ def strict_hits(counts: Counts, labels: Labels) -> FloatArray:
     return (winners(counts) == labels).astype(np.float64)
 
 
-def trial_interval(
-    values: FloatArray, trial: IntArray, level: float = 0.95
-) -> tuple[float, float] | None:
-    """Interval of the mean over windows by drawing whole trials again, percentiles.
-
-    The draws are the same at every call. None with fewer than two trials: one says nothing about
-    the next. With a handful of trials it is still too narrow, and where all trials are equally
-    good it has no width.
+def share(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+    """Share that `values` come to, its interval over trials, windows and trials.
 
     Args:
-        values: (n,), what a window counts.
+        values: (n,), what a window counts, 0..1.
         trial: integer (n,), whose it is.
+
+    Returns:
+        ``share``, ``low``, ``high`` (None where there is none), ``n`` windows and ``trials``.
     """
+    return _told(values, trial, share_interval)
+
+
+def mean(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+    """The same of values of any sign, such as differences, with Student's interval."""
+    return _told(values, trial, mean_interval)
+
+
+def _told(
+    values: FloatArray,
+    trial: IntArray,
+    measure: Callable[[FloatArray, FloatArray], tuple[float, float] | None],
+) -> dict[str, Any]:
     which, place = np.unique(trial, return_inverse=True)
-    if len(which) < 2:
-        return None
     sums = np.bincount(place, values, minlength=len(which))
-    sizes = np.bincount(place, minlength=len(which))
-    drawn = np.random.Generator(np.random.PCG64(_SEED)).integers(0, len(which), (DRAWS, len(which)))
-    means = sums[drawn].sum(axis=1) / sizes[drawn].sum(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
-
-
-def share(values: FloatArray, trial: IntArray) -> dict[str, Any]:
-    """Mean of `values`, its interval over trials, windows and trials; None where there is none."""
-    interval = trial_interval(values, trial)
+    span = measure(sums, np.bincount(place, minlength=len(which)).astype(np.float64))
     return {
         "share": float(values.mean()) if len(values) else None,
-        "low": None if interval is None else interval[0],
-        "high": None if interval is None else interval[1],
+        "low": None if span is None else span[0],
+        "high": None if span is None else span[1],
         "n": len(values),
-        "trials": len(np.unique(trial)),
+        "trials": len(which),
     }
 
 

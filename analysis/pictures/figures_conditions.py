@@ -57,8 +57,8 @@ def by_condition(
                 spread = rng.uniform(-0.2, 0.2, len(there))
                 axes.plot(there, place + spread, "o", ms=2.6, color=panel.colour, alpha=0.6, mew=0)
                 if len(there):
-                    low, high = interval(there) or (there.mean(), there.mean())
-                    axes.plot([low, high], [place, place], color="black", lw=1.6)
+                    span = interval(there) or (np.nan, np.nan)
+                    axes.plot(span, [place, place], color="black", lw=1.6)
                     axes.plot(there.mean(), place, "D", color="black", ms=3.8)
                 note = panel.notes.get(row, "" if len(there) else "none")
                 if note:
@@ -79,8 +79,19 @@ def by_condition(
             axes.set_title("\n".join(line for line in lines if line), fontsize=7.5, color=GREY)
             axes.set_xlabel(panel.label)
             axes.set_ylim(len(rows) - 0.5, -0.5)
+            axes.set_xlim(*_room(panel))
         grid[0][0].set_yticks(range(len(rows)), list(rows))
         return svg_text(figure, simulated)
+
+
+def _room(panel: Panel) -> tuple[float, float]:
+    """What a panel shows: all trials and lines; the wide interval of a few trials is cut off."""
+    shown = [value for values in panel.values.values() for value in values]
+    shown += [0.0] if panel.zero else []
+    shown += [] if panel.published is None else [panel.published[0]]
+    low, high = min(shown, default=0.0), max(shown, default=1.0)
+    margin = 0.06 * (high - low) or 1.0
+    return low - margin, high + margin
 
 
 @dataclass(frozen=True)

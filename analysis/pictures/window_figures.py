@@ -25,7 +25,14 @@ def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
         )
         places = range(len(rows))
         shares = np.array([row["share"] for row in rows])
-        off = np.array([[row["share"] - row["low"], row["high"] - row["share"]] for row in rows])
+        off = np.array(
+            [
+                [0.0, 0.0]
+                if row["low"] is None
+                else [row["share"] - row["low"], row["high"] - row["share"]]
+                for row in rows
+            ]
+        )
         top.errorbar(
             places,
             100 * shares,

@@ -55,7 +55,7 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) ->
     return {
         **metrics.score(counts, test.y, margin).as_dict(),
         "interval": window_groups.share(hits, trial),
-        "reliability": reliability.by_lead(counts, test.y),
+        "reliability": reliability.by_lead(counts, test.y, trial),
         "calibration": reliability.calibration(
             counts,
             test.y,
@@ -170,7 +170,7 @@ def compared(
         "argmax": found["share"],
         "low": found["low"],
         "high": found["high"],
-        "network_ahead": window_groups.share(ours - theirs, trial),
+        "network_ahead": window_groups.mean(ours - theirs, trial),
     }
 
 

@@ -8,8 +8,8 @@ from typing import Any
 from analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
 from analysis.pictures.figures_conditions import Panel, by_condition
 from analysis.pictures.published import DISTURBANCE_LEAD_STD_MS, PAPER
-from analysis.pictures.report import Figure, Section, Table, number
-from analysis.statistics.intervals import difference, interval
+from analysis.pictures.report import Figure, Section, Table, number, percent
+from analysis.statistics.intervals import difference, exact_interval, interval
 from flows.reporting import clock_words
 from flows.reporting.detector_section import choice_note
 from flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values
@@ -33,7 +33,10 @@ _STATISTICS = ("n", "mean", "median", "p95", "std", "min", "max", "missed", "lat
                "false_early")  # fmt: skip
 _HEADINGS = ("n", "mean (95 %)", "median (95 %)", "95th percentile (95 %)", "std", "min", "max",
              "missed", "late", "false early")  # fmt: skip
-_DOTS = "A dot is a trial, the diamond the mean, the bar its 95 % interval over trials"
+_DOTS = (
+    "A dot is a trial, the diamond the mean, the bar its 95 % interval over trials, which may "
+    "reach out of the figure"
+)
 _LATE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
 """Which entry of a trial says why a value is missing."""
 _LATE_WORDS = (
@@ -282,7 +285,8 @@ def _statistics(summary: Json, experiment: str, kinds: Sequence[str]) -> Table:
                      else number(found[key]) for key in _STATISTICS)]
         )  # fmt: skip
     caption = (
-        "Milliseconds; n counts trials; intervals draw trials again. "
+        "Milliseconds; n counts trials. Intervals are over trials: Student's of means, by ranks of "
+        "medians (from 6 trials) and percentiles (from 72). "
         f"{clock_words.latency_note(summary)}"
     )
     return Table(("", *_HEADINGS), rows, caption)
@@ -290,9 +294,16 @@ def _statistics(summary: Json, experiment: str, kinds: Sequence[str]) -> Table:
 
 def _accounts(summary: Json, experiment: str) -> Table:
     accounts = summary[experiment]["accounted"]
-    row = [experiment, *(str(accounts[name]) for name in ("planned", *OUTCOMES))]
+    planned = accounts["planned"]
+    row = [experiment, str(planned), *(_counted(accounts[name], planned) for name in OUTCOMES)]
     columns = ("trials", "planned for the test", *(WORDS[name] for name in OUTCOMES))
-    return Table(columns, [row], "Every planned trial, by its incipient detection.")
+    caption = "Every planned trial, by its incipient detection; shares with exact 95 % intervals."
+    return Table(columns, [row], caption)
+
+
+def _counted(count: int, planned: int) -> str:
+    low, high = exact_interval(count, planned)
+    return f"{count} ({100 * low:.0f} to {percent(high, 0)})" if planned else str(count)
 
 
 def _with(value: float | None, span: Sequence[float] | None, digits: int = 1) -> str:

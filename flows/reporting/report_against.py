@@ -2,7 +2,7 @@
 
 A figure that differs says nothing by itself: another seed, or other trials, would have changed it
 as well. So each difference stands beside what chance alone would do. Where networks of several
-seeds were trained that is the spread between them; else trials are drawn again, the same ones in
+seeds were trained that is the spread between them; else that between trials, one by one in
 both reports where both judged the same. Both summaries hold all that is needed.
 """
 
@@ -25,8 +25,8 @@ Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]
 SUMMARY = ("report", "summary.json")
 BASES: dict[Basis, str] = {
     "seeds": "spread between seeds",
-    "same trials": "the same trials drawn again",
-    "trials": "trials drawn again, each report's own",
+    "same trials": "the same trials, one by one",
+    "trials": "trials, each report's own",
     "intervals": "both intervals over trials",
     "none": "no noise known",
 }

@@ -101,9 +101,9 @@ def _figures(figures: Sequence[Json], simulated: bool) -> Section:
         "What changed",
         [
             "Seed noise is judged by the spread between trained seeds where at least one report "
-            "has several. Elsewhere trials are drawn again, which tells whether these two networks "
-            "differ on such trials; it does not tell what another seed of either would have done. "
-            "One in twenty differences is called more than noise by chance alone.",
+            "has several. Elsewhere by the spread between trials, which tells whether these two "
+            "networks differ on such trials; it does not tell what another seed of either would "
+            "have done. One in twenty differences is called more than noise by chance alone.",
         ],
         pictures,
         [Table(COLUMNS, table(figures), "Shares in percent, their differences in points.")],

@@ -127,8 +127,8 @@ def _where(windows: Json, simulated: bool) -> Section:
     return Section(
         "Where the network is right",
         [
-            "Strict accuracy, with 95 % intervals that draw whole trials again: windows of a trial "
-            "are right together and wrong together. With a handful of trials they are too narrow."
+            "Strict accuracy, with 95 % intervals (Student's, over trials): windows of a trial "
+            "are right together and wrong together."
         ],
         [
             Figure(
@@ -175,8 +175,8 @@ def _lead(windows: Json, simulated: bool) -> Section:
             Figure(
                 window_figures.reliability(windows["reliability"], simulated=simulated),
                 "Share of windows called rightly, by how far the winner leads; below, how many "
-                "windows there are. Bars are Wilson's 95 % intervals, which take windows for "
-                "independent. The paper's detection asks for a lead of 2 with one output neuron a "
+                "windows there are. Bars are 95 % intervals over trials. "
+                "The paper's detection asks for a lead of 2 with one output neuron a "
                 "class.",
                 "lead-reliability",
                 _leads(windows["reliability"]),

@@ -106,7 +106,7 @@ def label() -> dict[str, Any]:
     slips = frame_times()[over.argmax(axis=0)]
     return {
         "incipient_ns": int(slips.min()), "gross_ns": int(slips[0]),
-        "doubts": {"incipient": None, "gross": None}, "first_marker": 1,
+        "end_ns": 600_000_000, "doubts": {"incipient": None, "gross": None}, "first_marker": 1,
         "per_marker_ns": slips.tolist(), "markers_lost": 0, "plate_lost": 0, "source": "video",
     }  # fmt: skip
 

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binomtest
 
 from analysis.detect.detector_choice import (
     Judged,
     allowed_early,
-    interval,
     merit,
     outcomes,
     set_levels,
@@ -80,16 +78,6 @@ def test_no_bound_is_refused() -> None:
 )
 def test_a_share_is_a_whole_number_of_trials(rate: float, trials: int, allowed: int) -> None:
     assert allowed_early(rate, trials) == allowed
-
-
-@pytest.mark.parametrize(("count", "trials"), [(0, 130), (1, 130), (65, 130), (130, 130), (2, 3)])
-def test_intervals_are_exact(count: int, trials: int) -> None:
-    expected = binomtest(count, trials).proportion_ci(method="exact")
-    np.testing.assert_allclose(interval(count, trials), (expected.low, expected.high), atol=1e-12)
-
-
-def test_an_interval_of_nothing_is_everything() -> None:
-    assert interval(0, 0) == (0.0, 1.0)
 
 
 def scored(latency: float | None, early: bool = False) -> TrialLatency:

@@ -11,10 +11,11 @@ from analysis.nets.window_groups import (
     by_tenth,
     by_trial,
     credit,
+    mean,
     share,
     strict_hits,
-    trial_interval,
 )
+from analysis.statistics.intervals import share_interval
 
 COUNTS = np.array([[5, 0, 0], [3, 3, 0], [0, 0, 0], [0, 2, 1], [0, 0, 4], [9, 0, 0]])
 LABELS = np.array([0, 1, 2, 1, 2, 2])
@@ -33,29 +34,16 @@ def test_credits_add_up_to_the_accuracies() -> None:
     assert credit(COUNTS[:0], LABELS[:0]).shape == (0,)
 
 
-def test_two_trials_have_the_interval_of_their_three_mixtures() -> None:
-    # drawn with equal chance: both the one, both the other, or one of each twice
-    values, trial = np.array([0.0] * 10 + [1.0] * 10), np.repeat([0, 1], 10)
-    assert trial_interval(values, trial) == (0.0, 1.0)
-    assert trial_interval(values, trial, level=0.4) == (0.5, 0.5)
-    assert trial_interval(values[:10], trial[:10]) is None
-
-
-def test_intervals_over_trials_hold_the_truth_where_those_over_windows_do_not() -> None:
-    """Trials of 50 windows, each trial with a share of its own: 95 % should be about 95 %."""
-    rng = np.random.default_rng(0)
-    trial = np.repeat(np.arange(40), 50)
-    held = naive = 0
-    for _ in range(100):
-        each = rng.beta(4, 1, 40)
-        hits = (rng.random(2000) < np.repeat(each, 50)).astype(float)
-        found = trial_interval(hits, trial)
-        assert found is not None
-        held += found[0] <= 0.8 <= found[1]
-        half = 1.96 * np.sqrt(0.8 * 0.2 / 2000)
-        naive += abs(hits.mean() - 0.8) <= half
-    assert 88 <= held <= 100
-    assert naive < 70
+def test_a_share_tells_windows_and_trials_and_its_interval() -> None:
+    hits = strict_hits(COUNTS, LABELS)
+    found = share(hits, TRIAL)
+    assert (found["share"], found["n"], found["trials"]) == (0.5, 6, 2)
+    assert (found["low"], found["high"]) == share_interval([1.0, 2.0], [3.0, 3.0])
+    assert share(hits[:3], TRIAL[:3])["low"] is None
+    assert share(hits[:0], TRIAL[:0])["share"] is None
+    ahead = mean(hits - 0.5, TRIAL)
+    assert ahead["share"] == 0.0
+    assert ahead["low"] == pytest.approx(-ahead["high"])
 
 
 def test_levels_are_split_by_trials() -> None:

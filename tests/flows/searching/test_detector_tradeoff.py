@@ -13,6 +13,7 @@ import pytest
 
 from analysis.detect.detection import detect
 from analysis.detect.latency import score_trial, summarise_latency
+from analysis.detect.true_slip import true_slip
 from analysis.nets import dataset, training
 from flows.labelling.label import STEP, label_key
 from flows.running import stopping
@@ -146,8 +147,9 @@ def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, res
         x, ends = dataset.trial_windows(used.recording, run.windows)
         counts = training.predict_counts(fitted, x)
         said = detect(counts, ends, Detection())
-        onsets = (used.label["incipient_ns"], used.label["gross_ns"])
-        scored.append(score_trial(said, *onsets, 30_000_000))
+        slip = true_slip(used.label)
+        assert slip is not None
+        scored.append(score_trial(said, slip, 30_000_000))
         kept = trial_counts(search.kept.read(run)[1], "trained", 15)
         place = search.data.judged.index(used)
         assert np.array_equal(kept[place][0][::2], counts)
