@@ -59,8 +59,11 @@ def _told(
     measure: Callable[[FloatArray, FloatArray], tuple[float, float] | None],
 ) -> dict[str, Any]:
     which, place = np.unique(trial, return_inverse=True)
-    sums = np.bincount(place, values, minlength=len(which))
-    span = measure(sums, np.bincount(place, minlength=len(which)).astype(np.float64))
+    sums, sizes = (
+        np.bincount(place, weights, minlength=len(which)).astype(np.float64)
+        for weights in (values, None)
+    )
+    span = measure(sums, sizes)
     return {
         "share": float(values.mean()) if len(values) else None,
         "low": None if span is None else span[0],
