@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from flows.labelling.reviewed import Labels
     from flows.learning.evaluate import Job
 
-VERSION = 3
+VERSION = 4
 STEP = "windows"
 """The network's counts of the test windows are kept under it, for what is compared later."""
 NAME = "test"
