@@ -1,6 +1,6 @@
 """The whole chain: collect every protocol, synchronise, label, check the labels, train, evaluate,
-search if that is asked for, report. Run again it goes on where it was, and a step with nothing to
-do says so.
+judge a campaign that chooses nothing, search if that is asked for, report. Run again it goes on
+where it was, and a step with nothing to do says so.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from flows.learning.train import train
 from flows.planning.orders import Order
 from flows.reporting.report import report
 from flows.running.campaigns import collected
+from flows.searching.holdout import STEP, measure_holdout
 from flows.study_ledger import Ledger, Row
 from flows.study_searches import Search, training_windows
 from flows.syncing.sync import sync
@@ -45,16 +46,21 @@ class Outcome:
     rows: list[Row] = field(default_factory=list)
 
 
-def study(orders: list[Order], check: int = 0, more: Sequence[Search] = ()) -> Outcome:
+def study(
+    orders: list[Order], check: int = 0, more: Sequence[Search] = (), holdout: int = 0
+) -> Outcome:
     """Run what is missing or stale, step by step; a step with nothing to do says so.
 
     Args:
         check: trials whose labels are checked with video, where the rig draws none.
         more: what is searched before the report.
+        holdout: trials of the campaign that chooses nothing, where slides are simulated.
     """
     Store.create(orders[0].store)
     check = check if label_check.wanted(orders[0]) else 0
-    ledger = Ledger(orders[0].store, expected(orders, check, more))
+    slides = [o for o in orders if o.plan.protocol.collection.experiment == "kinematic"]
+    holdout = holdout if slides and slides[0].rig.simulated else 0
+    ledger = Ledger(orders[0].store, expected(orders, check, more, holdout))
     done = []
     for order in orders:
         with ledger.step(f"collect {order.campaign}") as tell:
@@ -77,13 +83,17 @@ def study(orders: list[Order], check: int = 0, more: Sequence[Search] = ()) -> O
         run(CHECK, lambda: check_labels(orders[0], check), "trials")
     run("train", lambda: train(store, campaigns), "networks")
     run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
+    if holdout:
+        run(STEP, lambda: measure_holdout(store, campaigns, holdout), "evaluations")
     for search in more:
         run(search.name, partial(search.work, store, campaigns), search.of)
     run("report", lambda: report(store, campaigns), "pages")
     return Outcome(done, steps, ledger.rows())
 
 
-def expected(orders: list[Order], check: int, more: Sequence[Search] = ()) -> dict[str, float]:
+def expected(
+    orders: list[Order], check: int, more: Sequence[Search] = (), holdout: int = 0
+) -> dict[str, float]:
     """Seconds that each step is expected to take from nothing."""
     seconds: dict[str, float] = {}
     labelled, trials = 0.0, 0
@@ -100,6 +110,9 @@ def expected(orders: list[Order], check: int, more: Sequence[Search] = ()) -> di
         seconds[CHECK] = (COLLECT_S["video"] + LABEL_S["video"]) * check
     seconds["train"] = _training_s(orders)
     seconds["evaluate"] = EVALUATE_S * trials
+    if holdout:
+        source = orders[0].rig.frame_source
+        seconds[STEP] = (COLLECT_S[source] + LABEL_S[source] + EVALUATE_S) * holdout
     seconds = {**seconds, **{search.name: search.seconds for search in more}, "report": 0.0}
     return {name: START_S + each for name, each in seconds.items()}
 

@@ -23,6 +23,7 @@ from flows.cli.detect import register as register_detect
 from flows.cli.exchange import register as register_exchange
 from flows.cli.generalise import register as register_generalise
 from flows.cli.guesses import register as register_guesses
+from flows.cli.holdout import register as register_holdout
 from flows.cli.models import register as register_models
 from flows.cli.remote import register as register_remote
 from flows.cli.review import register as register_review
@@ -160,6 +161,7 @@ register_steps(app)
 register_tradeoff(app)
 register_generalise(app)
 register_guesses(app)
+register_holdout(app)
 register_chain(app)
 register_store(app)
 register_remote(app)

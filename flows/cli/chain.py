@@ -16,6 +16,8 @@ PILOT = ("pilot", "pilot_gravity")
 EXTRA = ("disturbance=125",)
 LABELS_CHECKED = 60
 """Trials whose labels of tracks a study checks with video, unless another number is asked for."""
+HELD_OUT = 144
+"""Trials that choose nothing: half of the conditions of the kinematic grid, each once."""
 
 
 def package_file(package: str, name: str) -> Path:
@@ -55,6 +57,15 @@ def study(
             help="Trials to take again with video, to check labels of tracks by.",
         ),
     ] = LABELS_CHECKED,
+    holdout: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=1_000_000,
+            help="Trials of another simulated skin that choose nothing, judged once a version; "
+            "144 with the protocols that ship, else 0.",
+        ),
+    ] = None,
     searches: Annotated[
         bool,
         typer.Option(
@@ -72,7 +83,9 @@ def study(
         _status(folder, as_json)
         return
     files = dict.fromkeys(protocol, ()) if protocol else shipped(pilot, extra)
-    _chain(folder, files, rig, as_json, check_labels, searches)
+    if holdout is None:
+        holdout = 0 if pilot or protocol else HELD_OUT
+    _chain(folder, files, rig, as_json, check_labels, searches, holdout)
 
 
 def _status(folder: Path, as_json: bool) -> None:
@@ -110,6 +123,7 @@ def _chain(
     as_json: bool,
     check: int = 0,
     more: bool = False,
+    holdout: int = 0,
 ) -> None:
     """Run the whole chain and print what came out."""
     from flows.planning.orders import check_disk, make_order
@@ -122,7 +136,7 @@ def _chain(
     from flows.study_searches import searches
     from storage.store import Store
 
-    outcome = run(orders, check, searches(orders) if more else ())
+    outcome = run(orders, check, searches(orders) if more else (), holdout)
     summary = read_summary(Store.open(folder))
     page = folder / "report" / "index.html"
     if as_json:

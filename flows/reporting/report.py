@@ -89,9 +89,10 @@ def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
             wanted_models(store, campaigns, evaluation.get("reviewed") is not None)
         )
         fitted = model_file.load(model.path)
-        summary = make_summary(store, campaigns, evaluation)
+        others = extras(store)
+        summary = make_summary(store, campaigns, evaluation, others.get("holdout"))
         made = sections.make_sections(
-            sections.Material(store, campaigns, evaluation, summary, fitted, extras(store))
+            sections.Material(store, campaigns, evaluation, summary, fitted, others)
         )
         write_figures(folder, made, simulated=summary["simulated"])
         html = page.render(

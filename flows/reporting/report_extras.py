@@ -2,6 +2,7 @@
 
     STORE/derived/generalisation/results.json   sliplab generalise
     STORE/derived/guesses/results.json          sliplab guesses
+    STORE/holdout/results.json                  sliplab holdout
     STORE/derived/tradeoff/tradeoff.json        sliplab tradeoff --scene
     STORE/derived/tradeoff/labels.json          python -m benchmarks labels --json
     STORE/derived/tradeoff/labels_truth.json    python -m benchmarks labels_truth --json
@@ -24,6 +25,7 @@ Json = dict[str, Any]
 FILES = {
     "generalisation": "derived/generalisation/results.json",
     "guesses": "derived/guesses/results.json",
+    "holdout": "holdout/results.json",
     "scene": "derived/tradeoff/tradeoff.json",
     "labels": "derived/tradeoff/labels.json",
     "labels_truth": "derived/tradeoff/labels_truth.json",
@@ -34,6 +36,7 @@ FILES = {
 COMMANDS = {
     "generalisation": "sliplab generalise {store}",
     "guesses": "sliplab guesses {store}",
+    "holdout": "sliplab holdout {store}",
     "scene": "sliplab tradeoff --scene PROTOCOL --out {folder}",
     "labels": "python -m benchmarks labels --json > {file}",
     "labels_truth": "python -m benchmarks labels_truth --json > {file}",

@@ -14,6 +14,7 @@ from flows.reporting import (
     detector_section,
     failures_section,
     guesses_section,
+    holdout_section,
     label_section,
     latency_section,
     others_section,
@@ -88,6 +89,7 @@ def make_sections(material: Material) -> list[Section]:
     example = trial_section.example(campaigns, evaluation)
     found: list[Section | None] = [
         paper_section.section(summary),
+        holdout_section.section(store, extras.get("holdout"), summary) if simulated else None,
         campaign_section.collected(campaigns, summary, simulated),
         campaign_section.quality(store, campaigns, simulated),
         None if example is None else trial_section.section(store, *example, simulated),

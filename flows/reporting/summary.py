@@ -12,6 +12,7 @@ from flows.learning.train import training_settings
 from flows.learning.window_baselines import EVALUATION, beside
 from flows.learning.window_scores import window_intervals
 from flows.planning.estimate import plan_bytes
+from flows.reporting import holdout_section
 from flows.reporting.campaign_section import reference_rows, wear
 from flows.reporting.report_trials import accounted, intervals, told
 from flows.running import timing
@@ -51,9 +52,16 @@ _WINDOWS = (
 
 
 def make_summary(
-    store: Store, campaigns: list[Collected], evaluation: dict[str, Any]
+    store: Store,
+    campaigns: list[Collected],
+    evaluation: dict[str, Any],
+    held_out: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything `summary.json` says; only `timing_s` differs between equal runs."""
+    """Everything `summary.json` says; only `timing_s` differs between equal runs.
+
+    Args:
+        held_out: what `flows.searching.holdout` kept.
+    """
     windows, experiments = evaluation["windows"], evaluation["experiments"]
     reviewed = evaluation.get("reviewed") is not None
     kinematic = {
@@ -94,6 +102,7 @@ def make_summary(
         "detection": evaluation["detection"],
         "choices": evaluation["choices"],
         "detectors": evaluation["detectors"],
+        "holdout": None if held_out is None else holdout_section.part(held_out),
         "sync": _sync(campaigns),
         "quality": _quality(campaigns),
         "planned": {item.name: _planned(item) for item in campaigns},

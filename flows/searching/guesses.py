@@ -20,20 +20,18 @@ import numpy.typing as npt
 
 from analysis.labels import labelling
 from analysis.nets import dataset, model_file, training, window_groups
-from analysis.nets.samples import strided_windows
 from flows.collecting.collect import collect
 from flows.labelling.label import label
-from flows.labelling.reviewed import Labels
 from flows.learning import evaluate
 from flows.learning.evaluate import choose_model
-from flows.learning.samples import load_samples, several, split_trials
-from flows.learning.train import training_settings, wanted_models
-from flows.learning.trial_scores import score_row, summaries
+from flows.learning.samples import several, split_trials
+from flows.learning.train import wanted_models
+from flows.learning.trial_scores import summaries
 from flows.planning.orders import Order
 from flows.running import console
 from flows.running.campaigns import Collected, collected, training_campaigns
 from flows.searching.guess_changes import AS_IT_IS, NAMES, figures
-from flows.searching.other_rig import other_order
+from flows.searching.other_rig import judge, other_order
 from flows.searching.scene_runs import sample_trials
 from flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
 from protocols.errors import InputError
@@ -41,7 +39,6 @@ from protocols.settings import Detection
 from rigs.rig_file import load_rig_file
 from storage.derived import make_key
 from storage.files import read_json, write_json
-from storage.recording import Recording
 from storage.store import Store, StoreError
 
 STEP, FILE, VERSION = "guesses", "results.json", 1
@@ -187,38 +184,19 @@ class Guesses:
 
     def _judge(self, store: Store, campaigns: list[Collected]) -> Json:
         """Windows and trials at one setting, by the study's network and settings."""
-        labels, rows = Labels(store), []
-        for item in campaigns:
-            for trial, recording in item.of_split("test"):
-                counts, end_ns = self._hear(recording, self.detection[item.name])
-                told = labels.read(item, recording)
-                row = score_row(item, trial, told, counts, end_ns, self.detection[item.name])
-                rows.append({**row, "depth_zero_mm": recording.record["depth_zero_mm"]})
+        judged = judge(self.fitted, self.detection, store, campaigns)
+        rows = [
+            {**row, "depth_zero_mm": recording.record["depth_zero_mm"]}
+            for row, recording in judged.trials
+        ]
         used = training_campaigns(campaigns)
-        samples = load_samples(labels, used, "test")
-        hits = window_groups.strict_hits(
-            training.predict_counts(self.fitted, samples.windows), samples.y
-        )
         known = split_trials(used, "test")
         names = [
             f"{item.name}/{trial.id}" if several(used) else trial.id for item, trial, _ in known
         ]
-        windows = _by_trial(hits, samples.trial, names)
+        hits = window_groups.strict_hits(judged.counts, judged.y)
+        windows = _by_trial(hits, judged.trial, names)
         return {"windows": windows, "trials": rows, "experiments": summaries(rows)}
-
-    def _hear(
-        self, recording: Recording, settings: Detection
-    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        """Spikes of consecutive windows (n, 3), and where they end (n,), ns."""
-        windows = training_settings(self.campaigns).windows
-        if settings.stride_ms is None:
-            x, end_ns = dataset.trial_windows(recording, windows)
-        else:
-            length_ns = windows.length_ms * 1_000_000
-            span, stride_ns = dataset.recorded_span(recording), settings.stride_ms * 1_000_000
-            starts = strided_windows(*span, length_ns, stride_ns)
-            x, end_ns = dataset.cut_windows(recording, starts, windows), starts + length_ns
-        return training.predict_counts(self.fitted, x), end_ns
 
 
 def _by_trial(

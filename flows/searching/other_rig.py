@@ -1,20 +1,36 @@
-"""A campaign's trials on a rig that differs from its own in a few simulated numbers."""
+"""A campaign's trials on a rig that differs from its own in a few simulated numbers, judged."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from analysis.nets import dataset, training
+from analysis.nets.samples import strided_windows
+from flows.labelling.reviewed import Labels
+from flows.learning.samples import load_samples
+from flows.learning.trial_scores import score_row
 from flows.planning.orders import Order, make_order
-from flows.running.campaigns import Collected
+from flows.running.campaigns import Collected, training_campaigns
+from protocols.settings import Detection
 from protocols.yaml_file import parse_yaml, read_text
 from rigs.rig_inheritance import rig_yaml
 from storage.files import make_folder, write_text
+from storage.recording import Recording
+from storage.store import Store
 
 
 def other_order(
-    item: Collected, change: Mapping[str, Any], folder: Path, most: int | None = None
+    item: Collected,
+    change: Mapping[str, Any],
+    folder: Path,
+    most: int | None = None,
+    protocol: Mapping[str, Any] | None = None,
 ) -> Order:
     """An order for the same protocol, into ``folder/store``.
 
@@ -22,18 +38,25 @@ def other_order(
         change: values by key, as deep as they stand in a rig file.
         folder: gets the changed rig file too.
         most: trials at most.
+        protocol: likewise values of the protocol, which then is a changed one.
     """
-    source = item.campaign.folder / "rig.yaml"
-    data = parse_yaml(read_text(source, "rig file"), source)
-    _merge(data, change)
     make_folder(folder)
     rig = folder / f"{item.name}.yaml"
-    write_text(rig, rig_yaml(data))
+    _changed(item.campaign.folder / "rig.yaml", "rig file", change, rig)
+    file = item.campaign.protocol_file
+    if protocol is not None:
+        file = folder / f"{item.name}.protocol.yaml"
+        _changed(item.campaign.protocol_file, "protocol", protocol, file)
     enabled: Any = item.info.get("enabled", ())
     return make_order(
-        item.campaign.protocol_file, rig, folder / "store",
-        enable=tuple(enabled), campaign=item.name, most=most,
-    )  # fmt: skip
+        file, rig, folder / "store", enable=tuple(enabled), campaign=item.name, most=most
+    )
+
+
+def _changed(source: Path, what: str, change: Mapping[str, Any], path: Path) -> None:
+    data = parse_yaml(read_text(source, what), source)
+    _merge(data, change)
+    write_text(path, rig_yaml(data))
 
 
 def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
@@ -42,3 +65,57 @@ def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
             _merge(data[name], value)
         else:
             data[name] = value
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a network and a rule say of a store's test trials.
+
+    Attributes:
+        counts, y, trial: of the chosen windows: spikes int64 (n, 3), classes int64 (n,), and the
+            place of each one's trial among the kinematic test trials, int64 (n,).
+        trials: a row of `flows.learning.trial_scores.score_row` for each, and its recording.
+    """
+
+    counts: npt.NDArray[np.int64]
+    y: npt.NDArray[np.int64]
+    trial: npt.NDArray[np.int64]
+    trials: list[tuple[dict[str, Any], Recording]]
+
+
+def judge(
+    fitted: training.Fitted,
+    detection: Mapping[str, Detection],
+    store: Store,
+    campaigns: list[Collected],
+) -> Judged:
+    """Judge the labelled test trials of a store by a network that another one trained.
+
+    Args:
+        detection: smoothing, margin and stride by campaign.
+    """
+    labels, rows = Labels(store), []
+    for item in campaigns:
+        settings = detection[item.name]
+        for trial, recording in item.of_split("test"):
+            counts, end_ns = _counts(recording, fitted, settings)
+            told = labels.read(item, recording)
+            rows.append((score_row(item, trial, told, counts, end_ns, settings), recording))
+    samples = load_samples(labels, training_campaigns(campaigns), "test")
+    counts = training.predict_counts(fitted, samples.windows)
+    return Judged(counts, samples.y, samples.trial, rows)
+
+
+def _counts(
+    recording: Recording, fitted: training.Fitted, settings: Detection
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Spikes of consecutive windows (n, 3), and where they end (n,), ns."""
+    windows = fitted.windows
+    if settings.stride_ms is None:
+        x, end_ns = dataset.trial_windows(recording, windows)
+    else:
+        length_ns = windows.length_ms * 1_000_000
+        span, stride_ns = dataset.recorded_span(recording), settings.stride_ms * 1_000_000
+        starts = strided_windows(*span, length_ns, stride_ns)
+        x, end_ns = dataset.cut_windows(recording, starts, windows), starts + length_ns
+    return training.predict_counts(fitted, x), end_ns

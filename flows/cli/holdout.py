@@ -1,0 +1,46 @@
+"""`sliplab holdout`: the study's network on a campaign that nothing was chosen by."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from flows.cli.chain import HELD_OUT
+from flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from flows.running import console
+
+
+def holdout(
+    folder: StoreArgument,
+    trials: Annotated[
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Spread over the conditions.")
+    ] = HELD_OUT,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Also where this version of SlipLab judged it already."),
+    ] = False,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Judge the network once on another simulated skin and seed, which choose nothing."""
+    from storage.store import Store
+
+    store = Store.open(folder)
+    prepare_store(folder)
+    from flows.reporting.holdout_section import COLUMNS, rows_of
+    from flows.running.campaigns import collected
+    from flows.searching.holdout import measure_holdout
+
+    done = measure_holdout(store, collected(store, campaign), trials, again)
+    if as_json:
+        console.print_json(done)
+        return
+    result = done["result"]
+    console.print_table("hold-out, simulated", COLUMNS, rows_of(result))
+    console.say(f"kept in {done['file']}, with its ledger; the next report shows it")
+
+
+def register(app: typer.Typer) -> None:
+    """Make it a command of `app`."""
+    app.command()(holdout)

@@ -1,0 +1,127 @@
+"""A campaign that chooses nothing: its own seed and skin, judged once, each time written down."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from flows.labelling.label import label
+from flows.learning.evaluate import evaluation_of
+from flows.planning.orders import Order
+from flows.reporting import holdout_section
+from flows.reporting.report import read_summary, report
+from flows.running.campaigns import collected
+from flows.searching import generalisation, holdout
+from flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
+from flows.study import Outcome
+from storage.files import read_json, write_json
+from storage.store import Store, StoreError
+from tests.conftest import ROOT
+
+SEEDS = (5, 6)
+"""Not the release's: no test may look at its trials."""
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study, with four trials held out."""
+    folder = tmp_path_factory.mktemp("holdout") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    found = Store.open(folder)
+    assert measure_holdout(found, collected(found), 4, seeds=SEEDS)["done"] == 1
+    return found
+
+
+def test_the_release_s_seeds_stand_nowhere_else() -> None:
+    used = [PROTOCOL_SEED, SKIN_SEED]
+    skins = range(generalisation.SKIN_SEEDS, generalisation.SKIN_SEEDS + 1000)
+    assert not set(used) & set(skins)
+    words = [str(seed) for seed in used] + [f"{seed:_}" for seed in used]
+    own = {ROOT / "flows" / "searching" / "holdout.py"}
+    files = [
+        path
+        for folder in ("protocols", "rigs", "analysis", "flows", "storage", "tests", "benchmarks")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in {".py", ".yaml", ".json"} and path not in own
+    ]
+    assert len(files) > 300
+    assert not [path for path in files if any(word in path.read_text() for word in words)]
+
+
+def test_its_trials_are_others_on_another_skin(store: Store) -> None:
+    item = collected(store)[0]
+    order = Holdout(store, collected(store), 4, SEEDS).order()
+    assert order.plan.protocol.collection.seed == SEEDS[0] != item.plan.protocol.collection.seed
+    assert order.rig.scene.scene.skin.seed == SEEDS[1]
+    assert {trial.split for trial in order.plan} == {"test"}
+    assert not {trial.seed for trial in order.plan} & {trial.seed for trial in item.plan}
+    theirs = Store.open(store.folder / "holdout" / "store").campaign(item.name)
+    assert theirs.committed() == order.only
+    # the study's own campaigns are what they were: nothing trains on these, or chooses by them
+    assert [campaign.name for campaign in store.campaigns()] == ["tiny", "tiny_gravity"]
+    settings = order.plan.protocol.analysis
+    assert settings.model_copy(update={"split": item.settings.split}) == item.settings
+
+
+def test_it_is_judged_once_a_version_and_written_down(
+    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    campaigns = collected(store)
+    first = measure_holdout(store, campaigns, 4, seeds=SEEDS)
+    assert first["done"] == 0
+    (line,) = first["result"]["evaluations"]
+    key, _ = evaluation_of(store)
+    assert key is not None
+    assert line["model"] == first["result"]["model"]
+    assert line["strict"] == first["result"]["windows"]["accuracy"]["strict"]
+    # other settings under the same version: kept as it was, and said
+    monkeypatch.setattr(holdout, "VERSION", 99)
+    again = measure_holdout(store, campaigns, 4, seeds=SEEDS)
+    assert (again["done"], again["result"]) == (0, first["result"])
+    assert "a second look" in capsys.readouterr().err
+    # a new version of the program looks once more
+    monkeypatch.setattr(holdout, "version", lambda name: "99.0")
+    later = measure_holdout(store, campaigns, 4, seeds=SEEDS)
+    assert [each["version"] for each in later["result"]["evaluations"]] == [
+        line["version"], "99.0"
+    ]  # fmt: skip
+    asked = measure_holdout(store, campaigns, 3, again=True, seeds=SEEDS)
+    assert len(asked["result"]["evaluations"]) == 3
+    figures = ("windows", "rows", "kinematic", "trials")
+    assert all(later["result"][name] == first["result"][name] for name in figures)
+    write_json(store.folder / "holdout/results.json", first["result"])
+
+
+def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None:
+    report(store, collected(store))
+    summary = read_summary(store)["holdout"]
+    kept = read_json(store.folder / "holdout/results.json")
+    assert summary["trials"] == len(kept["rows"]) == 4
+    assert summary["windows"]["strict"]["trials"] == 4
+    latency = summary["latency_ms"]["incipient"]
+    assert latency["n"] + latency["missed"] + latency["late"] + latency["false_early"] == 4
+    assert "at" not in json.dumps(summary["versions"])
+    page = (store.folder / "report" / "index.html").read_text()
+    assert holdout_section.TITLE in page
+    assert "They were judged 1 time here" in page
+    rows = holdout_section.rows_of(kept)
+    assert rows[0][0] == "windows right, strict"
+    assert rows[0][2] == f"4 trials, {summary['windows']['strict']['n']} windows"
+
+
+def test_a_file_of_another_shape_is_named(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"holdout/results\.json"):
+        holdout_section.section(store, {"rows": []}, read_summary(store))
+
+
+def test_real_slides_need_a_campaign_of_their_own(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaigns = collected(store)
+    monkeypatch.setitem(campaigns[0].info, "simulated", False)
+    with pytest.raises(StoreError, match="its slides are real"):
+        Holdout(store, campaigns, 4, SEEDS)
+    assert label(store, campaigns)["done"] == 0
