@@ -88,13 +88,14 @@ class Holdout:
     def order(self) -> Order:
         """The study's protocol and rig with another seed and skin, all trials for the test."""
         trials, skin = self.seeds
+        split = {"method": "ranked", "train": 0.0, "validation": 0.0, "test": 1.0}
         order = other_order(
             self.item,
             {"mock": {"scene": {"skin": {"seed": skin}}}},
             self.store.folder / STEP,
             protocol={
                 "collection": {"seed": trials},
-                "analysis": {"split": {"train": 0.0, "validation": 0.0, "test": 1.0}},
+                "analysis": {"split": split},
             },
         )
         chosen = sample_trials(order.plan, self.trials)
