@@ -31,7 +31,7 @@ WRONG: dict[str, tuple[tuple[str, ...], str | None, str | None, str | None]] = {
     **dict.fromkeys(
         (
             "sync", "label", "train", "evaluate", "report", "generalise", "guesses", "trials",
-            "verify", "migrate", "pause", "resume", "stop", "review",
+            "holdout", "verify", "migrate", "pause", "resume", "stop", "review",
         ),
         (("ROOM/nowhere",), "ROOM/nowhere", None, None),
     ),
