@@ -72,7 +72,7 @@ class Figures:
         false_early_either: of trials where either did.
         missed_either: of trials where either is missing.
         late_either: of trials where either came late.
-        lost_either: of trials where either is missing or late.
+        lost, lost_gross, lost_either: of trials missed or late.
         trials: how many.
     """
 
@@ -86,6 +86,8 @@ class Figures:
     late: float
     late_gross: float
     late_either: float
+    lost: float
+    lost_gross: float
     lost_either: float
     false_early: float
     false_early_gross: float
@@ -137,16 +139,20 @@ def worth(found: I64, trials: Trials) -> Figures:
     late = (incipient - trials.incipient_ns[counted[:, 0]]) / 1e6
     late_gross = (gross - trials.gross_ns[counted[:, 1]]) / 1e6
     lead = (trials.gross_ns[counted[:, 0]] - incipient) / 1e6
+
+    def share(which: Mask) -> float:
+        return np.count_nonzero(which) / len(found)
+
     shares = {}
-    for name, mask in vars(out).items():
-        shares[name], shares[f"{name}_gross"] = mask.mean(axis=0).tolist()
-        shares[f"{name}_either"] = float(mask.any(axis=1).mean())
+    for name, mask in {**vars(out), "lost": out.missed | out.late}.items():
+        first, second = mask.T
+        shares[name], shares[f"{name}_gross"] = share(first), share(second)
+        shares[f"{name}_either"] = share(first | second)
     return Figures(
         mean_ms=float(late.mean()) if late.size else None,
         p95_ms=float(np.percentile(late, 95)) if late.size else None,
         gross_mean_ms=float(late_gross.mean()) if late_gross.size else None,
         lead_min_ms=float(lead.min()) if lead.size else None,
-        lost_either=float((out.missed | out.late).any(axis=1).mean()),
         trials=len(found),
         **shares,
     )

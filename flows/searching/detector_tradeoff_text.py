@@ -40,12 +40,8 @@ def flat(row: Row, simulated: bool) -> dict[str, Any]:
     return {**found, **{name: row[name] for name in flags}, "simulated": simulated}
 
 
-_LOST = ("missed", "late", "false_early")
-_SHARES = (
-    "strict",
-    "lost_either",
-    *(f"{name}{of}" for name in _LOST for of in ("", "_gross", "_either")),
-)
+_OUT = ("missed", "late", "lost", "false_early")
+_SHARES = ("strict", *(f"{name}{of}" for name in _OUT for of in ("", "_gross", "_either")))
 _UNITS = {
     **dict.fromkeys(_SHARES, "_share"),
     **dict.fromkeys(("us_single", "us_batched", "synaptic_operations"), "_per_window"),
