@@ -118,12 +118,12 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
     if make is kinematic:
         assert found.end_ns == recording.step("slide")[1]
     else:
-        # the plate's fastest fall is its last millisecond before the stop: read off the raw track
+        # the fall is fastest just before the stop, in the last frame or the last but one
         places = recording.tracks().plate_px
         assert places is not None
         fastest = int(np.hypot(*np.diff(places, axis=0).T).argmax())
         after = (found.end_ns - int(found.frame_ns[fastest])) / 1e6
-        assert 0 < after <= 2 * FRAME_MS
+        assert 0 < after <= 2.05 * FRAME_MS
         assert found.onsets.gross_ns is not None
         assert found.onsets.gross_ns < found.end_ns < recording.step("retract")[1]
 
