@@ -49,8 +49,8 @@ def section(summary: Json) -> Section:
         [
             Table(
                 columns, rows,
-                "In brackets 95 % over trials (Student's), windows of a trial together. Accuracy of "
-                "raw spike counts, ties shared.",
+                "In brackets 95 % over trials (Student's), windows of a trial together. Accuracy "
+                "of raw spike counts, ties shared.",
             ),
             Table(["figure", *networks], counts, "How many windows and trials each figure is of."),
             Table(
