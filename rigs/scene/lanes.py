@@ -48,6 +48,7 @@ from rigs.scene.rows import (
     block_of,
     take_knot,
 )
+from rigs.scene.sliding import is_steady, slows_down
 from rigs.scene.sliding_lanes import slide_on
 from rigs.scene.springs import (
     ACROSS,
@@ -83,9 +84,6 @@ from rigs.scene.springs import (
 from rigs.scene.tip import ROUNDING, tip_step
 from rigs.scene.turning import raised, slides_on
 
-_STEADY = 1.25
-"""Mean speed of a step over that of the next one up to which a parabola through them tells more."""
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def respond(flat, field, law, first, count, sensor, plate_y, swerve, h, decay, gain):  # type: ignore[no-untyped-def]
@@ -107,7 +105,7 @@ def respond(flat, field, law, first, count, sensor, plate_y, swerve, h, decay, g
     for _ in range(ITERATIONS):
         if _bend(w) == 0:
             break
-    slide, alone = _decide(w, law, decay, gain, swerve)
+    slide, alone = _decide(w, law, h, decay, gain, swerve)
     if slide > 0:
         alone += slide_on(w, field, law, first, count, h, swerve, decay, gain)
     if alone > 0:
@@ -166,7 +164,7 @@ def _bend(w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _decide(w, law, decay, gain, swerve):  # type: ignore[no-untyped-def]
+def _decide(w, law, h, decay, gain, swerve):  # type: ignore[no-untyped-def]
     """The forces if all tips stick, and which do; how many slide on, and go on alone."""
     slide, alone = 0, 0
     static = 1.0 + law.static_excess
@@ -196,8 +194,8 @@ def _decide(w, law, decay, gain, swerve):  # type: ignore[no-untyped-def]
         touches = mode != FREE and deep > 0.0 and w[PRESSED, j] > 0.0
         free = (mode != FREE and not touches) or deep <= 0.0
         sticks = touches and size <= limit * ROUNDING
-        fresh = w[SLID_S, j] == 0.0 and law.strengthening > 0.0 and law.damping_s == 0.0
-        slides = touches and keeps_on and not sticks and not fresh
+        slows = slows_down(w[SLID_S, j], w[SPEED, j], new_x - old_x, new_y - old_y, h, law)
+        slides = touches and keeps_on and not sticks and not slows
         end = SLIDING if slides else ALONE
         end = STUCK if sticks else end
         end = FREE if free else end
@@ -240,9 +238,10 @@ def settle(flat, law, start_s, h, decay):  # type: ignore[no-untyped-def]
         w[NORMAL, j], w[BENT, j] = w[END_NORMAL, j], w[END_BENT, j]
         slip, share = w[SLIP, j], w[SHARE, j]
         w[SLIPPED, j] = start_s + share * h if share >= 0.0 else w[SLIPPED, j]
-        speed, earlier = slip / h, w[SPEED, j]
-        # a tip that just let go, or slows down this fast, is not as it was a step ago
-        steady = slip > 0.0 and share < 0.0 and earlier <= _STEADY * speed
+        part = h * (1.0 - max(share, 0.0))
+        speed, earlier = slip / part if slip > 0.0 else 0.0, w[SPEED, j]
+        # a tip that just let go, or slows down fast, is not as it was a step ago
+        steady = slip > 0.0 and share < 0.0 and is_steady(earlier, speed)
         w[EARLIER, j] = earlier if steady and w[SLID_S, j] == h else -1.0
         w[SLID_S, j], w[SPEED, j] = h if steady else 0.0, speed
         w[PATH, j] += slip

@@ -24,7 +24,9 @@ PASSES = 8
 _MARCH_MM = KNOT_MM / 8.0
 """How far apart places are at which the balance of a tip is looked at one by one."""
 _MOST_PLACES = 4096.0
-_CLOSE_SPEED = 1e-4
+_STEADY = 1.25
+"""Speed over the next one up to which a line or a parabola through both tells of the one after."""
+_CLOSE_SPEED = 1e-3
 """A change of the speed, over that at which friction begins to rise, like `CLOSE`."""
 
 
@@ -218,6 +220,25 @@ def slid_surely(  # type: ignore[no-untyped-def]
         slip = (low * above - high * below) / (above - below)
         slip = slip if low < slip < high else 0.5 * (low + high)
     return slip, bent
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def slows_down(slid_s, speed, moved_x, moved_y, h, law):  # type: ignore[no-untyped-def]
+    """Tell that a tip's earlier speeds tell nothing of its next one: see `relaxed_speed`.
+
+    Args:
+        slid_s, speed: of the step before: how long it tells of, s (0: not), and its mean, mm/s.
+        moved_x, moved_y, h: how far the base moves, mm, in how many seconds.
+    """
+    far = _STEADY * _STEADY * (moved_x * moved_x + moved_y * moved_y)
+    fast = speed * speed * h * h > far
+    return slid_s == 0.0 and fast and law.strengthening > 0.0 and law.damping_s == 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def is_steady(earlier, speed):  # type: ignore[no-untyped-def]
+    """Tell that speeds of two steps, mm/s, foretell the next one."""
+    return earlier <= _STEADY * speed
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

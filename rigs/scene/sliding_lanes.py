@@ -95,26 +95,24 @@ def slide_on(w, field, law, first, count, h, swerve, decay, gain):  # type: igno
         first, count, swerve, h, decay, gain: as in `rigs.scene.lanes.respond`.
 
     Returns:
-        how many have not found their slip; their END_MODE becomes ALONE.
+        how many must be computed alone; their END_MODE is ALONE.
     """
     _aim(w, law)
     _begin(w, law, field.shape[1] > 1, h, swerve, decay, gain)
-    alone = 0
     for _ in range(PASSES):
         if _look(w) > 0:
             for j in range(count):
                 if w[SEEKS, j] > 0.0 and w[WANTED, j] != w[KNOT, j]:
                     take_knot(w, field, first + j, j, w[WANTED, j])
-        seek, lost = _seek(w, law)
-        alone += lost
-        if seek == 0:
+        if _seek(w, law) == 0:
             break
-    if _arrive(w) > 0:
+    stale, alone = _arrive(w)
+    if stale > 0:
         for j in range(count):
             if w[END_MODE, j] == SLIDING and w[WANTED, j] != w[KNOT, j]:
                 take_knot(w, field, first + j, j, w[WANTED, j])
     _pull(w, law)
-    return alone + seek
+    return alone
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -180,8 +178,8 @@ def _look(w):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _seek(w, law):  # type: ignore[no-untyped-def]
-    """A step of every tip towards its slip; how many have not found it, and how many never will."""
-    seek, lost = 0, 0
+    """A step of every tip towards its slip; how many go on seeking."""
+    seek = 0
     for j in range(LANES):
         slip = w[SLIP, j]
         grip, grip_slope = grip_between(
@@ -198,7 +196,6 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
             w[TABLE + SHORTER, j], w[TABLE + COMPLIANCE, j], w[GRIP, j], w[GRIP_SLOPE, j],
             w[QUICK, j], law.weak_mm_s,
         )  # fmt: skip
-        hopeful = hopeful and slip <= w[FAR, j]
         w[SLIP, j] = slip if seeks else w[SLIP, j]
         w[END_BENT, j] = bent if seeks else w[END_BENT, j]
         gone = seeks and not hopeful
@@ -206,27 +203,28 @@ def _seek(w, law):  # type: ignore[no-untyped-def]
         w[END_MODE, j] = ALONE if gone else w[END_MODE, j]
         w[SEEKS, j] = 1.0 if still else 0.0
         seek += 1 if still else 0
-        lost += 1 if gone else 0
-    return seek, lost
+    return seek
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _arrive(w):  # type: ignore[no-untyped-def]
-    """Places of the tips that slid; how many need another knot."""
-    stale = 0
+    """Places of the tips that slid; how many need another knot, and how many are done alone."""
+    stale, alone = 0, 0
     for j in range(LANES):
-        # what was not found is done alone
-        end = ALONE if w[SEEKS, j] > 0.0 else w[END_MODE, j]
+        # what was not found, or is not believed, is done alone
+        slip, end = w[SLIP, j], w[END_MODE, j]
+        doubted = end == SLIDING and (w[SEEKS, j] > 0.0 or slip > w[FAR, j])
+        end = ALONE if doubted else end
         slides = end == SLIDING
         w[END_MODE, j] = end
-        slip = w[SLIP, j]
+        alone += 1 if end == ALONE else 0
         wanted = knot_at(w[PATH, j] + slip)
         w[END_X, j] = w[PLACE_X, j] + slip * w[UNIT_X, j] if slides else w[END_X, j]
         w[END_Y, j] = w[PLACE_Y, j] + slip * w[UNIT_Y, j] if slides else w[END_Y, j]
         w[SLIP, j] = slip if slides else 0.0
         w[WANTED, j] = wanted
         stale += 1 if slides and wanted != w[KNOT, j] else 0
-    return stale
+    return stale, alone
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

@@ -44,6 +44,7 @@ from rigs.scene.sliding import (
     relaxed_speed,
     slid_surely,
     slide_step,
+    slows_down,
     strengthened,
 )
 from rigs.scene.springs import (
@@ -234,9 +235,13 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
         new_x - old_x, new_y - old_y, unit_x, unit_y, slides, w[BENT, j], bending, shortening,
         compliance, pressed, along, field.shape[1] > 1,
     )  # fmt: skip
-    if keeps_on and w[SLID_S, j] > 0.0:
-        pass
-    elif law.strengthening > 0.0 and law.damping_s == 0.0 and before > 0.0 and slid_s > 0.0:
+    unknown = not keeps_on and law.strengthening > 0.0 and law.damping_s == 0.0 and slid_s > 0.0
+    if before > 0.0 and (
+        unknown
+        or (
+            keeps_on and slows_down(w[SLID_S, j], w[SPEED, j], new_x - old_x, new_y - old_y, h, law)
+        )
+    ):
         first = np.sqrt(from_x * from_x + from_y * from_y)
         grip, grip_slope = grip_at(field, i, path)
         _, _, _, _, steepness = slide_step(
@@ -253,10 +258,9 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
             slip, bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
             shortening, compliance, grip, grip_slope, quick, law.weak_mm_s,
         )  # fmt: skip
-        hopeful = hopeful and slip <= far
         found = found and hopeful
         tried += 1
-    if not found:
+    if not found or slip > far:
         slip, bend = slid_surely(
             bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
             shortening, compliance, field, i, path, quick, lag, law,
