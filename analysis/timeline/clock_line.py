@@ -1,21 +1,25 @@
 """A clock's line through pulses of which some may be wrong: straight, or bent as the clock is.
 
 A crystal that warms up drifts by a few ppm more at the end of a trial than at its beginning; a
-straight line is then wrong by a hundred microseconds and does not know it. So the line gets as many
-pieces as its residuals ask for, by a test on their means, and no more. It also says how far it may
-be wrong: the 95 % quantile of the largest error anywhere between the first and the last pulse.
+straight line is then wrong by a hundred microseconds and does not know it. So the line gets a knot
+wherever the drift changes beyond chance, and each piece between such knots is cut into some more:
+a change that chance hides is then followed, not assumed away, and what that costs is in the stated
+uncertainty. That is the 95 % quantile of the largest error anywhere between the first and the last
+pulse. A clock that jumps has no line: a step is looked for at every pulse, along with each knot.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from analysis.timeline.pulse_kernels import (
+    changes,
     median,
     normal_equations,
     places_of,
@@ -25,15 +29,29 @@ from analysis.timeline.pulse_kernels import (
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 _HUBER = 1.345
 _GATE = 5.0
-_MAX_PIECES = 64
+_MOST_KNOTS = 24
 _PIECE_PULSES = 30
+_PIECES = 4
+"""Into so many pieces a straight clock is cut, and one with knots into twice as many as it has."""
+_MOVED_KNOTS = 4
+"""As long as there are so few knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
-"""How often a straight clock is given more pieces than it needs."""
-_RUNS = (8, 16, 32)
+"""How often a straight clock's locked stamps are taken for bent."""
+_KNOT = 3.5
+"""A drift that changes by so many standard deviations gets a knot."""
+_STEP, _STEP_AT_END = 5.5, 4.5
+"""A clock has jumped where a step stands out by so many, among thousands of places or at an end."""
+_MORE_LIKELY, _MORE = 12.0, 1.1
+"""By how much and by what share more of the squares a step must explain than a change of drift: of
+a clock that bends smoothly a step explains less than a bend does, of one that jumps 1.5 times as
+much in the median over the places of the jump."""
+_DOUBT, _DOUBT_AT_END = 4.0, 3.0
+"""A step of so many may be one: what it would do is added to the uncertainty."""
 _DRAWS = 4096
 _SLOPES = 81
 _UNITS = 0.6
@@ -68,7 +86,8 @@ class ClockLine:
         sigma: scatter of the pulses on the line, ns.
         uncertainty: largest error of the line from the first to the last knot, 95 %, ns.
         sudden: how far the line may be off next to where its slope changes faster than a clock
-            bends, as it does when the clock jumps, ns.
+            bends, ns.
+        jump: by how much the clock jumped somewhere, ns; 0 if it did not.
         straightened: whether what is left over looks like chance.
     """
 
@@ -79,6 +98,7 @@ class ClockLine:
     sigma: float
     uncertainty: float
     sudden: float
+    jump: float
     straightened: bool
 
     @cached_property
@@ -94,12 +114,13 @@ class ClockLine:
 
 
 def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> ClockLine:
-    """The line of a clock through pulses at rising x, with as few pieces as the residuals allow.
+    """The line of a clock through pulses at rising x, with as few knots as the residuals allow.
 
     Args:
         x: (n,) times of the pulses, rising, ns.
         y: (n,) what the other clock gained there, ns.
-        resolution: unit of the stamps, ns: means that differ by less than half of it are no bend.
+        resolution: unit of the stamps, ns: where nothing shakes them, means that differ by less
+            than half of it are no bend.
         bend_per_ns: by how much a slope may change in a nanosecond.
     """
     slope, level = theil_sen(x, y)
@@ -108,19 +129,117 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
     # scatter between neighbours is free of any bend
     local = max(1.4826 * median(np.abs(rough[1:] - rough[:-1])) / 2**0.5, floor)
     knots = x[[0, -1]]
-    values = slope * knots + level
+    values, moved = slope * knots + level, True
     while True:
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor)
-        straight = _is_chance(residuals[inside], knots.size, min(local, sigma), resolution / 2)
+        noise = min(local, sigma)
+        # a unit that nothing shakes hides what is smaller
+        locked = resolution / 2 > noise
+        found = _changes(x, knots, residuals, inside, _HUBER * sigma, noise)
+        step = _jump(found, resolution if locked else 0.0)
+        if locked:
+            straight = _is_chance(residuals[inside], knots.size, noise, resolution / 2)
+        else:
+            straight = found.knot < _KNOT
         pieces = knots.size - 1
-        if straight or 2 * pieces > min(_MAX_PIECES, int(inside.sum()) // _PIECE_PULSES):
+        if straight or (step and moved):
             break
-        at = np.flatnonzero(inside)
-        ends = np.linspace(0, at.size - 1, 2 * pieces + 1).round().astype(np.int64)
-        finer = x[at[ends]]
-        finer[0], finer[-1] = x[0], x[-1]
+        before = knots
+        if not step:
+            if pieces > min(_MOST_KNOTS, int(inside.sum()) // _PIECE_PULSES - 1):
+                break
+            knots = np.sort(np.append(knots, x[found.knot_at]))
+        # a knot beside its place leaves a step there
+        moved = bool(step) or pieces <= _MOVED_KNOTS
+        if moved:
+            knots = _moved(x, y, knots, inside, noise)
+        values = np.interp(knots, before, values)
+    at = knots[1:-1]
+    if not (locked or step):
+        finer = _cut(x[inside], knots)
         values, knots = np.interp(finer, knots, values), finer
-    return _judged(x, knots, values, residuals, inside, sigma, resolution, bend_per_ns, straight)
+        values, residuals, inside, sigma = _robust(x, y, knots, values, floor)
+    line = _judged(x, knots, at, values, residuals, inside, sigma, resolution, bend_per_ns)
+    return replace(
+        line, uncertainty=line.uncertainty + _doubt(found), jump=step, straightened=bool(straight)
+    )
+
+
+def _cut(x: Floats, knots: Floats) -> Floats:
+    """Knots with more between them, about `_PIECES` or twice as many pieces as there are."""
+    pieces = knots.size - 1
+    wanted = min(max(_PIECES, 2 * pieces), max(x.size // _PIECE_PULSES, 1))
+    length = (knots[-1] - knots[0]) / wanted
+    parts = [knots[:1]]
+    for begin, end in pairwise(knots):
+        count = max(1, int(np.ceil((end - begin) / length - 0.25)))
+        parts.append(np.linspace(begin, end, count + 1)[1:])
+    return np.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """The most that stands out of the residuals, in standard deviations of chance, and where.
+
+    knot, knot_at: a change of the drift, and its pulse.
+    step, step_size: a step, and its size in ns.
+    end, end_size: the same within some pulses of an end.
+    """
+
+    knot: float
+    knot_at: int
+    step: float
+    step_size: float
+    end: float
+    end_size: float
+
+
+def _changes(
+    x: Floats, knots: Floats, residuals: Floats, inside: Bools, limit: float, noise: float
+) -> _Changes:
+    piece, share = places_of(x, knots)
+    rest = np.where(inside, residuals, np.inf)
+    gate = float(np.abs(residuals[inside]).max())
+    matrix = normal_equations(piece, share, np.zeros(x.size), rest, gate, limit, knots.size)[0]
+    found = changes(
+        (x - x[0]) / (x[-1] - x[0]), piece, share, rest, gate, limit,
+        np.linalg.inv(_held(matrix)), max(1, x.size * knots.size**2 // 60_000), _PIECE_PULSES // 2,
+    )  # fmt: skip
+    knot, at, step, step_size, end, end_size = found
+    return _Changes(knot / noise, int(at), step / noise, step_size, end / noise, end_size)
+
+
+def _jump(found: _Changes, hidden: float) -> float:
+    """The size of a step that is none by chance, no change of the drift, and not hidden; else 0."""
+    bent = max(found.knot**2 + _MORE_LIKELY, _MORE * found.knot**2)
+    if found.step**2 > max(_STEP**2, bent) and abs(found.step_size) > hidden:
+        return found.step_size
+    if found.end**2 > max(_STEP_AT_END**2, bent) and abs(found.end_size) > hidden:
+        return found.end_size
+    return 0.0
+
+
+def _doubt(found: _Changes) -> float:
+    """What a step would do that may be there: half of it is wrong on either side, ns."""
+    middle = 0.5 * abs(found.step_size) if found.step > _DOUBT else 0.0
+    return max(middle, abs(found.end_size) if found.end > _DOUBT_AT_END else 0.0)
+
+
+def _moved(x: Floats, y: Floats, knots: Floats, inside: Bools, noise: float) -> Floats:
+    """Each inner knot in turn where it fits best while the others stay."""
+    none, rest = np.zeros(x.size), np.where(inside, 0.0, np.inf)
+    for _ in range(1 if knots.size == 3 else 2):
+        for k in range(1, knots.size - 1):
+            others = np.delete(knots, k)
+            piece, share = places_of(x, others)
+            level = np.where(inside, y, 0.0)
+            matrix, right = normal_equations(piece, share, level, rest, 1.0, 1.0, others.size)
+            values: Floats = np.linalg.solve(_held(matrix), right)
+            residuals = residuals_at(piece, share, y, values)
+            found = _changes(x, others, residuals, inside, np.inf, noise)
+            if found.knot > 0:
+                knots = np.sort(np.append(others, x[found.knot_at]))
+    return knots
 
 
 def line_within_unit(x: Floats, y: Floats, resolution: float, drift: float) -> ClockLine | None:
@@ -151,7 +270,7 @@ def line_within_unit(x: Floats, y: Floats, resolution: float, drift: float) -> C
     everything = np.ones(x.size, np.bool_)
     uncertainty = 1.0 + resolution / 2 + away
     return ClockLine(
-        knots, slope * knots + level, residuals, everything, sigma, uncertainty, 0.0, True
+        knots, slope * knots + level, residuals, everything, sigma, uncertainty, 0.0, 0.0, True
     )
 
 
@@ -200,10 +319,10 @@ def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -
 
 
 def _judged(
-    x: Floats, knots: Floats, values: Floats, residuals: Floats, inside: Bools, sigma: float,
-    resolution: float, bend_per_ns: float, straight: bool,
+    x: Floats, knots: Floats, at: Floats, values: Floats, residuals: Floats, inside: Bools,
+    sigma: float, resolution: float, bend_per_ns: float,
 ) -> ClockLine:  # fmt: skip
-    """The line with its uncertainty."""
+    """The line with its uncertainty; `at` are the knots whose places the pulses told."""
     inner, n = residuals[inside], knots.size
     piece, share = places_of(x[inside], knots)
     none = np.zeros(inner.size)
@@ -212,17 +331,19 @@ def _judged(
     limit = _HUBER * sigma
     linear = max(float((np.abs(inner) < limit).mean()), 0.1)
     variance = float((np.minimum(np.abs(inner), limit) ** 2).mean()) / linear**2
-    variance *= inner.size / max(1, inner.size - n)
+    variance *= inner.size / max(1, inner.size - n - at.size)
     covariance = variance * np.linalg.inv(matrix)
-    root = np.linalg.cholesky(covariance + (1e-12 * covariance.trace() / n + 1e-6) * np.eye(n))
+    ends = _with_places(matrix, piece, share, np.searchsorted(knots, at)) * variance
+    count = ends.shape[0]
+    root = np.linalg.cholesky(ends + (1e-12 * ends.trace() / count + 1e-6) * np.eye(count))
     # between knots the error is no larger than at one of them
-    errors = _draws(n) @ root.T
+    errors = _draws(count) @ root.T
     np.abs(errors, out=errors)
     # numpy is slow where it takes the largest of two
-    largest = errors.max(axis=1) if n > 8 else reduce(np.maximum, errors.T)
+    largest = errors.max(axis=1) if count > 8 else reduce(np.maximum, errors.T)
     band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
-    band *= float(special.stdtrit(max(1, inner.size - n), 0.975)) / 1.959964
-    sag, sudden = 0.0, 0.0
+    band *= float(special.stdtrit(max(1, inner.size - n - at.size), 0.975)) / 1.959964
+    sudden = 0.0
     if n > 2:
         run = np.diff(knots)
         # slopes' changes as a linear function of the values
@@ -230,30 +351,42 @@ def _judged(
         here = np.arange(n - 2)
         to_change[here, here], to_change[here, here + 2] = 1 / run[:-1], 1 / run[1:]
         to_change[here, here + 1] = -1 / run[:-1] - 1 / run[1:]
-        changes = np.abs(to_change @ values)
+        changed = np.abs(to_change @ values)
         chance = np.sqrt(np.einsum("ij,jk,ik->i", to_change, covariance, to_change))
         spans, longest = 0.5 * (run[:-1] + run[1:]), np.maximum(run[:-1], run[1:])
-        # a parabola sags by an eighth of the slope's change over a piece; what changes faster than
-        # clocks bend may be a jump, of which half is wrong next to it
-        smooth = np.minimum(changes, bend_per_ns * spans)
-        faster = np.maximum(changes - chance - smooth, 0.0) * longest / 2
-        sag = float((smooth * longest / 8 + faster).max())
+        faster = np.maximum(changed - chance - bend_per_ns * spans, 0.0) * longest / 2
         sudden = float(faster.max())
-    uncertainty = 1.0 + band + sag + _left_over(inner, sigma) + _locked(inner, resolution)
-    return ClockLine(knots, values, residuals, inside, sigma, uncertainty, sudden, straight)
+    uncertainty = 1.0 + band + _locked(inner, resolution)
+    return ClockLine(knots, values, residuals, inside, sigma, uncertainty, sudden, 0.0, True)
 
 
-def _left_over(residuals: Floats, sigma: float) -> float:
-    """By how much the mean of a few pulses in a row is off beyond chance, as next to a jump, ns."""
-    sums = np.concatenate([[0.0], np.cumsum(residuals)])
-    worst = 0.0
-    for count in _RUNS:
-        if count <= residuals.size:
-            means, chance = np.abs(sums[count:] - sums[:-count]) / count, sigma / count**0.5
-            # of a clock that drifts away at an end, the mean shows half
-            at_end = 2.0 * (max(float(means[0]), float(means[-1])) - 3.0 * chance)
-            worst = max(worst, float(means.max()) - 5.0 * chance, at_end)
-    return worst
+def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Floats:
+    """Covariance of the values at knots, for pulses of variance 1; twice where a place is told.
+
+    A knot that lies a little aside makes the line wrong by a step there, to first order (Seber and
+    Wild 1989, section 9.4): it has one value before and one behind. `matrix` are the normal
+    equations of the values, `places` (p,) which knots these are.
+    """
+    n, count = matrix.shape[0], places.size
+    if not count:
+        inverse: Floats = np.linalg.inv(matrix)
+        return inverse
+    hats = np.zeros((n - 1, n))
+    here = np.arange(n - 1)
+    hats[here, here] = np.bincount(piece, 1.0 - share, n - 1)
+    hats[here, here + 1] = np.bincount(piece, share, n - 1)
+    behind = np.cumsum(hats[::-1], axis=0)[::-1][places]
+    pulses = np.cumsum(np.bincount(piece, minlength=n - 1)[::-1])[::-1][places]
+    whole = np.zeros((n + count, n + count))
+    whole[:n, :n], whole[n:, :n], whole[:n, n:] = matrix, behind, behind.T
+    whole[n:, n:] = pulses[np.maximum.outer(np.arange(count), np.arange(count))]
+    told = np.eye(n + count)
+    told[:n, n:] = np.arange(n)[:, None] > places
+    # behind each place: the value of its knot, and all steps up to its own
+    told[n:, n:] = np.tri(count)
+    told[n + np.arange(count), places] = 1.0
+    result: Floats = told @ np.linalg.inv(_held(whole)) @ told.T
+    return result
 
 
 def _locked(residuals: Floats, resolution: float) -> float:
@@ -268,7 +401,7 @@ def _locked(residuals: Floats, resolution: float) -> float:
     return 0.5 * resolution * float(np.exp(-2 * np.pi**2 * shaken**2))
 
 
-@lru_cache(maxsize=_MAX_PIECES)
+@lru_cache(maxsize=128)
 def _draws(n: int) -> Floats:
     """Normal numbers, the same ones always, (draws, n)."""
     return np.random.default_rng(n).standard_normal((_DRAWS, n))

@@ -31,9 +31,14 @@ Floats = NDArray[np.float64]
 
 MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
+MIN_LOSSY, MIN_LIFT = 100, 1.5
+"""Where both trains lost many pulses a smaller share will do: of so many pulses and so many times
+what a wrong lag gives. In such a train a clock that jumps by whole ticks, after which half of the
+pulses meet others, stands out only where there are many."""
 MIN_EITHER = 0.75
-"""A device loses pulses or adds some; where both trains are full of strangers the place is wrong,
-or a clock jumped by whole ticks, after which half of the pulses meet others."""
+"""Where less than this of both trains fits, both lost many."""
+UNVOUCHED = 2
+"""A clock that jumps at the last two pulses cannot be told from two late ones."""
 BEND_PPM_S = 2.0
 """By how much a clock's drift may change in a second without being taken for a jump; a crystal that
 warms up by 10 K in a minute makes 0.4."""
@@ -156,7 +161,7 @@ def fit_clock(
         match = match_trains(x, y, tick, 1.02 * max_drift_ppm * 1e-6, start_marker_ns)
     except NoMatchError as error:
         raise ClockRefused(cast("Reason", error.reason), str(error)) from None
-    _gate_share(x, y, match)
+    _gate_share(x, y, match, tick)
     px, py = x[match.device], y[match.reference]
     line = fit_line(px, py - px, resolution_ns, BEND_PPM_S * 1e-15)
     # where a unit is all that the stamps show, it knows better than their scatter
@@ -174,11 +179,12 @@ def fit_clock(
     if stray is not None:
         raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
     shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
-    if max(shares) < MIN_EITHER:
+    if max(shares) < MIN_EITHER and i.size < MIN_LOSSY:
         raise ClockRefused(
             "no_match",
             f"only {shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses "
-            f"fit (of one of them at least {MIN_EITHER:.0%}): a clock jumped, or not these pulses",
+            f"fit, of one of them at least {MIN_EITHER:.0%} where less than {MIN_LOSSY} do: a "
+            "clock jumped, or not these pulses",
         )
     return _fit(match, line, x, y, device_0, reference_0)
 
@@ -201,11 +207,13 @@ def _fit(
         clock = ClockMap.through(
             [device_0 + int(knot) for knot in knots], [reference_0 + int(image) for image in images]
         )
-    seen = px[inside]
-    first, last = device_0 + int(seen[0]), device_0 + int(seen[-1])
+    # what lies at the edge of chance does not vouch for what comes before it
+    seen = px[inside & (np.abs(line.residuals) <= 3 * line.sigma)]
+    first, last = device_0 + int(seen[UNVOUCHED]), device_0 + int(seen[-1 - UNVOUCHED])
     in_span = (y >= py.min()) & (y <= py.max())
     middle_ns = (first + last) // 2
-    run = float(line.knots[-1] - line.knots[0])
+    gained = np.interp(px[inside], line.knots, line.values)
+    apart = px[inside] - px[inside].mean()
     return ClockFit(
         map=clock,
         pulses_seen=int(inside.sum()),
@@ -216,7 +224,7 @@ def _fit(
         residual_p95_ns=line.residual_p95,
         residual_max_ns=float(residuals.max()),
         offset_ns=clock.to_reference(middle_ns) - middle_ns,
-        drift_ppm=float(line.values[-1] - line.values[0]) / run * 1e6,
+        drift_ppm=float((apart * gained).sum() / (apart**2).sum()) * 1e6,
         uncertainty_ns=line.uncertainty,
         peak_ratio=match.peak_ratio,
         first_ns=first,
@@ -256,7 +264,7 @@ def _extended(line: ClockLine, x: Floats) -> Floats:
     return result
 
 
-def _gate_share(x: Floats, y: Floats, match: Match) -> None:
+def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
     """Refuse when, where the trains overlap, too few pulses of the shorter have a partner."""
     matched = int(match.device.size)
     if matched < MIN_PULSES:
@@ -269,10 +277,12 @@ def _gate_share(x: Floats, y: Floats, match: Match) -> None:
     in_x = int(((x + lag >= low) & (x + lag <= high)).sum())
     in_y = int(((y >= low) & (y <= high)).sum())
     share = matched / max(1, min(in_x, in_y))
-    if share < MIN_MATCHED:
+    by_chance = max(in_x, in_y) * tick / max(high - low, tick)
+    if share < MIN_MATCHED and (matched < MIN_LOSSY or share < MIN_LIFT * by_chance):
         raise ClockRefused(
             "no_match",
-            f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}); "
+            f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}, or "
+            f"{MIN_LIFT:g} times the {by_chance:.0%} of a wrong place and {MIN_LOSSY} pulses); "
             f"{in_x} device and {in_y} reference pulses overlap",
         )
 
@@ -286,6 +296,10 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
             "residuals",
             f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
             f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
+        )
+    if line.jump:
+        raise ClockRefused(
+            "residuals", f"a clock jumped by {abs(line.jump) / 1e3:.1f} us, or pulses did"
         )
     if line.sudden > 3 * jitter_ns:
         raise ClockRefused(

@@ -151,6 +151,91 @@ def residuals_at(piece, share, y, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # type: ignore[no-untyped-def]
+    """What stands out of the residuals of a line with knots: a change of its slope, and a step.
+
+    Each is tried at pulse after pulse, beside all that the line may do by itself: what is left of
+    it then, times the residuals, has a standard deviation that chance explains.
+
+    Args:
+        x: (n,) from 0 to 1, rising.
+        piece, share: (n,) see `places_of`.
+        residuals: (n,) those beyond `gate` have no weight, those beyond `limit` less than 1.
+        inverse: (k, k) of the matrix of `normal_equations`, with the same weights.
+        every: pulses from one that is tried to the next, but near the ends.
+        apart: pulses between a change of slope and the next knot at the least.
+
+    Returns:
+        the largest change of slope over its standard deviation for residuals of size 1, and its
+        pulse; the same of a step, and its size; the same of steps among the first and the last
+        32 pulses, which leave out 3 pulses or more.
+    """
+    n, k = x.size, inverse.shape[0]
+    used = total = 0
+    in_piece = np.zeros(k - 1, np.int64)
+    # what the line would take away of the residuals with these weights
+    taken = np.zeros(k)
+    for j in range(n):
+        size = abs(residuals[j])
+        if size <= gate:
+            total += 1
+            in_piece[piece[j]] += 1
+            weighted = min(1.0, limit / max(size, 1e-9)) * residuals[j]
+            taken[piece[j]] += weighted * (1.0 - share[j])
+            taken[piece[j] + 1] += weighted * share[j]
+    taken = inverse @ taken
+    flat, rising = np.zeros(k), np.zeros(k)
+    sum_0 = sum_1 = sum_2 = rest_0 = rest_1 = 0.0
+    knot = step = step_size = end = end_size = 0.0
+    at = used_in_piece = 0
+    for j in range(n - 1, -1, -1):
+        size = abs(residuals[j])
+        if size > gate:
+            continue
+        weight, t, p = min(1.0, limit / max(size, 1e-9)), x[j], piece[j]
+        before, after = weight * (1.0 - share[j]), weight * share[j]
+        flat[p] += before
+        flat[p + 1] += after
+        rising[p] += before * t
+        rising[p + 1] += after * t
+        sum_0 += weight
+        sum_1 += weight * t
+        sum_2 += weight * t * t
+        rest_0 += weight * residuals[j]
+        rest_1 += weight * residuals[j] * t
+        used += 1
+        used_in_piece = used_in_piece + 1 if j < n - 1 and piece[j + 1] == p else 1
+        edge = min(used, total - used)
+        whole = j % every == 0
+        if edge < 3 or (not whole and edge > 32):
+            continue
+        left, rest = sum_0, rest_0
+        for a in range(p, k):
+            rest -= flat[a] * taken[a]
+            for b in range(p, k):
+                left -= flat[a] * inverse[a, b] * flat[b]
+        if left > 0.5:
+            high = abs(rest) / np.sqrt(left)
+            if high > step:
+                step, step_size = high, rest / left
+            if edge <= 32 and high > end:
+                end, end_size = high, rest / left
+        if not whole or used_in_piece < apart or in_piece[p] - used_in_piece < apart:
+            continue
+        left, rest = sum_2 - 2.0 * t * sum_1 + t * t * sum_0, rest_1 - t * rest_0
+        for a in range(p, k):
+            one = rising[a] - t * flat[a]
+            rest -= one * taken[a]
+            for b in range(p, k):
+                left -= one * inverse[a, b] * (rising[b] - t * flat[b])
+        if left > 1e-9:
+            high = abs(rest) / np.sqrt(left)
+            if high > knot:
+                knot, at = high, j
+    return knot, at, step, step_size, end, end_size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def most_off(width, fits, low, high, at_ends):  # type: ignore[no-untyped-def]
     """Of windows of `width` reference pulses: how many are off the line while the device has some.
 

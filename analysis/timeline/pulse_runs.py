@@ -28,8 +28,8 @@ BURST_AT_END = 2
 the last two pulses cannot be told from two late pulses."""
 _WIDTHS = (16, 24, 32, 48, 64, 96, 128)
 _WIDTHS_AT_END = (8, 12, 16, 24, 32)
-_LEAST, _MOST_DEVICE, _MOST_REFERENCE = 0.02, 0.25, 0.4
-"""Shares of bad pulses that are assumed at least and at most: a jump must not vouch for itself."""
+_LEAST, _MOST = 0.02, 0.46
+"""Shares of bad pulses that are assumed at least and at most."""
 
 
 def stray_stretch(
@@ -46,8 +46,8 @@ def stray_stretch(
         i, j: (k,) indices of pulses that belong together and lie on the line, ascending.
         slack_ns: how far a pulse on the line may be from it.
     """
-    bad_device = _share(i, _MOST_DEVICE)
-    bad_reference = _share(j, _MOST_REFERENCE)
+    bad_device = _share(i)
+    bad_reference = _share(j)
     places = reference.size.bit_length()
     # between pulses on the line: those that both trains have there, and neither on the line
     both = np.minimum(_left_out(i, predicted.size), _left_out(j, reference.size))
@@ -80,11 +80,20 @@ def _left_out(on_line: Ints, size: int) -> Ints:
     return np.diff(np.concatenate([[-1], on_line, [size]])) - 1
 
 
-def _share(on_line: Ints, most: float) -> float:
-    """Share of bad pulses between the first and the last good one, in steps of 2 %, rounded up."""
-    total = int(on_line[-1] - on_line[0]) + 1
-    bad = 1.0 - on_line.size / total
-    return float(min(max(np.ceil(50 * bad) / 50, _LEAST), most))
+def _share(on_line: Ints) -> float:
+    """Share of bad pulses in the best quarter between the first and the last good one.
+
+    With two standard deviations of it, in steps of 2 %, rounded up. Not the share of all: a clock that
+    jumped must not vouch for itself.
+    """
+    edges = np.linspace(on_line[0], on_line[-1] + 1, 5).round()
+    quarter = np.maximum(np.diff(edges), 1.0)
+    good = np.diff(np.searchsorted(on_line, edges)) / quarter
+    best = int(good.argmax())
+    bad = 1.0 - float(good[best])
+    count = float(quarter[best])
+    bad += 2.0 * ((bad * (1.0 - bad) + 1.0 / count) / count) ** 0.5
+    return float(min(max(np.ceil(50 * bad) / 50, _LEAST), _MOST))
 
 
 @lru_cache(maxsize=4096)
