@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from statistics import median
 
 import numpy as np
@@ -26,6 +28,7 @@ from scipy import special
 from analysis.timeline.clocks import ClockRefused, fit_clock
 from benchmarks.clocks import DRIFT_PPM, Train, make_train
 from benchmarks.measure import SEED, Figures
+from rigs.pulse_code import U8, code_bits
 from storage.streams import F64
 
 FAR = 3.0
@@ -33,9 +36,11 @@ FAR = 3.0
 KINDS = (
     "good", "jump_1ms_at_end", "jump_1ms", "jump_20us_in_middle", "jump_20us", "jump_20us_at_end",
     "jump_of_ticks", "kink_0.2ppm", "kink_1ppm", "kink_5ppm", "warming", "other_trial",
-    "lost_30_on_both", "lost_30_and_jump_of_ticks",
+    "other_trial_16_bits", "lost_30_on_both", "lost_30_and_jump_of_ticks",
 )  # fmt: skip
-HOPELESS = ("jump_of_ticks", "other_trial", "lost_30_and_jump_of_ticks")
+HOPELESS = (
+    "jump_of_ticks", "other_trial", "other_trial_16_bits", "lost_30_and_jump_of_ticks",
+)  # fmt: skip
 """Whatever is accepted of these is wrong."""
 END = 0.005
 """The share of a train that is its end."""
@@ -136,8 +141,8 @@ def tally(kind: str, trains: int) -> Tally:
 
 def faulty_train(rng: np.random.Generator, kind: str) -> Train:
     """A train of `benchmarks.clocks` with one more fault."""
-    if kind == "other_trial":
-        return _other_trial(rng)
+    if kind.startswith("other_trial"):
+        return _other_trial(rng, code_bits if kind == "other_trial" else _old_code)
     missing = 0.3 if kind.startswith("lost_30") else None
     made = make_train(rng, missing=missing, clock=lambda sent, tick: _clock(rng, kind, sent, tick))
     if missing is None:
@@ -169,11 +174,25 @@ def _clock(rng: np.random.Generator, kind: str, sent: F64, tick: int) -> F64:
     return shift
 
 
-def _other_trial(rng: np.random.Generator) -> Train:
+def _other_trial(rng: np.random.Generator, code: Callable[[int, int], U8]) -> Train:
     """What the device saw of one trial with what the box sent in another, of the same length."""
     seconds, tick = float(rng.uniform(20, 60)), int(rng.choice([10, 20, 50])) * 1_000_000
-    one, other = (make_train(rng, seconds=seconds, tick=tick) for _ in range(2))
+    one, other = (make_train(rng, seconds=seconds, tick=tick, code=code) for _ in range(2))
     return Train(one.device, other.reference, one.true, one.sent, tick)
+
+
+def _old_code(seed: int, n: int) -> U8:
+    """The code of recordings made before it had 32 bits: stretches of one that has 65,535."""
+    begin = seed % 65_535
+    return np.resize(np.roll(_old_period(), -begin), n)
+
+
+@cache
+def _old_period() -> U8:
+    bits = [1] * 16
+    for _ in range(65_535 - 16):
+        bits.append(bits[-16] ^ bits[-14] ^ bits[-13] ^ bits[-11])
+    return np.array(bits, np.uint8)
 
 
 def main() -> None:

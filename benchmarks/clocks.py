@@ -8,8 +8,7 @@ within the stated uncertainty.
 
 `wrong_accepted` counts accepted maps that are wrong by over 100 us, and fits accepted of what must
 be refused: a train without a code, another stretch of the code, a clock that jumps by whole ticks
-half-way. Every seed gives a stretch of the same
-65,535 ticks; stretches that overlap do fit where they overlap, so the other stretch does not.
+half-way. More kinds of trains: `benchmarks/clock_kinds.py`.
 
 Beside it, on the same trains: pulses paired by their index and least squares; the nearest pulse
 after the best lag of a cross-correlation, and scipy's soft-L1 regression; and the clock regression
@@ -30,7 +29,7 @@ from scipy import fft, optimize
 
 from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
 from benchmarks.measure import SEED, Figures, spread
-from rigs.pulse_code import PERIOD, code_bits
+from rigs.pulse_code import SEEDS, U8, code_bits
 from storage.streams import F64, I64
 
 DAY_NS = 86_400 * 10**9
@@ -110,6 +109,7 @@ def make_train(
     missing: float | None = None,
     seconds: float | None = None,
     tick: int | None = None,
+    code: Callable[[int, int], U8] = code_bits,
 ) -> Train:
     """A train with all its faults.
 
@@ -117,10 +117,11 @@ def make_train(
         clock: what the device's clock is ahead by, ns, at times since the train began, for a tick.
         missing: share of the pulses that the device does not report; up to a fifth by default.
         seconds, tick: how long the train is, and a tick of it in ns; drawn by default.
+        code: gives the bits from a seed and how many.
     """
     if seconds is None or tick is None:
         seconds, tick = float(rng.uniform(20, 60)), int(rng.choice([10, 20, 50])) * 1_000_000
-    bits = code_bits(int(rng.integers(1, PERIOD)), int(seconds * 1e9 / tick))
+    bits = code(int(rng.integers(1, SEEDS)), int(seconds * 1e9 / tick))
     sent = np.flatnonzero(bits).astype(np.int64) * tick
     offset, start = int(rng.integers(-DAY_NS, DAY_NS)), int(rng.integers(0, 10**12))
     true = np.round(sent / (1 + rng.uniform(-200, 200) * 1e-6)).astype(np.int64) + offset
@@ -139,7 +140,7 @@ def make_train(
 def _hopeless(rng: np.random.Generator, made: Train) -> list[tuple[I64, I64]]:
     """Device and reference trains that do not belong together."""
     ticks = int((made.reference[-1] - made.reference[0]) // made.tick_ns)
-    bits = code_bits(int(rng.integers(1, PERIOD)), 4 * ticks)
+    bits = code_bits(int(rng.integers(1, SEEDS)), 4 * ticks)
     one, other = (
         np.flatnonzero(bits[a : a + ticks]).astype(np.int64) * made.tick_ns for a in (0, 3 * ticks)
     )

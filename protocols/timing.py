@@ -16,7 +16,7 @@ from protocols.quantity import PositiveSeconds
 from protocols.yaml_file import KeyedError, StrictModel
 
 Code = Literal["lfsr", "irregular", "regular"]
-"""What the box sends: 16-bit LFSR, irregular intervals, or a regular train with a start marker."""
+"""What the box sends: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""
 FrameGrade = Literal["hardware trigger", "exposure line", "device time stamps", "host arrival"]
 ArmGrade = Literal["digital input", "host time"]
 WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")

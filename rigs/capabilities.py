@@ -210,7 +210,7 @@ class SyncBox(Protocol):
         """See that a box answers; anew after a fault. Raises RigError."""
 
     def start(self, rate_hz: float, seed: int, code: Code) -> None:
-        """Begin ticks and a code of `rigs.pulse_code` from `seed`, 1 to 65,535."""
+        """Begin ticks and a code of `rigs.pulse_code` from `seed`, which has 32 bits."""
 
     def read_pulses(self) -> PulseChunk:
         """Pulses sent since the last call; the box's clock starts at 0 with `start`."""

@@ -4,13 +4,14 @@ A regular train looks the same after a shift by one period, so a device that mis
 pulse would be aligned wrongly by one tick. Three codes say where in the train one is; which one a
 sync box sends is told by the rig file (`protocols.timing.Timing.code`):
 
-* ``lfsr``: bits of a maximal linear-feedback shift register. A run of 16 never comes again within
-  65,535 ticks (11 minutes at 100 Hz), so any 16 of them say where in the train one is.
+* ``lfsr``: bits of a maximal linear-feedback shift register of 32 bits. A run of 32 comes again
+  after 4,294,967,295 ticks (497 days at 100 Hz), and every seed begins somewhere else: two trials
+  share no stretch (docs/decisions/0078).
 * ``irregular``: pulses at pseudo-random intervals, for a box that times pulses and knows no bits.
 * ``regular``: pulses at equal intervals after one long silence, the start marker, for a box that
   can do nothing else. Only who sees the marker knows where he is.
 
-The sync box, the frame camera's sync line and the decoder share this file.
+The sync box, simulated ones and the check of its reports share this file; a fit needs no code.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ import numpy.typing as npt
 
 from protocols.timing import MARKER_TICKS, Code
 
-SEEDS = (1 << 16) - 1
+SEEDS = (1 << 32) - 2
 """Seeds are 1 to this, whatever the code."""
-PERIOD = SEEDS
-"""Ticks until the code `lfsr` comes again; the others do not."""
-TAPS = (16, 14, 13, 11)
-"""Of the Fibonacci register x^16 + x^14 + x^13 + x^11 + 1, which is primitive."""
+TAPS = (0, 1, 2, 22)
+"""Of the Fibonacci register x^32 + x^22 + x^2 + x + 1, which is primitive."""
+LONGEST_GAP_TICKS = 32
+"""No code is silent for longer from one pulse to the next, but for a board with an older code."""
 SHORTEST_TICKS, LONGEST_TICKS = 2, 9
 """Intervals of the code `irregular`."""
 REGULAR_TICKS = 2
@@ -39,8 +40,9 @@ _SPREAD = 2_654_435_761
 def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
     """The first `n` bits of a code, one a tick, shape (n,), uint8: 1 is a pulse on that tick.
 
-    ``lfsr``: bit 0 is the lowest bit of `seed`; each step shifts the register down and feeds the
-    exclusive or of its taps in at the top. The bits repeat after `PERIOD`.
+    ``lfsr``: the register begins as `seed` times 2654435761 modulo 2**32, so that small seeds do
+    not begin with silence. Each bit is the register's lowest one; then the register shifts down,
+    and the exclusive or of its taps comes in at the top.
 
     ``irregular``: a pulse on tick 0, then one after each interval in turn. Intervals are drawn by
     a xorshift generator of 32 bits, here as a sync box has it in C (all unsigned, modulo 2**32)::
@@ -54,11 +56,11 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
     ``regular``: pulses on the ticks 0, 16, 18, 20 and so on, whatever the seed.
 
     Args:
-        seed: 1 to 65,535 (a register in the state 0 would stay there for ever).
-        n: how many bits; any number, a trial may be longer than `PERIOD`.
+        seed: 1 to 4,294,967,294 (a register in the state 0 would stay there for ever).
+        n: how many bits.
 
     Raises:
-        ValueError: `seed` outside 1 to 65,535, or `n` negative.
+        ValueError: `seed` outside 1 to 4,294,967,294, or `n` negative.
     """
     if not 1 <= seed <= SEEDS:
         raise ValueError(f"seed = {seed}: must be 1 to {SEEDS}")
@@ -68,21 +70,20 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
 
 
 def _lfsr(seed: int, n: int) -> U8:
-    once = np.zeros(max(n if n < PERIOD else PERIOD, 16), np.uint8)
-    once[:16] = (seed >> np.arange(16)) & 1
-    done, leap = 16, 1
-    while done < len(once):
-        # b[k + 16 m] = b[k] ^ b[k + 2 m] ^ b[k + 3 m] ^ b[k + 5 m] for m = 1, and so for every
+    bits = np.zeros(max(n, 32), np.uint8)
+    bits[:32] = ((seed * _SPREAD & _WORD) >> np.arange(32)) & 1
+    done, leap = 32, 1
+    while done < len(bits):
+        # b[k + 32 m] = b[k] ^ b[k + m] ^ b[k + 2 m] ^ b[k + 22 m] for m = 1, and so for every
         # power of two: squaring a polynomial over GF(2) doubles its exponents
-        while 32 * leap <= done:
+        while 64 * leap <= done:
             leap *= 2
-        first = done - 16 * leap
-        count = min(11 * leap, len(once) - done)
-        begin = [first + tap * leap for tap in (0, 2, 3, 5)]
-        parts = [once[at : at + count] for at in begin]
-        once[done : done + count] = parts[0] ^ parts[1] ^ parts[2] ^ parts[3]
+        first = done - 32 * leap
+        count = min(10 * leap, len(bits) - done)
+        parts = [bits[first + tap * leap : first + tap * leap + count] for tap in TAPS]
+        bits[done : done + count] = parts[0] ^ parts[1] ^ parts[2] ^ parts[3]
         done += count
-    return np.resize(once, n) if n > len(once) else once[:n]
+    return bits[:n]
 
 
 def _irregular(seed: int, n: int) -> U8:

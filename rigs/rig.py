@@ -30,6 +30,7 @@ from rigs.capabilities import (
     SyncBox,
 )
 from rigs.plate_frame import PlateFrame
+from rigs.pulse_code import SEEDS
 from rigs.touching import LOOK_S, QUIET_S, RateTouch, count_central
 from storage.streams import Json, Sink, StepTimes
 
@@ -345,7 +346,7 @@ class Rig:
         by_itself = with_frames and self.timing.frames == "exposure line"
         if with_frames and not by_itself:
             self.frames.start()
-        self.sync.start(rate_hz, seed % 65535 + 1, self.timing.code)
+        self.sync.start(rate_hz, seed % SEEDS + 1, self.timing.code)
         if by_itself:
             # the box must stamp every exposure, the first one too
             self.frames.start()

@@ -99,7 +99,7 @@ class SerialSyncBox:
 
         Args:
             rate_hz: 1 to 1,000, to a thousandth.
-            seed: 1 to 65,535.
+            seed: 1 to 4,294,967,294.
             code: see `rigs.pulse_code`.
 
         Raises:

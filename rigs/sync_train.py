@@ -11,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from protocols.timing import MARKER_TICKS, Code
-from rigs.pulse_code import code_bits
+from protocols.timing import Code
+from rigs.pulse_code import LONGEST_GAP_TICKS, code_bits
 
-LONGEST_GAP_TICKS = MARKER_TICKS
-"""No code is silent for longer."""
 _BITS = 1 << 12
 """Bits of the code that are made at first; more when they are needed."""
 _FARTHEST_TICKS = 1 << 24
@@ -62,7 +60,7 @@ class Train:
 
     Args:
         millihertz: rate of the ticks, thousandths of a hertz.
-        seed: of the code, 1 to 65,535.
+        seed: of the code, see `rigs.pulse_code`.
         code: which code.
     """
 

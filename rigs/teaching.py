@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from protocols.program import Move, Position
 from rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from rigs.pulse_code import SEEDS
 from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
 from rigs.touching import LOOK_S, QUIET_S, MarkerTouch, RateTouch
 from storage.streams import FrameChunk
@@ -135,7 +136,7 @@ def _start(rig: Rig, seed: int, with_frames: bool) -> None:
     by_itself = rig.timing.frames == "exposure line"
     if not by_itself:
         rig.frames.start()
-    rig.sync.start(FRAMES_HZ, seed % 65535 + 1, rig.timing.code)
+    rig.sync.start(FRAMES_HZ, seed % SEEDS + 1, rig.timing.code)
     if by_itself:
         rig.frames.start()
 

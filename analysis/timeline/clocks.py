@@ -35,6 +35,9 @@ MIN_LOSSY, MIN_LIFT = 100, 1.5
 """Where both trains lost many pulses a smaller share will do: of so many pulses and so many times
 what a wrong lag gives. In such a train a clock that jumps by whole ticks, after which half of the
 pulses meet others, stands out only where there are many."""
+MOST_STAGGERED = 8
+"""So many pulses may lie before one train begins and behind the end of the other: noise. More mean
+that only a stretch of two trials' codes is the same."""
 MIN_EITHER = 0.75
 """Where less than this of both trains fits, both lost many."""
 UNVOUCHED = 2
@@ -173,6 +176,7 @@ def fit_clock(
             line = bounded
     _gate_line(line, jitter_ns, max_drift_ppm)
     predicted = _extended(line, x)
+    _gate_staggered(predicted, y, tick)
     inside = line.inside
     i, j = match.device[inside], match.reference[inside]
     stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
@@ -284,6 +288,19 @@ def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
             f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}, or "
             f"{MIN_LIFT:g} times the {by_chance:.0%} of a wrong place and {MIN_LOSSY} pulses); "
             f"{in_x} device and {in_y} reference pulses overlap",
+        )
+
+
+def _gate_staggered(predicted: Floats, y: Floats, tick: float) -> None:
+    """Refuse a device that saw pulses before the box sent any, and none of the last, or so."""
+    before, behind = (predicted < y[0] - tick).sum(), (predicted > y[-1] + tick).sum()
+    unseen, missing = (y < predicted[0] - tick).sum(), (y > predicted[-1] + tick).sum()
+    foreign = int(max(min(before, missing), min(behind, unseen)))
+    if foreign > MOST_STAGGERED:
+        raise ClockRefused(
+            "no_match",
+            f"{foreign} pulses or more at one end are the device's alone and as many at the other "
+            "the reference's: two trials whose codes are the same where they overlap",
         )
 
 

@@ -15,10 +15,11 @@
 #include "line.h"
 #include "train.h"
 
-#define NAME "sliplab-sync-box 1" /* the number is the protocol's */
+#define NAME "sliplab-sync-box 2" /* the number is the protocol's */
 
 #define LEAST_MILLIHERTZ 1000UL
 #define MOST_MILLIHERTZ 1000000UL
+#define MOST_SEED 4294967294UL /* what is too large reads as one more */
 #define ALL_TO_MILLIHERTZ 200000UL /* up to here ticks with bit 0 are reported too */
 #define PATIENCE 64 /* reports until it is told how many were dropped, while others wait */
 
@@ -64,8 +65,8 @@ static void arm(char *text)
         fail(PSTR("rate must be 1 to 1000 Hz"));
         return;
     }
-    if (start < 1 || start > UINT16_MAX) {
-        fail(PSTR("seed must be 1 to 65535"));
+    if (start < 1 || start > MOST_SEED) {
+        fail(PSTR("seed must be 1 to 4294967294"));
         return;
     }
     if (text && !strcmp_P(text, PSTR("lfsr")))

@@ -13,7 +13,7 @@ from rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, 
 from rigs.mock.faults import NEVER
 from rigs.mock.free_run import ExposureLine
 from rigs.mock.world import World
-from rigs.pulse_code import SEEDS, code_bits
+from rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
 from storage.clockmap import ClockMap
 from storage.streams import ClockReads, PulseChunk
 
@@ -246,8 +246,8 @@ class _PulseFaults:
             due = self._book.due_ns(fault)
             if fault.device == self._device and due is not None:
                 first = self._box.tick_at(due)
-                # no code stays 0 for more than 15 ticks
-                after = np.arange(first, first + 16 * fault.count + 16, dtype=np.int64)
+                most = LONGEST_GAP_TICKS * (fault.count + 1)
+                after = np.arange(first, first + most, dtype=np.int64)
                 hit = after[self._box.bits(after) == 1][: fault.count].tolist()
                 seconds = 0.0 if isinstance(fault, PulsesLost) else fault.seconds
                 ticks += hit

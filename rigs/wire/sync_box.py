@@ -245,7 +245,7 @@ class PtySyncBox:
         elif not LEAST_HZ <= float(hz) <= MOST_HZ:
             self._say("E rate must be 1 to 1000 Hz")
         elif not 1 <= int(seed) <= SEEDS:
-            self._say("E seed must be 1 to 65535")
+            self._say(f"E seed must be 1 to {SEEDS}")
         elif code not in CODES:
             self._say("E code must be lfsr, irregular or regular")
         else:

@@ -30,7 +30,7 @@ from tests.conftest import ROOT
 FIRMWARE = ROOT / "rigs" / "firmware"
 HOST = Path(__file__).with_name("firmware_host.c")
 MHZ = 16
-SEED = 0xACE1
+SEED = 0xBEEFACE1
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 FLASH_BYTES, MEMORY_BYTES = 30 << 10, 2 << 10
 """Of an ATmega328P with its bootloader."""
@@ -316,6 +316,7 @@ def test_what_it_answers(run: Run, connect: Connect) -> None:
         "ARM 1000.001 1 0 lfsr",
         "ARM 1e2 1 0 lfsr",
         "ARM 100 0 0 lfsr",
+        "ARM 100 4294967295 0 lfsr",
         "ARM 100 1 0 prbs",
         "ARM 100",
         "FLY",
@@ -328,24 +329,25 @@ def test_what_it_answers(run: Run, connect: Connect) -> None:
         "STOP",
     )
     rate, code = "E rate must be 1 to 1000 Hz", "E code must be lfsr, irregular or regular"
-    assert answers[:12] == [
+    assert answers[:13] == [
         f"ID {NAME}",
         "E not armed",
         rate,
         rate,
         rate,
-        "E seed must be 1 to 65535",
+        "E seed must be 1 to 4294967294",
+        "E seed must be 1 to 4294967294",
         code,
-        "E seed must be 1 to 65535",
+        "E seed must be 1 to 4294967294",
         "E unknown",
         "E checksum",
         "E checksum",
         "OK ARM",
     ]
-    assert answers[12].startswith("OK GO ")
-    assert answers[12] == answers[13], "a host that missed the answer asks again"
-    assert answers[14] == "E running"
-    assert answers[15] in {f"OK STOP {sent}" for sent in (1, 2, 3)}
+    assert answers[13].startswith("OK GO ")
+    assert answers[13] == answers[14], "a host that missed the answer asks again"
+    assert answers[15] == "E running"
+    assert answers[16] in {f"OK STOP {sent}" for sent in (1, 2, 3)}
 
 
 def test_a_train_of_n_ticks_ends_by_itself(run: Run, connect: Connect) -> None:

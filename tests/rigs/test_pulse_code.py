@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocols.timing import MARKER_TICKS, Code
-from rigs.pulse_code import PERIOD, SEEDS, code_bits
+from rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
 
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 HOUR = 360_000
@@ -17,41 +17,61 @@ def intervals(bits: np.ndarray) -> np.ndarray:
     return np.diff(np.flatnonzero(bits))
 
 
-def test_any_16_bits_in_a_row_are_unique_over_the_whole_period() -> None:
-    bits = code_bits(0xACE1, PERIOD + 15).astype(np.int64)
-    words = sum(bits[shift : shift + PERIOD] << shift for shift in range(16))
-    assert len(np.unique(words)) == PERIOD
-    assert words.min() == 1
+def power_of_x(exponent: int) -> int:
+    """x to that power modulo the register's polynomial, over GF(2)."""
+    result, square = 1, 2
+    while exponent:
+        if exponent & 1:
+            result = product(result, square)
+        square, exponent = product(square, square), exponent >> 1
+    return result
 
 
-def test_it_repeats_after_the_period_and_not_before() -> None:
-    bits = code_bits(1, 2 * PERIOD)
-    assert np.array_equal(bits[:PERIOD], bits[PERIOD:])
-    for divisor in (3, 5, 17, 257):
-        assert not np.array_equal(bits[:PERIOD], np.roll(bits[:PERIOD], PERIOD // divisor))
+def product(one: int, other: int) -> int:
+    found = 0
+    while other:
+        found ^= one if other & 1 else 0
+        one, other = one << 1, other >> 1
+        one ^= (1 << 32 | 1 << 22 | 0b111) if one >> 32 else 0
+    return found
 
 
-@pytest.mark.parametrize("n", [1, 15, 16, 17, 300, 5000])
+def test_the_code_comes_again_after_all_states_and_not_before() -> None:
+    """The order of x is 2**32 - 1 and no divisor of it: the polynomial is primitive."""
+    period = 2**32 - 1
+    assert power_of_x(period) == 1
+    assert 3 * 5 * 17 * 257 * 65_537 == period
+    assert all(power_of_x(period // prime) != 1 for prime in (3, 5, 17, 257, 65_537))
+
+
+@pytest.mark.parametrize("n", [1, 31, 32, 33, 300, 5000])
 def test_it_is_the_register_stepped_bit_by_bit(n: int) -> None:
-    state, expected = 0xBEEF, []
+    state, expected = 0xBEEF * 2654435761 % 2**32, []
     for _ in range(n):
         expected.append(state & 1)
-        fed = (state ^ (state >> 2) ^ (state >> 3) ^ (state >> 5)) & 1
-        state = (state >> 1) | (fed << 15)
+        fed = (state ^ (state >> 1) ^ (state >> 2) ^ (state >> 22)) & 1
+        state = (state >> 1) | (fed << 31)
     assert code_bits(0xBEEF, n).tolist() == expected
 
 
-def test_balanced_but_for_the_missing_zero_state() -> None:
-    assert code_bits(77, PERIOD).sum() == 32768
+def test_half_of_the_ticks_have_a_pulse() -> None:
+    assert code_bits(77, HOUR).mean() == pytest.approx(0.5, abs=0.003)
 
 
-def test_seeds_are_shifts_of_one_code() -> None:
-    bits = code_bits(1, PERIOD).astype(np.int64)
-    seed = int(sum(bits[100 + shift] << shift for shift in range(16)))
-    assert np.array_equal(code_bits(seed, 500), bits[100:600].astype(np.uint8))
+@pytest.mark.parametrize(("code", "bits", "length"), [("lfsr", 1, 60), ("irregular", 3, 20)])
+def test_trials_share_no_stretch_of_the_code(code: Code, bits: int, length: int) -> None:
+    """Of 500 trials of 20 s no two have the same 60 ticks, or 20 intervals, anywhere."""
+    words = []
+    for seed in np.random.default_rng(4).integers(1, SEEDS, 500).tolist():
+        sent = code_bits(seed, 2000, code)
+        part = sent.astype(np.int64) if code == "lfsr" else intervals(sent) - 2
+        count = len(part) - length + 1
+        words.append(sum(part[k : k + count] << bits * k for k in range(length)))
+    every = np.concatenate(words)
+    assert np.unique(every).size == every.size
 
 
-@pytest.mark.parametrize("seed", [0, -1, 65536])
+@pytest.mark.parametrize("seed", [0, -1, 2**32 - 1])
 def test_a_state_that_is_none_is_refused(seed: int) -> None:
     with pytest.raises(ValueError, match="seed"):
         code_bits(seed, 4)
@@ -75,10 +95,10 @@ def test_a_code_is_its_seeds_however_much_is_asked_for(
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_no_silence_is_longer_than_15_ticks_in_an_hour(code: Code) -> None:
+def test_no_silence_is_longer_than_is_said_in_an_hour(code: Code) -> None:
     gaps = intervals(code_bits(1234, HOUR, code))
     assert gaps.min() >= 1
-    assert gaps.max() <= 16
+    assert gaps.max() <= LONGEST_GAP_TICKS
 
 
 def test_irregular_is_what_the_boxs_firmware_draws() -> None:

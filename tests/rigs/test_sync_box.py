@@ -298,7 +298,7 @@ def test_what_the_box_refuses_is_said(
     "line",
     [
         b"ARM\n", seal("ARM 100"), seal("ARM x 1 0 lfsr"), seal("ARM 100 0 0 lfsr"),
-        seal("ARM 100 65536 0 lfsr"), seal("FLY"), seal("T?"), seal("T? x"),
+        seal("ARM 100 4294967295 0 lfsr"), seal("FLY"), seal("T?"), seal("T? x"),
     ],
 )  # fmt: skip
 def test_the_stand_in_survives_nonsense(wire: PtySyncBox, box: SerialSyncBox, line: bytes) -> None:
