@@ -11,7 +11,7 @@ pulse. A clock that jumps has no line: a step is looked for at every pulse, alon
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -20,11 +20,13 @@ from scipy import special
 
 from analysis.timeline.pulse_kernels import (
     changes,
+    largest_sizes,
     median,
     normal_equations,
     places_of,
     quantile,
     residuals_at,
+    robust_values,
 )
 
 Floats = NDArray[np.float64]
@@ -33,6 +35,8 @@ Ints = NDArray[np.int64]
 
 _HUBER = 1.345
 _GATE = 5.0
+_ROUGHLY, _EXACTLY = 1e-2, 1e-3
+"""An estimate is there once a step moves it by less, in standard deviations of a pulse."""
 _MOST_KNOTS = 24
 _PIECE_PULSES = 30
 _PIECES = 4
@@ -52,7 +56,7 @@ a clock that bends smoothly a step explains less than a bend does, of one that j
 much in the median over the places of the jump."""
 _DOUBT, _DOUBT_AT_END = 4.0, 3.0
 """A step of so many may be one: what it would do is added to the uncertainty."""
-_DRAWS = 4096
+_DRAWS = 2048
 _SLOPES = 81
 _UNITS = 0.6
 """How many units stamps may lie from a line that their unit explains: half of one, and jitter."""
@@ -131,7 +135,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
     knots = x[[0, -1]]
     values, moved = slope * knots + level, True
     while True:
-        values, residuals, inside, sigma = _robust(x, y, knots, values, floor)
+        values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _ROUGHLY)
         noise = min(local, sigma)
         # a unit that nothing shakes hides what is smaller
         locked = resolution / 2 > noise
@@ -155,10 +159,13 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
             knots = _moved(x, y, knots, inside, noise)
         values = np.interp(knots, before, values)
     at = knots[1:-1]
-    if not (locked or step):
+    if locked or step:
+        finer = knots
+    else:
         finer = _cut(x[inside], knots)
+    if not step:
         values, knots = np.interp(finer, knots, values), finer
-        values, residuals, inside, sigma = _robust(x, y, knots, values, floor)
+        values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
     line = _judged(x, knots, at, values, residuals, inside, sigma, resolution, bend_per_ns)
     return replace(
         line, uncertainty=line.uncertainty + _doubt(found), jump=step, straightened=bool(straight)
@@ -275,24 +282,13 @@ def line_within_unit(x: Floats, y: Floats, resolution: float, drift: float) -> C
 
 
 def _robust(
-    x: Floats, y: Floats, knots: Floats, values: Floats, floor: float
+    x: Floats, y: Floats, knots: Floats, values: Floats, floor: float, until: float
 ) -> tuple[Floats, Floats, Bools, float]:
     """Huber's M-estimate of the values at knots on what lies inside 5 robust sigma."""
     piece, share = places_of(x, knots)
-    residuals = y - np.interp(x, knots, values)
-    for _ in range(20):
-        size = np.abs(residuals)
-        sigma = max(1.4826 * median(size), floor)
-        inside = size <= _GATE * sigma
-        matrix, right = normal_equations(
-            piece, share, y, residuals, _GATE * sigma, _HUBER * sigma, knots.size
-        )
-        new: Floats = np.linalg.solve(_held(matrix), right)
-        moved = float(np.abs(new - values).max())
-        values = new
-        residuals = residuals_at(piece, share, y, values)
-        if moved < 1e-3 * sigma:
-            break
+    values, residuals, inside = robust_values(
+        piece, share, y, np.interp(x, knots, values), values, floor, _GATE, _HUBER, until
+    )
     sigma = float(np.sqrt((residuals[inside] ** 2).sum() / max(1, inside.sum() - knots.size)))
     return values, residuals, inside, max(sigma, floor)
 
@@ -337,10 +333,7 @@ def _judged(
     count = ends.shape[0]
     root = np.linalg.cholesky(ends + (1e-12 * ends.trace() / count + 1e-6) * np.eye(count))
     # between knots the error is no larger than at one of them
-    errors = _draws(count) @ root.T
-    np.abs(errors, out=errors)
-    # numpy is slow where it takes the largest of two
-    largest = errors.max(axis=1) if count > 8 else reduce(np.maximum, errors.T)
+    largest = largest_sizes(_draws(count), root)
     band = float(np.partition(largest, int(0.95 * _DRAWS))[int(0.95 * _DRAWS)])
     band *= float(special.stdtrit(max(1, inner.size - n - at.size), 0.975)) / 1.959964
     sudden = 0.0

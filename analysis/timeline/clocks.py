@@ -293,9 +293,9 @@ def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
 
 def _gate_staggered(predicted: Floats, y: Floats, tick: float) -> None:
     """Refuse a device that saw pulses before the box sent any, and none of the last, or so."""
-    before, behind = (predicted < y[0] - tick).sum(), (predicted > y[-1] + tick).sum()
-    unseen, missing = (y < predicted[0] - tick).sum(), (y > predicted[-1] + tick).sum()
-    foreign = int(max(min(before, missing), min(behind, unseen)))
+    before, last = np.searchsorted(predicted, (y[0] - tick, y[-1] + tick)).tolist()
+    unseen, seen = np.searchsorted(y, (predicted[0] - tick, predicted[-1] + tick)).tolist()
+    foreign = max(min(before, y.size - seen), min(predicted.size - last, unseen))
     if foreign > MOST_STAGGERED:
         raise ClockRefused(
             "no_match",

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def median(values: Floats) -> float:
-    """As np.median, of numbers of which there is at least one and none is NaN."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def median(values):  # type: ignore[no-untyped-def]
+    """As np.median, of floats of which there is at least one and none is NaN."""
     half = values.size // 2
     parted = np.partition(values, half)
-    middle = float(parted[half])
-    return middle if values.size % 2 else 0.5 * (float(parted[:half].max()) + middle)
+    middle = parted[half]
+    return middle if values.size % 2 else 0.5 * (parted[:half].max() + middle)
 
 
 def quantile(values: NDArray[np.float64 | np.int64], share: float) -> float:
@@ -151,6 +152,61 @@ def residuals_at(piece, share, y, values):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # type: ignore[no-untyped-def]
+    """Huber's M-estimate of the values at knots, by weights again and again, 20 times at the most.
+
+    Args:
+        piece, share: (m,) see `places_of`.
+        line, values: (m,) and (k,) the line to begin with, at the pulses and at the knots.
+        floor: the least robust sigma, 1.4826 times the median of the sizes of the residuals.
+        gate, huber: pulses beyond so many sigma have no weight, beyond so many less than 1.
+        until: the estimate is there once it moves by less, in sigma.
+
+    Returns:
+        the values; the residuals; and which of them lay within the gate.
+    """
+    k = values.size
+    residuals = y - line
+    inside = np.ones(y.size, np.bool_)
+    diagonal, right = np.empty(k), np.empty(k)
+    beside = np.empty(k - 1)
+    for _ in range(20):
+        sizes = np.abs(residuals)
+        sigma = max(1.4826 * median(sizes), floor)
+        diagonal[:], right[:], beside[:] = 0.0, 0.0, 0.0
+        for j in range(y.size):
+            inside[j] = sizes[j] <= gate * sigma
+            if inside[j]:
+                weight = min(1.0, huber * sigma / max(sizes[j], 1e-9))
+                p, after = piece[j], weight * share[j]
+                before = weight - after
+                diagonal[p] += before * (1.0 - share[j])
+                diagonal[p + 1] += after * share[j]
+                beside[p] += before * share[j]
+                right[p] += before * y[j]
+                right[p + 1] += after * y[j]
+        # a piece with a single pulse in it hangs on its neighbours
+        held = 1e-12 * diagonal.sum() / k
+        for a in range(k):
+            diagonal[a] += held
+        # the matrix has a diagonal and one beside it on either side
+        for a in range(1, k):
+            share_of = beside[a - 1] / diagonal[a - 1]
+            diagonal[a] -= share_of * beside[a - 1]
+            right[a] -= share_of * right[a - 1]
+        new = np.empty(k)
+        new[k - 1] = right[k - 1] / diagonal[k - 1]
+        for a in range(k - 2, -1, -1):
+            new[a] = (right[a] - beside[a] * new[a + 1]) / diagonal[a]
+        moved = np.abs(new - values).max()
+        values = new
+        residuals = residuals_at(piece, share, y, values)
+        if moved < until * sigma:
+            break
+    return values, residuals, inside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # type: ignore[no-untyped-def]
     """What stands out of the residuals of a line with knots: a change of its slope, and a step.
 
@@ -233,6 +289,19 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
             if high > knot:
                 knot, at = high, j
     return knot, at, step, step_size, end, end_size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def largest_sizes(draws, root):  # type: ignore[no-untyped-def]
+    """Of each of (m, k) draws the largest absolute part of its product with a lower triangle."""
+    result = np.zeros(draws.shape[0])
+    for j in range(draws.shape[0]):
+        for a in range(root.shape[0]):
+            value = 0.0
+            for b in range(a + 1):
+                value += root[a, b] * draws[j, b]
+            result[j] = max(result[j], abs(value))
+    return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

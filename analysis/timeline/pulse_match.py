@@ -166,8 +166,8 @@ def _correlate(
     bins = 2 * int(half / width + 1) + 1
     size = int(fft.next_fast_len(y_bins.size + bins + 2, real=True))
     spectrum = fft.rfft(y_bins, size)
-    # one step of drift moves the piece's ends by a bin
-    steps = int(np.ceil(max_drift * half / width))
+    # one step of drift moves the piece's ends by a bin, or a little more
+    steps = round(max_drift * half / width)
     drifts = np.linspace(-max_drift, max_drift, 2 * steps + 1) if steps else np.zeros(1)
     combs = np.zeros((drifts.size, bins + 2), np.float32)
     for comb, drift in zip(combs, drifts, strict=True):

@@ -8,7 +8,9 @@ reference both have pulses one after the other and few of them fit, the fit must
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,7 @@ BURST_AT_END = 2
 the last two pulses cannot be told from two late pulses."""
 _WIDTHS = (16, 24, 32, 48, 64, 96, 128)
 _WIDTHS_AT_END = (8, 12, 16, 24, 32)
-_LEAST, _MOST = 0.02, 0.46
+_LEAST, _MOST = 0.04, 0.48
 """Shares of bad pulses that are assumed at least and at most."""
 
 
@@ -83,17 +85,16 @@ def _left_out(on_line: Ints, size: int) -> Ints:
 def _share(on_line: Ints) -> float:
     """Share of bad pulses in the best quarter between the first and the last good one.
 
-    With two standard deviations of it, in steps of 2 %, rounded up. Not the share of all: a clock that
+    With two standard deviations of it, in steps of 4 %, rounded up. Not the share of all: a clock that
     jumped must not vouch for itself.
     """
-    edges = np.linspace(on_line[0], on_line[-1] + 1, 5).round()
-    quarter = np.maximum(np.diff(edges), 1.0)
-    good = np.diff(np.searchsorted(on_line, edges)) / quarter
-    best = int(good.argmax())
-    bad = 1.0 - float(good[best])
-    count = float(quarter[best])
-    bad += 2.0 * ((bad * (1.0 - bad) + 1.0 / count) / count) ** 0.5
-    return float(min(max(np.ceil(50 * bad) / 50, _LEAST), _MOST))
+    first, total = int(on_line[0]), int(on_line[-1] - on_line[0]) + 1
+    edges = [first + k * total // 4 for k in range(5)]
+    there = np.searchsorted(on_line, edges).tolist()
+    quarters = zip(pairwise(there), pairwise(edges), strict=True)
+    bad, count = min((1.0 - (b - a) / max(d - c, 1), d - c) for (a, b), (c, d) in quarters)
+    bad += 2.0 * ((bad * (1.0 - bad) + 1.0 / max(count, 1)) / max(count, 1)) ** 0.5
+    return min(max(math.ceil(25 * bad) / 25, _LEAST), _MOST)
 
 
 @lru_cache(maxsize=4096)
