@@ -159,11 +159,8 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
             knots = _moved(x, y, knots, inside, noise)
         values = np.interp(knots, before, values)
     at = knots[1:-1]
-    if locked or step:
-        finer = knots
-    else:
-        finer = _cut(x[inside], knots)
     if not step:
+        finer = knots if locked else _cut(x[inside], knots)
         values, knots = np.interp(finer, knots, values), finer
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
     line = _judged(x, knots, at, values, residuals, inside, sigma, resolution, bend_per_ns)
@@ -234,7 +231,7 @@ def _doubt(found: _Changes) -> float:
 
 def _moved(x: Floats, y: Floats, knots: Floats, inside: Bools, noise: float) -> Floats:
     """Each inner knot in turn where it fits best while the others stay."""
-    none, rest = np.zeros(x.size), np.where(inside, 0.0, np.inf)
+    rest = np.where(inside, 0.0, np.inf)
     for _ in range(1 if knots.size == 3 else 2):
         for k in range(1, knots.size - 1):
             others = np.delete(knots, k)
@@ -362,8 +359,7 @@ def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Fl
     """
     n, count = matrix.shape[0], places.size
     if not count:
-        inverse: Floats = np.linalg.inv(matrix)
-        return inverse
+        return np.asarray(np.linalg.inv(matrix), np.float64)
     hats = np.zeros((n - 1, n))
     here = np.arange(n - 1)
     hats[here, here] = np.bincount(piece, 1.0 - share, n - 1)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from analysis.timeline.clock_line import ClockLine, fit_line, line_within_unit
 from analysis.timeline.pulse_kernels import median
 from analysis.timeline.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
-from analysis.timeline.pulse_runs import stray_stretch
+from analysis.timeline.pulse_runs import stray_stretch, unevenness
 from storage.clockmap import ClockMap
 
 Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
@@ -38,6 +38,8 @@ pulses meet others, stands out only where there are many."""
 MOST_STAGGERED = 8
 """So many pulses may lie before one train begins and behind the end of the other: noise. More mean
 that only a stretch of two trials' codes is the same."""
+UNEVEN = 3.5
+"""Standard deviations between the shares of pulses that fit before and after some time."""
 MIN_EITHER = 0.75
 """Where less than this of both trains fits, both lost many."""
 UNVOUCHED = 2
@@ -183,12 +185,13 @@ def fit_clock(
     if stray is not None:
         raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
     shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
-    if max(shares) < MIN_EITHER and i.size < MIN_LOSSY:
+    uneven = max(shares) < MIN_EITHER and min(unevenness(i), unevenness(j)) > UNEVEN
+    if uneven or (max(shares) < MIN_EITHER and i.size < MIN_LOSSY):
         raise ClockRefused(
             "no_match",
             f"only {shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses "
-            f"fit, of one of them at least {MIN_EITHER:.0%} where less than {MIN_LOSSY} do: a "
-            "clock jumped, or not these pulses",
+            f"fit (at least {MIN_EITHER:.0%} of one of them, or {MIN_LOSSY} pulses, and as many "
+            "early as late): a clock jumped, or not these pulses",
         )
     return _fit(match, line, x, y, device_0, reference_0)
 

@@ -30,8 +30,11 @@ BURST_AT_END = 2
 the last two pulses cannot be told from two late pulses."""
 _WIDTHS = (16, 24, 32, 48, 64, 96, 128)
 _WIDTHS_AT_END = (8, 12, 16, 24, 32)
-_LEAST, _MOST = 0.04, 0.48
-"""Shares of bad pulses that are assumed at least and at most."""
+_LEAST, _MOST_DEVICE, _MOST_REFERENCE = 0.02, 0.25, 0.4
+"""Shares of bad pulses that are assumed at least and at most: a jump must not vouch for itself."""
+_MOST_LOSSY = 0.48
+"""The same where both trains have more bad ones than that, which then is asked of their best
+quarters."""
 
 
 def stray_stretch(
@@ -48,8 +51,12 @@ def stray_stretch(
         i, j: (k,) indices of pulses that belong together and lie on the line, ascending.
         slack_ns: how far a pulse on the line may be from it.
     """
-    bad_device = _share(i)
-    bad_reference = _share(j)
+    bad_device, bad_reference = _share(i), _share(j)
+    if min(bad_device, bad_reference) > _MOST_DEVICE:
+        bad_device, bad_reference = (min(_best_quarter(k), _MOST_LOSSY) for k in (i, j))
+    else:
+        bad_device = min(bad_device, _MOST_DEVICE)
+        bad_reference = min(bad_reference, _MOST_REFERENCE)
     places = reference.size.bit_length()
     # between pulses on the line: those that both trains have there, and neither on the line
     both = np.minimum(_left_out(i, predicted.size), _left_out(j, reference.size))
@@ -83,18 +90,37 @@ def _left_out(on_line: Ints, size: int) -> Ints:
 
 
 def _share(on_line: Ints) -> float:
-    """Share of bad pulses in the best quarter between the first and the last good one.
+    """Share of bad pulses between the first and the last good one, in steps of 2 %, rounded up."""
+    total = int(on_line[-1] - on_line[0]) + 1
+    return max(math.ceil(50 * (1.0 - on_line.size / total)) / 50, _LEAST)
 
-    With two standard deviations of it, in steps of 4 %, rounded up. Not the share of all: a clock that
-    jumped must not vouch for itself.
-    """
+
+def _best_quarter(on_line: Ints) -> float:
+    """The same of the quarter with the fewest, and two standard deviations of it."""
     first, total = int(on_line[0]), int(on_line[-1] - on_line[0]) + 1
     edges = [first + k * total // 4 for k in range(5)]
     there = np.searchsorted(on_line, edges).tolist()
     quarters = zip(pairwise(there), pairwise(edges), strict=True)
     bad, count = min((1.0 - (b - a) / max(d - c, 1), d - c) for (a, b), (c, d) in quarters)
     bad += 2.0 * ((bad * (1.0 - bad) + 1.0 / max(count, 1)) / max(count, 1)) ** 0.5
-    return min(max(math.ceil(25 * bad) / 25, _LEAST), _MOST)
+    return math.ceil(50 * bad) / 50
+
+
+def unevenness(on_line: Ints) -> float:
+    """By how many standard deviations the share of pulses on the line differs before and after.
+
+    The largest of all times that leave 16 pulses on either side.
+    """
+    total = int(on_line[-1] - on_line[0]) + 1
+    good = np.zeros(total)
+    good[on_line - on_line[0]] = 1.0
+    before, count = np.cumsum(good)[15:-16], np.arange(16, total - 15)
+    if not count.size:
+        return 0.0
+    share = on_line.size / total
+    away = np.abs(before - share * count)
+    chance = np.sqrt(share * (1.0 - share) * count * (total - count) / total)
+    return float((away / np.maximum(chance, 1e-9)).max())
 
 
 @lru_cache(maxsize=4096)

@@ -40,7 +40,7 @@ def test_the_code_comes_again_after_all_states_and_not_before() -> None:
     """The order of x is 2**32 - 1 and no divisor of it: the polynomial is primitive."""
     period = 2**32 - 1
     assert power_of_x(period) == 1
-    assert 3 * 5 * 17 * 257 * 65_537 == period
+    assert period == 3 * 5 * 17 * 257 * 65_537
     assert all(power_of_x(period // prime) != 1 for prime in (3, 5, 17, 257, 65_537))
 
 

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from analysis.timeline.pulse_kernels import (
+    changes,
     fullest,
+    largest_sizes,
     median,
     most_off,
     normal_equations,
@@ -18,6 +20,7 @@ from analysis.timeline.pulse_kernels import (
     places_of,
     quantile,
     residuals_at,
+    robust_values,
 )
 
 Floats = NDArray[np.float64]
@@ -86,6 +89,79 @@ def test_normal_equations_are_weighted_sums(n: int) -> None:
     values = rng.normal(0, 1, n)
     line = values[piece] + share * (values[piece + 1] - values[piece])
     assert residuals_at(piece, share, y, values).tolist() == (y - line).tolist()
+
+
+def hats(x: Floats, knots: Floats) -> Floats:
+    """The line's basis at pulses, (n, k)."""
+    return np.stack([np.interp(x, knots, each) for each in np.eye(knots.size)], axis=1)
+
+
+@pytest.mark.parametrize("n", [2, 4, 7])
+def test_a_change_stands_out_as_least_squares_says(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x = np.sort(rng.uniform(0, 1, 150))
+    x[[0, -1]] = 0.0, 1.0
+    knots = np.linspace(0, 1, n)
+    basis = hats(x, knots)
+    residuals = rng.normal(0, 3, x.size)
+    residuals[::17] = 40.0
+    weights = np.where(np.abs(residuals) <= 9.0, np.minimum(1.0, 4.0 / np.abs(residuals)), 0.0)
+    inverse = np.linalg.inv(basis.T * weights @ basis)
+    piece, share = places_of(x, knots)
+    found = changes(x, piece, share, residuals, 9.0, 4.0, inverse, 1, 5)
+
+    def high(column: Floats) -> tuple[float, float]:
+        # what is left of a column beside the basis, with weights
+        left = column - basis @ (inverse @ (basis.T @ (weights * column)))
+        norm = float((weights * left**2).sum())
+        top = float((weights * left * residuals).sum())
+        return (abs(top) / norm**0.5, top / norm) if norm > 0.5 else (0.0, 0.0)
+
+    used = weights > 0
+    steps, ends, bends = [], [], []
+    for j in np.flatnonzero(used):
+        edge = min(used[j:].sum(), used[:j].sum())
+        beside = min((used & (piece == piece[j]) & later).sum() for later in (x >= x[j], x < x[j]))
+        if edge >= 3:
+            steps.append(high((x >= x[j]) * 1.0))
+            ends += steps[-1:] if edge <= 32 else []
+        if edge >= 3 and beside >= 5:
+            slope = np.maximum(x - x[j], 0.0)
+            left = slope - basis @ (inverse @ (basis.T @ (weights * slope)))
+            norm = (weights * left**2).sum()
+            bends.append((abs((weights * left * residuals).sum()) / norm**0.5, j))
+    assert found[0] == pytest.approx(max(bends)[0], rel=1e-6)
+    assert found[1] == max(bends)[1]
+    assert found[2:4] == pytest.approx(max(steps), rel=1e-9)
+    assert found[4:] == pytest.approx(max(ends), rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 3, 9])
+def test_the_robust_values_solve_hubers_equations(n: int) -> None:
+    rng = np.random.default_rng(n)
+    x = np.sort(rng.uniform(0, 100, 400))
+    knots = np.linspace(x[0], x[-1], n)
+    y = np.sin(x / 30) + rng.normal(0, 0.1, x.size)
+    y[::11] += rng.uniform(1, 9, y[::11].size)
+    piece, share = places_of(x, knots)
+    begin = np.zeros(n)
+    values, residuals, inside = robust_values(
+        piece, share, y, np.zeros(x.size), begin, 1e-6, 5.0, 1.345, 1e-9
+    )
+    sigma = 1.4826 * np.median(np.abs(residuals))
+    assert residuals == pytest.approx(y - np.interp(x, knots, values), abs=1e-12)
+    assert inside.tolist() == (np.abs(residuals) <= 5 * sigma).tolist()
+    pull = np.where(inside, np.clip(residuals, -1.345 * sigma, 1.345 * sigma), 0.0)
+    assert hats(x, knots).T @ pull == pytest.approx(np.zeros(n), abs=1e-5)
+    # without a gate and a limit they are least squares
+    values = robust_values(piece, share, y, np.zeros(x.size), begin, 1e-6, np.inf, np.inf, 1e-9)[0]
+    assert values == pytest.approx(np.linalg.lstsq(hats(x, knots), y, rcond=None)[0], abs=1e-8)
+
+
+def test_the_largest_sizes_are_those_of_the_product() -> None:
+    rng = np.random.default_rng(5)
+    draws, root = rng.normal(size=(50, 6)), np.tril(rng.normal(size=(6, 6)))
+    assert largest_sizes(draws, root) == pytest.approx(np.abs(draws @ root.T).max(axis=1))
 
 
 @pytest.mark.parametrize("at_ends", [False, True])
