@@ -321,6 +321,14 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
         raise ClockRefused(
             "residuals", f"a clock jumped by {abs(line.jump) / 1e3:.1f} us, or pulses did"
         )
+    for first, second in ((0, 1), (-1, -2)):
+        off = line.residuals[first], line.residuals[second]
+        if not line.inside[[first, second]].any() and abs(off[0] - off[1]) <= 5 * line.sigma:
+            raise ClockRefused(
+                "residuals",
+                f"the two pulses at one end lie off the line alike, by {off[0] / 1e3:.1f} us: a "
+                "clock jumped",
+            )
     if line.sudden > 3 * jitter_ns:
         raise ClockRefused(
             "residuals",

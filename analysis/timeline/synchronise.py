@@ -29,7 +29,7 @@ from storage.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 
-VERSION = 1
+VERSION = 2
 """Of what fitting does; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
