@@ -15,8 +15,8 @@ from benchmarks.kept import PAGE, Result, as_line, keep, table
 from benchmarks.measure import SEED, Figures, machine, versions
 
 NAMES = (
-    "storage", "scene", "clocks", "labels", "labels_truth", "network", "live", "orchestration",
-    "acquisition", "scale",
+    "storage", "scene", "clocks", "clock_kinds", "labels", "labels_truth", "network", "live",
+    "orchestration", "acquisition", "scale",
 )  # fmt: skip
 LIMIT_S = 900
 

@@ -18,6 +18,7 @@ TINY: dict[str, dict[str, Any]] = {
     "storage": {"events": 30_000, "frames": 3, "size": 96, "runs": 1},
     "scene": {"length_mm": 1.0, "runs": 1, "trials": 0, "grid": 8},
     "clocks": {"trains": 3},
+    "clock_kinds": {"trains": 2},
     "labels": {"frames": 5, "runs": 1},
     "orchestration": {"trials": 30, "runs": 1, "records": 50, "starts": 0, "long": 40},
     "acquisition": {
@@ -47,6 +48,10 @@ PROMISED = {
     "clocks": {
         "worst_error_us", "accepted_share", "wrong_accepted", "fit_ms", "coverage_95",
         "index_worst_error_us", "nearest_worst_error_us", "pyxdf_worst_error_us",
+    },
+    "clock_kinds": {
+        "good_wrong", "good_refused_share", "good_coverage_95", "other_trial_wrong",
+        "jump_1ms_at_end_wrong", "lost_30_on_both_refused_share", "kink_0.2ppm_coverage_95",
     },
     "acquisition": {
         "frames_lost", "events_lost", "pulses_lost", "memory_growth_mb", "saturation_x_realtime",
