@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 from protocols import InputError
+from protocols.plan import load_plan
+from protocols.program import Move
 from rigs.build import _check_grade
 from rigs.cameras.stamps import Stamping
 from rigs.capabilities import RigError
@@ -234,3 +236,16 @@ def test_lengths_in_metres_are_noticed(case: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ur5", "irb120", "loopback"])
 def test_shipped_rigs_are_in_millimetres(name: str) -> None:
     load_rig_file(Path(name))
+
+
+def test_the_loopback_arm_has_room_for_every_shipped_press() -> None:
+    """Its own limits count from the taught plane, and depth zero may be found behind it."""
+    rig = load_rig_file(ROOT / "rigs" / "loopback.yaml")[0]
+    assert rig.devices is not None
+    limits = rig.devices.arm.limits
+    for path in sorted((ROOT / "protocols").glob("*.yaml")):
+        plan = load_plan(path)
+        moves = [step for trial in plan for step in plan.program(trial).steps]
+        deepest = max(step.to.depth_mm for step in moves if isinstance(step, Move))
+        assert deepest + 0.2 <= limits.depth_mm
+        assert deepest + 0.2 <= limits.high_mm[2]
