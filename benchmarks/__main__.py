@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -64,7 +65,12 @@ def main() -> int:
     parser.add_argument("name", nargs="?", choices=NAMES, help="left out: all, into RESULTS.md")
     parser.add_argument("--json", action="store_true", help="one line of JSON on standard output")
     parser.add_argument("--keep", action="store_true", help="its figures go into RESULTS.md")
+    parser.add_argument("--v2e", metavar="FOLDER", help="v2e's source, for `scene`")
     wanted = parser.parse_args()
+    if wanted.v2e:
+        from benchmarks.emulator import SOURCE
+
+        os.environ[SOURCE] = wanted.v2e
     if wanted.name is None:
         if wanted.json:
             parser.error("--json goes with a NAME")

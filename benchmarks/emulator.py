@@ -1,13 +1,20 @@
-"""A rival for `rigs.scene.events`: events from frames, the way the public emulators make them.
+"""v2e's own emulator on frames: what the analytic event camera is held against.
 
-Ours, written from how those emulators are described (v2e: Hu, Liu and Delbruck 2021; ESIM: Rebecq,
-Gehrig and Scaramuzza 2018), and compiled: every millisecond the whole scene is drawn, its logarithm
-is taken, and each pixel whose log intensity has gone by its threshold from its own reference fires,
-at a time on the straight line between the two frames. The same discs, thresholds and dead time as
-the analytic way, and neither noise nor a read-out. All simulated.
+The events are those of `EventEmulator` of v2e (Hu, Liu and Delbruck 2021; SensorsINI/v2e), from the
+installed package `v2ecore` or from a checkout (`python -m benchmarks scene --v2e FOLDER`, or the
+variable SLIPLAB_V2E). It is no dependency of the project, and where it is not found its rows are
+left out. The frames are ours: the discs of the analytic way, every millisecond, as floats without
+the rounding of a video, white at 255. v2e gets the thresholds of our pixels and the dead time, and
+neither noise nor a low pass. All simulated.
 """
 
 from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -17,38 +24,81 @@ from rigs.scene.events import EventOptics, Events
 from storage.streams import F64
 
 FRAME_NS = 1_000_000
+SOURCE = "SLIPLAB_V2E"
+"""Variable that names the folder in which v2e's package `v2ecore` is."""
+_WHITE = 255.0
 
 
-def emulate(path: F64, optics: EventOptics, threshold: F64) -> Events:
-    """Events of discs that are drawn every millisecond, in order of time.
+def find_emulator() -> Any | None:
+    """v2e's class; None, and a line on standard error, where it is not to be had.
+
+    Raises:
+        ValueError: a folder is named, and v2e cannot be loaded from it.
+    """
+    folder = os.environ.get(SOURCE)
+    if folder is not None and not (Path(folder) / "v2ecore" / "emulator.py").is_file():
+        raise ValueError(f"{SOURCE}: {folder}: must be a folder with v2ecore/emulator.py in it")
+    if folder is not None and folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        return import_module("v2ecore.emulator").EventEmulator
+    except ImportError as error:
+        if folder is not None:
+            raise ValueError(
+                f"{SOURCE}: {folder}: v2e cannot be loaded: {error}; install what it needs"
+            ) from error
+    print(
+        f"v2e was not found, its rows are left out: --v2e FOLDER or {SOURCE} names a checkout of "
+        "SensorsINI/v2e",
+        file=sys.stderr,
+    )
+    return None
+
+
+def emulate(emulator: Any, path: F64, optics: EventOptics, threshold: F64) -> Events:
+    """Events of v2e for discs that are drawn every millisecond.
 
     Args:
+        emulator: the class of `find_emulator`.
         path: column, row and radius of every disc in every frame, px, (m, n, 3).
         optics: picture, edges, contrast and dead time.
-        threshold: of every pixel, (height, width).
+        threshold: of every pixel for both polarities, (height, width).
 
     Returns:
-        time (ns from the first frame), column, row, polarity, (k,) each.
+        time (ns from the first frame), column, row, polarity, (k,) each, in order of time.
     """
-    room = 1 << 18
-    while True:
-        t_ns, x, y, p, n = _emulate(
-            np.ascontiguousarray(path), optics.contrast, optics.edge_px,
-            round(optics.refractory_us * 1e3), threshold, room,
-        )  # fmt: skip
-        if n <= room:
-            break
-        # rarely: all is done again, with room enough
-        room = n
-    order = np.argsort(t_ns[:n], kind="stable")
-    return t_ns[order], x[order], y[order], p[order]
+    import torch
+
+    device = emulator(
+        pos_thres=optics.threshold, neg_thres=optics.threshold, sigma_thres=0.0, cutoff_hz=0.0,
+        leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_period_s=optics.refractory_us * 1e-6,
+        output_width=optics.width, output_height=optics.height, device="cpu",
+    )  # fmt: skip
+    device.pos_thres = device.neg_thres = torch.tensor(threshold, dtype=torch.float32)
+    picture = np.empty(threshold.shape)
+    found = [np.empty((0, 4))]
+    for index in range(path.shape[0]):
+        draw(path[index], optics.contrast, optics.edge_px, picture)
+        events = device.generate_events(picture, index * FRAME_NS * 1e-9)
+        if events is not None:
+            found.append(np.asarray(events, np.float64))
+    t_s, x, y, p = np.concatenate(found).T
+    order = np.argsort(t_s, kind="stable")
+    return (
+        np.rint(t_s[order] * 1e9).astype(np.int64), x[order].astype(np.uint16),
+        y[order].astype(np.uint16), (p[order] > 0).astype(np.uint8),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(discs, contrast, edge, picture):  # type: ignore[no-untyped-def]
-    """Intensity of the discs over that of the ground, into `picture` (height, width)."""
+def draw(discs, contrast, edge, picture):  # type: ignore[no-untyped-def]
+    """Intensity of discs on their ground, 255 at most, into `picture` (height, width).
+
+    Args:
+        discs: column, row and radius, px, (n, 3).
+    """
     height, width = picture.shape
-    picture[:] = 1.0
+    picture[:] = _WHITE * np.exp(-contrast)
     for i in range(discs.shape[0]):
         column, row, radius = discs[i, 0], discs[i, 1], discs[i, 2]
         reach = radius + CUT * edge
@@ -57,57 +107,4 @@ def _draw(discs, contrast, edge, picture):  # type: ignore[no-untyped-def]
                 dx, dy = x - column, y - row
                 level = level_at(np.sqrt(dx * dx + dy * dy) - radius, contrast, edge)
                 if level > 0.0:
-                    picture[y, x] = np.exp(level)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _take_logarithm(picture, levels):  # type: ignore[no-untyped-def]
-    height, width = picture.shape
-    for y in range(height):
-        for x in range(width):
-            levels[y, x] = np.log(picture[y, x])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _compare(  # type: ignore[no-untyped-def]
-    before, now, reference, threshold, fired, start_ns, refractory_ns, t_ns, xs, ys, ps, begin
-):
-    """Events between two frames, written from `begin` on while there is room; all are counted."""
-    n, (height, width), room = begin, threshold.shape, t_ns.shape[0]
-    for y in range(height):
-        for x in range(width):
-            change, step = now[y, x] - reference[y, x], threshold[y, x]
-            # a level met to within rounding is met, as it is for the analytic way
-            while abs(change) >= step - 2e-9:
-                sign = 1.0 if change > 0.0 else -1.0
-                reference[y, x] += sign * step
-                change = now[y, x] - reference[y, x]
-                share = (reference[y, x] - before[y, x]) / (now[y, x] - before[y, x])
-                t = start_ns + np.int64(min(max(share, 0.0), 1.0) * FRAME_NS)
-                if t - fired[y, x] >= refractory_ns:
-                    fired[y, x] = t
-                    if n < room:
-                        t_ns[n], xs[n], ys[n], ps[n] = t, x, y, sign > 0.0
-                    n += 1
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _emulate(path, contrast, edge, refractory_ns, threshold, room):  # type: ignore[no-untyped-def]
-    """Events, in room for so many, and how many there are."""
-    picture = np.empty(threshold.shape)
-    levels = np.empty((2, *threshold.shape))
-    _draw(path[0], contrast, edge, picture)
-    _take_logarithm(picture, levels[0])
-    reference = levels[0].copy()
-    fired = np.full(threshold.shape, -(1 << 62))
-    t_ns, ps = np.empty(room, np.int64), np.empty(room, np.uint8)
-    xs, ys, n = np.empty(room, np.uint16), np.empty(room, np.uint16), 0
-    for frame in range(1, path.shape[0]):
-        _draw(path[frame], contrast, edge, picture)
-        _take_logarithm(picture, levels[frame % 2])
-        n = _compare(
-            levels[(frame + 1) % 2], levels[frame % 2], reference, threshold, fired,
-            (frame - 1) * FRAME_NS, refractory_ns, t_ns, xs, ys, ps, n,
-        )  # fmt: skip
-    return t_ns, xs, ys, ps, n
+                    picture[y, x] = _WHITE * np.exp(level - contrast)

@@ -6,10 +6,13 @@ motion program. `contact_864_s` is the contact of all 864 trials at the default 
 slips located exactly and forces told every millimetre of the way.
 `ns_per_event` has noise, sorting and read-out in it, for a slide at 1 mm/s, whose markers hardly
 move; `ns_per_event_busy` is the same where every marker moves at about 200 px/s.
-`x_frame_emulator` compares a fast slide without noise with `benchmarks.emulator`, ours, drawing
-included on both sides. `event_time_p95_us` holds signal events, before the read-out, against the
-same trial with contact steps 16 times as fine; `readout_p95_us` is what the read-out's grid adds.
-`peak_mb` is the most memory that a process held that took one trial with its video.
+`x_v2e` compares a second of a fast slide without noise with v2e's own emulator on frames at 1 kHz
+(`benchmarks.emulator`; left out where v2e is not found), projection and drawing included;
+`v2e_time_p50_us` and `v2e_time_p95_us` are how far its event times are from ours. `x_circuit` is
+what pixels with thresholds of both signs cost in place of those with one, `x_circuit_low_pass` what
+a bandwidth of 30 Hz costs on top of that. `event_time_p95_us` holds signal events, before the
+read-out, against the same trial with contact steps 16 times as fine; `readout_p95_us` is what the
+read-out adds. `peak_mb` is the most memory that a process held that took one trial with its video.
 """
 
 from __future__ import annotations
@@ -17,13 +20,16 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from analysis.statistics.scene_error import match_events
-from benchmarks.emulator import emulate
+from benchmarks.emulator import FRAME_NS, emulate, find_emulator
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
-from benchmarks.slides import CHUNK_S, LENGTH_MM, loads_of_slide
+from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
 from benchmarks.trials import stretch
 from rigs.mock.physics import springs_of
 from rigs.mock.settings import MockSettings
@@ -36,6 +42,10 @@ TRIALS = 30
 """Random trials of the grid; the same for every run."""
 FAST_MM_S = 1.6
 FINER = 16
+CIRCUITS: dict[str, dict[str, Any]] = {
+    "thresholds": {"threshold_off_sigma": 0.03},
+    "low_pass": {"threshold_off_sigma": 0.03, "cutoff_hz": 30.0},
+}
 
 
 def measure(
@@ -117,18 +127,15 @@ def _events(runs: int, length_mm: float) -> Figures:
         **{**settings.event_camera.model_dump(), "noise_hz": 0.0, "hot_pixels": 0, "readout_hz": 0}
     )
     silent = MarkerSensor(quiet, layout, SEED)
-    fast = loads_of_slide(settings, length_mm, FAST_MM_S)
-    # frames are drawn from the same path, at every millisecond
-    every = np.arange(fast[0][0], fast[0][-1] + 1, 1_000_000, dtype=np.int64)
-    dense = np.stack([np.interp(every, fast[0], column) for column in fast[1].T], axis=1)
-    frames = np.ascontiguousarray(np.transpose(silent.path(dense), (2, 0, 1)))
+    fast = _first_second(loads_of_slide(settings, length_mm, FAST_MM_S))
+    circuits = {
+        name: MarkerSensor(replace(quiet, **changes), layout, SEED)
+        for name, changes in CIRCUITS.items()
+    }
     counts: dict[str, int] = {}
 
     def sense(name: str, device: MarkerSensor, rows: tuple[I64, F64]) -> None:
         counts[name] = sum(len(part[0]) for part in _sensed(device, rows))
-
-    def frame_based() -> None:
-        counts["frames"] = len(emulate(frames, quiet, silent.threshold)[0])
 
     with one_core():
         taken = alternate(
@@ -136,16 +143,57 @@ def _events(runs: int, length_mm: float) -> Figures:
             slow=lambda: sense("slow", sensor, slow),
             busy=lambda: sense("busy", sensor, busy),
         )  # fmt: skip
-        rivals = alternate(
-            min(runs, 3), ours=lambda: sense("fast", silent, fast), frames=frame_based
+        circuit = alternate(
+            min(runs, 3),
+            plain=lambda: sense("fast", silent, fast),
+            **{name: partial(sense, name, device, fast) for name, device in circuits.items()},
         )
     return {
         **spread("ns_per_event", [value * 1e9 / counts["slow"] for value in taken["slow"]]),
         **spread("ns_per_event_busy", [value * 1e9 / counts["busy"] for value in taken["busy"]]),
         "events_per_slide": float(counts["slow"]),
-        **ratio("x_frame_emulator", rivals["frames"], rivals["ours"]),
-        **rate("emulator_x_realtime", len(frames) * 1e-3, rivals["frames"]),
-        "emulator_events_share": counts["frames"] / counts["fast"],
+        **ratio("x_circuit", circuit["thresholds"], circuit["plain"]),
+        **ratio("x_circuit_low_pass", circuit["low_pass"], circuit["thresholds"]),
+        **_against_v2e(runs, silent, fast),
+    }
+
+
+def _first_second(rows: tuple[I64, F64]) -> tuple[I64, F64]:
+    """The rows of a hold and slide that are within a second after the hold."""
+    t_ns, loads = rows
+    begin_ns = t_ns[0] + HOLD_S * 1e9
+    kept = (t_ns >= begin_ns) & (t_ns <= begin_ns + 1e9)
+    return t_ns[kept], np.ascontiguousarray(loads[kept])
+
+
+def _against_v2e(runs: int, silent: MarkerSensor, rows: tuple[I64, F64]) -> Figures:
+    """Some rows of a slide by v2e, where it is to be had, and by our way."""
+    emulator = find_emulator()
+    if emulator is None:
+        return {}
+    # frames are drawn from the same path, at every millisecond
+    every = np.arange(rows[0][0], rows[0][-1] + 1, FRAME_NS, dtype=np.int64)
+    dense = np.stack([np.interp(every, rows[0], column) for column in rows[1].T], axis=1)
+    found: dict[str, Events] = {}
+
+    def ours() -> None:
+        found["ours"] = _joined_events(_sensed(silent, rows))
+
+    def theirs() -> None:
+        path = np.ascontiguousarray(np.transpose(silent.path(dense), (2, 0, 1)))
+        t_ns, x, y, p = emulate(emulator, path, silent.optics, silent.threshold)
+        found["v2e"] = t_ns + every[0], x, y, p
+
+    with one_core():
+        taken = alternate(min(runs, 3), ours=ours, v2e=theirs)
+    apart, shared = _apart_us(_chunk(found["ours"]), _chunk(found["v2e"]))
+    return {
+        **ratio("x_v2e", taken["v2e"], taken["ours"]),
+        **rate("v2e_x_realtime", (every[-1] - every[0]) * 1e-9, taken["v2e"]),
+        "v2e_events_share": len(found["v2e"][0]) / len(found["ours"][0]),
+        "v2e_matched_share": shared,
+        "v2e_time_p50_us": float(np.percentile(apart, 50)),
+        "v2e_time_p95_us": float(np.percentile(apart, 95)),
     }
 
 
@@ -184,10 +232,19 @@ def _precision(length_mm: float) -> Figures:
     }
 
 
-def _joined(parts: list[Events]) -> tuple[EventChunk, I64]:
-    """Events as a chunk, and their times in ns, which a chunk would round."""
+def _joined_events(parts: list[Events]) -> Events:
     t_ns, x, y, p = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return t_ns, x, y, p
+
+
+def _chunk(events: Events) -> tuple[EventChunk, I64]:
+    """Events as a chunk, and their times in ns, which a chunk would round."""
+    t_ns, x, y, p = events
     return EventChunk(x, y, p, t_ns // 1000), t_ns
+
+
+def _joined(parts: list[Events]) -> tuple[EventChunk, I64]:
+    return _chunk(_joined_events(parts))
 
 
 def _apart_us(a: tuple[EventChunk, I64], b: tuple[EventChunk, I64]) -> tuple[F64, float]:

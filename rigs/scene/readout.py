@@ -141,7 +141,8 @@ def read_scans(  # type: ignore[no-untyped-def]
     keys = events[left:]
     for k in range(inside):
         keys[k] = other[k]
-    sort_packed(keys, inside, other, low, low + y_bits + x_bits + bits_for(past))
+    # few events of a scan share a column: insertion puts their rows in order
+    sort_packed(keys, inside, other, low + y_bits, low + y_bits + x_bits + bits_for(past))
     for k in range(inside):
         # all that is not in the cache is asked for at once, and not one pixel after the other
         other[k] = fired[

@@ -42,7 +42,7 @@ PROMISED = {
         "aedat4_own_read_m_events_per_s", "aedat4_own_read_ratio",
     },
     "scene": {
-        "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_frame_emulator",
+        "contact_8_s", "ns_per_event", "ns_per_event_busy", "x_circuit", "x_circuit_low_pass",
         "event_time_p95_us", "readout_p95_us",
     },
     "clocks": {
