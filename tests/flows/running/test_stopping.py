@@ -21,7 +21,7 @@ def test_a_signal_interrupts_and_is_remembered() -> None:
         with stopping.signals():
             assert not stopping.requested()
             with pytest.raises(KeyboardInterrupt):
-                os.kill(os.getpid(), number)
+                signal.raise_signal(number)  # in this thread, and at once
             assert stopping.requested()
             with pytest.raises(KeyboardInterrupt):
                 stopping.check()

@@ -95,7 +95,7 @@ def test_the_table_has_a_row_for_each_result() -> None:
     assert (row["share"], row["trials"], row["n"]) == (0.75, 2, 4)
     text = table({"depth 2 mm": {**row, "seen": 0.9}, "speed 1": {"left out": "no trials"}}, True)
     assert "(simulated)" in text
-    assert "| depth 2 mm | 2 | 4 | 75.0 | 50.0 to 100.0 | 83.3 | 90.0 |" in text
+    assert "| depth 2 mm | 2 | 4 | 75.0 | 0.0 to 100.0 | 83.3 | 90.0 |" in text
     assert "| speed 1 | no trials |" in text
 
 
