@@ -115,8 +115,10 @@ def test_a_library_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_ctrl_c_ends_an_opening_at_once() -> None:
     code = (
-        "import sys; from rigs.cameras.dvxplorer import DvxplorerCamera; "
-        "from rigs.cameras.settings import DvxplorerSettings; print('opening', flush=True); "
+        "import signal, sys; from rigs.cameras.dvxplorer import DvxplorerCamera; "
+        "from rigs.cameras.settings import DvxplorerSettings; "
+        # a shell's background job ignores it
+        "signal.signal(signal.SIGINT, signal.default_int_handler); print('opening', flush=True); "
         "DvxplorerCamera(DvxplorerSettings.model_validate_json(sys.argv[1]))"
     )
     with ports((EVENTS, b"")) as (port, settings):
