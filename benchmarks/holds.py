@@ -1,4 +1,4 @@
-"""Which press depth carries the heaviest plate through the recorded hold of a gravity trial?
+"""Press depths of a gravity trial, by whether the heaviest plate slips in the recorded hold.
 
 `python -m benchmarks.holds [N]` prints the table of docs/decisions/0083: N trials (20 by default)
 of the gravity protocol with the heaviest plate, all speeds, on the simulated rig with other press

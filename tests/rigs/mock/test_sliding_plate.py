@@ -5,13 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.holds import run
 from protocols import Plan, Trial
-from protocols.hashing import hash_integer
 from protocols.plan import load_plan
-from rigs.build import build_rig
 from rigs.mock.devices import MockDevices, build_mock
 from rigs.rig_file import load_rig_file
-from storage.streams import Unheeded
 from tests.conftest import ROOT
 from tests.rigs.mock.driving import SMALL, gravity
 
@@ -65,16 +63,7 @@ HEAVY = {"gravity": "mass=0.245kg", "disturbance": "disturbance=100", "pilot_gra
 
 def hold_still(plan: Plan, trial: Trial) -> dict[str, Any]:
     """Run a trial on the simulated rig, as a campaign's first attempt, and check its hold."""
-    rig = build_rig(load_rig_file(ROOT / "rigs" / "rehearsal.yaml")[0])
-    rig.connect()
-    try:
-        for task in plan.changeovers(None, trial):
-            rig.operator.ask(task.kind, task.prompt, task.expected)
-        seed = hash_integer(trial.seed, 0)
-        truth = rig.run_trial(plan.program(trial), Unheeded(), seed, None, 100).truth
-    finally:
-        rig.close()
-    assert truth is not None
+    truth = run(load_rig_file(ROOT / "rigs" / "rehearsal.yaml")[0], plan, trial)
     held = truth["from_hold"]
     assert max(held["hold_slip_mm"]) < QUARTER_MM, trial.id
     assert held["first_slip_ns"] > truth["reference_ns"], trial.id
