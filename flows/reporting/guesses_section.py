@@ -6,9 +6,8 @@ from typing import Any
 
 from analysis.pictures.figures_changes import Changed, ChangePanel, lowered_and_raised
 from analysis.pictures.report import Figure, Section, Table, number, percent
-from flows.reporting.report_extras import FILES, command
+from flows.reporting.report_extras import command, odd_shape
 from flows.searching.guess_changes import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
-from storage.errors import StoreError
 from storage.store import Store
 
 Json = dict[str, Any]
@@ -32,10 +31,7 @@ def section(store: Store, found: Json | None) -> Section:
     try:
         return _made(found)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
-        raise StoreError(
-            f"{FILES['guesses']}: is not of the shape that this version reads ({error!r}); delete "
-            "it, or make it again"
-        ) from None
+        raise odd_shape("guesses", error) from None
 
 
 def _made(found: Json) -> Section:

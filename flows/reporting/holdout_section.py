@@ -7,9 +7,8 @@ from typing import Any
 
 from analysis.pictures.report import Section, Table, number, percent
 from analysis.statistics.intervals import exact_interval
-from flows.reporting.report_extras import FILES, command
+from flows.reporting.report_extras import FILES, command, odd_shape
 from flows.reporting.report_trials import intervals, told
-from storage.errors import StoreError
 from storage.store import Store
 
 Json = dict[str, Any]
@@ -22,7 +21,7 @@ _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 
 def part(found: Json) -> Json:
-    """What the summary has of it: all but single trials and when it was judged; with intervals."""
+    """The part of the summary: all but single trials and dates, with intervals."""
     rows = [told(row) for row in found["rows"]]
     return {
         **{name: found[name] for name in ("trials", "protocol_seed", "skin_seed", "model")},
@@ -34,7 +33,7 @@ def part(found: Json) -> Json:
 
 
 def rows_of(found: Json) -> list[list[str]]:
-    """Its figures as rows of `COLUMNS`."""
+    """Figures of the hold-out campaign as rows of `COLUMNS`."""
     return _rows(part(found), {name: found["windows"][name] for name in _SHARES})
 
 
@@ -53,10 +52,7 @@ def section(store: Store, found: Json | None, summary: Json) -> Section:
     try:
         return _made(found, summary)
     except (KeyError, TypeError, AttributeError) as error:
-        raise StoreError(
-            f"{FILES['holdout']}: is not of the shape that this version reads ({error!r}); delete "
-            "it, or make it again"
-        ) from None
+        raise odd_shape("holdout", error) from None
 
 
 def _made(found: Json, summary: Json) -> Section:

@@ -10,11 +10,10 @@ from typing import Any
 from analysis.pictures.figures_conditions import Share, shares
 from analysis.pictures.report import Figure, Link, Section, Table, percent
 from flows.reporting import label_tables
-from flows.reporting.report_extras import FILES, command
+from flows.reporting.report_extras import FILES, command, odd_shape
 from flows.reporting.search_section import search
 from flows.searching import tradeoff_page
 from protocols.quantity import level_order
-from storage.errors import StoreError
 from storage.store import Store
 
 Json = dict[str, Any]
@@ -123,12 +122,12 @@ def tradeoff(store: Store, found: Mapping[str, Json]) -> Section:
                 made = label_tables.speed if name == "labels" else label_tables.truth
                 tables.append(made(_checked(found[name], name, "figures")))
             except (KeyError, TypeError, ValueError) as error:
-                raise _odd(name, error) from None
+                raise odd_shape(name, error) from None
     if "detector" in found:
         try:
             picture, table = search(found["detector"], bool(found["detector"]["simulated"]))
         except (KeyError, TypeError, AttributeError) as error:
-            raise _odd("detector", error) from None
+            raise odd_shape("detector", error) from None
         pictures.append(picture)
         tables.append(table)
     pages = {"scene": "the scene's", "detector": "the detector's"}
@@ -147,7 +146,7 @@ def _scene(numbers: Json, said: list[str], tables: list[Table]) -> Figure:
         rows = numbers["variants"]
         errors = list(rows[0]["error"])
     except (KeyError, IndexError, TypeError) as error:
-        raise _odd("scene", error) from None
+        raise odd_shape("scene", error) from None
     said.append(f"The scene of {numbers['protocol']} (simulated). {section.text[0]}")
     tables += section.tables
     data: dict[str, list[object]] = {
@@ -171,12 +170,5 @@ def _unit(key: str) -> str:
 def _checked(found: Json, name: str, key: str) -> Json:
     inner = found.get(key)
     if not isinstance(inner, dict):
-        raise _odd(name, KeyError(key))
+        raise odd_shape(name, KeyError(key))
     return inner
-
-
-def _odd(name: str, error: Exception) -> StoreError:
-    return StoreError(
-        f"{FILES[name]}: is not of the shape that this version reads ({error!r}); delete "
-        "it, or make it again"
-    )

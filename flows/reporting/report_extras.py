@@ -67,3 +67,11 @@ def command(store: Store, name: str) -> str:
     """The command that makes one of `FILES`, for this store."""
     path = store.folder.resolve() / FILES[name]
     return COMMANDS[name].format(store=store.folder.resolve(), folder=path.parent, file=path)
+
+
+def odd_shape(name: str, error: Exception) -> StoreError:
+    """The error of one of `FILES` that is not of the shape that its section reads."""
+    return StoreError(
+        f"{FILES[name]}: is not of the shape that this version reads ({error!r}); delete it, or "
+        "make it again"
+    )
