@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Source = Literal["published", "assumed"]
-PRESETS = ("paper",)
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,6 @@ CLASSES = ("no_slip", "incipient", "gross")
 
 NO_SLIP, INCIPIENT, GROSS = range(3)
 
-DEFAULT_MARGIN = 8.0
-"""Spikes by which a winner must lead to count as decided: two for each of a class's four output
-neurons (the paper's rule for a detection)."""
-
 Counts = npt.NDArray[Any]
 Labels = npt.NDArray[np.integer[Any]]
 IntArray = npt.NDArray[np.int64]
@@ -113,8 +109,11 @@ def winners(counts: Counts, margin: float = 0.0) -> npt.NDArray[np.int8]:
     return np.where(decided, counts.argmax(axis=1), -1).astype(np.int8)
 
 
-def accuracy(counts: Counts, labels: Labels, margin: float = DEFAULT_MARGIN) -> Accuracy:
-    """The three accuracies of spike counts (n, 3) against labels int (n,)."""
+def accuracy(counts: Counts, labels: Labels, margin: float = 0.0) -> Accuracy:
+    """The three accuracies of spike counts (n, 3) against labels int (n,).
+
+    Without a `margin` any lead decides, as in the strict one.
+    """
     counts, labels = check(counts, labels)
     n = len(labels)
     if n == 0:
@@ -151,13 +150,13 @@ def class_balance(labels: Labels) -> dict[str, float | None]:
     return {name: _share(each[k], len(labels)) for k, name in enumerate(CLASSES)}
 
 
-def score(counts: Counts, labels: Labels, margin: float = DEFAULT_MARGIN) -> Scores:
+def score(counts: Counts, labels: Labels, margin: float = 0.0) -> Scores:
     """Accuracies, confusion matrix, precision, recall and class balance in one.
 
     Args:
         counts: spike counts (n, 3), integer or float.
         labels: true classes, integer (n,), 0..2.
-        margin: spikes by which a winner must lead for the margin accuracy.
+        margin: spikes by which a winner must lead for the margin accuracy; any lead by default.
 
     Raises:
         ValueError: shapes that do not fit, a label that is no class, a count not finite.

@@ -23,7 +23,7 @@ from protocols.errors import InputError
 
 
 class Engine(StrEnum):
-    """What counts the spikes of a model file."""
+    """Engines that count the spikes of a model file."""
 
     fast = "fast"
     sinabs = "sinabs"
@@ -139,13 +139,11 @@ def evaluate(
 def _judged(result: dict[str, Any]) -> dict[str, Any]:
     """A judged model in a few lines."""
     accuracy, interval = result["accuracy"], result["interval"]
-    sure = (
-        ""
-        if interval["low"] is None
-        else (
+    sure = ""
+    if interval["low"] is not None:
+        sure = (
             f" ({interval['low']:.1%} to {interval['high']:.1%} over {interval['trials']} trials)"
         )
-    )
     shown = {"windows": accuracy["n"], "engine": result["engine"]}
     if not result["same_as_sinabs"]:
         shown["engine"] += "; a few counts may differ from Sinabs'"
@@ -157,7 +155,10 @@ def _judged(result: dict[str, Any]) -> dict[str, Any]:
         }
     for name, found in result["latency_ms"].items():
         if found["median"] is not None:
-            missed = f"{found['missed']} missed, {found['false_early']} early"
+            out = (
+                f"{found[key]} {key.replace('_', ' ')}" for key in ("missed", "late", "false_early")
+            )
+            missed = ", ".join(out)
             shown[f"{name} latency"] = f"median {found['median']:.0f} ms of {found['n']}; {missed}"
     for name, found in result["lead_ms"].items():
         if found["median"] is not None:

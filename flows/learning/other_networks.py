@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 STEP = "other_networks"
 VERSION = 1
 Engines = Literal["fast", "sinabs"]
-ENGINES: tuple[Engines, ...] = ("fast", "sinabs")
 Json = dict[str, Any]
 I64 = npt.NDArray[np.int64]
 
@@ -74,10 +73,16 @@ class OtherNetwork:
     engine: Engines
     exact: bool
 
+    @cached_property
+    def key(self) -> str:
+        """Of the file and the engine, on which its counts depend."""
+        said = None if self.description is None else self.description.model_dump(mode="json")
+        return hash_data([self.content.hex(), said, self.engine])
+
 
 @dataclass(frozen=True)
 class _Judging:
-    """What the counts of a trial depend on besides the trial."""
+    """Inputs of a trial's counts besides the trial."""
 
     network: OtherNetwork
     label: Json | None
@@ -129,7 +134,7 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
         try:
             model.fast()
         except ValueError as error:
-            reason = f"cannot run {path}: {error}; must be sinabs"
+            reason = f"cannot run {path}: {error}; use sinabs"
             raise InputError("--engine", "", engine, reason) from None
     return OtherNetwork(
         f"model-{path.stem}", Path(model.description.weights).name, model.weights,
@@ -140,7 +145,7 @@ def _described(path: Path, engine: Engines | None) -> OtherNetwork:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is judged by what, found before anything is computed."""
+    """A network, trials and rules to judge it by, found before anything is computed."""
 
     store: Store
     campaigns: list[Collected]
@@ -159,12 +164,10 @@ class Judgement:
     def key(self) -> str:
         """Of all that the result depends on."""
         network = self.network
-        said = None if network.description is None else network.description.model_dump(mode="json")
-        model = hash_data([network.content.hex(), said, network.engine])
         rules = {name: rule.model_dump(mode="json") for name, rule in self.rules.items()}
         return make_key(
             STEP, VERSION,
-            [model, self.data_key, network.title, self.about, window_scores.VERSION], rules,
+            [network.key, self.data_key, network.title, self.about, window_scores.VERSION], rules,
         )  # fmt: skip
 
     def run(self) -> bool:
@@ -282,7 +285,7 @@ def judge_beside(
 
 
 def kept(store: Store, campaigns: list[Collected], reviewed: bool = False) -> dict[str, Json]:
-    """What was judged on the trials and labels of today, by name."""
+    """Results on the trials and labels of today, by name."""
     folder = Derived.of(store, STEP)
     wanted = data_key(Labels(store, reviewed), campaigns)
     found = {}
@@ -305,15 +308,13 @@ def _flow(wanted: Parcel[Judgement]) -> None:
 def _count_all(job: Judgement) -> None:
     network, kinematic = job.network, {item.name for item in training_campaigns(job.campaigns)}
     samples = training_settings(job.campaigns).samples
-    said = None if network.description is None else network.description.model_dump(mode="json")
-    model = hash_data([network.content.hex(), said, network.engine])
     work = []
     for item in job.campaigns:
         stride = job.rules[item.name].stride_ms or network.windows.length_ms
         for trial, recording in item.of_split("test"):
             label = job.labels.read(item, recording) if item.name in kinematic else None
             key = make_key(
-                STEP, VERSION, [model, recording.checksum, job.labels.key(item, recording)],
+                STEP, VERSION, [network.key, recording.checksum, job.labels.key(item, recording)],
                 [network.windows.model_dump(mode="json"), samples.model_dump(), stride],
             )  # fmt: skip
             judging = _Judging(
@@ -356,7 +357,7 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, dict[str, npt
 def _counter(
     content: bytes, description: Description | None, engine: Engines
 ) -> Callable[[SparseWindows], I64]:
-    """What gives output spikes int64 (n, 3) of windows, each from rest."""
+    """A function from windows to output spikes int64 (n, 3), each window from rest."""
     if description is None:
         fitted = model_file.parse(content, "the model")
         if engine == "fast":

@@ -125,7 +125,7 @@ def test_predictions_are_those_of_the_sinabs_network(fitted: Fitted) -> None:
 
 
 def test_the_chosen_epoch_is_the_one_in_the_weights(fitted: Fitted) -> None:
-    found = metrics.accuracy(predict_counts(fitted, VAL[0]), VAL[1])
+    found = metrics.accuracy(predict_counts(fitted, VAL[0]), VAL[1], fitted.network.margin)
     chosen = fitted.chosen
     assert (found.argmax, found.strict, found.margin) == (
         chosen.val_argmax,

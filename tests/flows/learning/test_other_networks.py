@@ -153,7 +153,7 @@ def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"needs a description beside it, such as lab\.yaml"):
         judge_model(store, campaigns, tmp_path / "lab.pt")
     layers = [*OURS[:3], {**OURS[3], "lowest": -1.0}, *OURS[4:]]
-    with pytest.raises(InputError, match=r"--engine = fast: .*no lowest potential; must be sinabs"):
+    with pytest.raises(InputError, match=r"--engine = fast: .*no lowest potential; use sinabs"):
         judge_model(store, campaigns, lab(tmp_path, layers=layers), "fast")
     done = here("evaluate", store.folder, "--engine", "fast")
     assert done.returncode == 2
