@@ -41,14 +41,14 @@ KINDS = (
 HOPELESS = (
     "jump_of_ticks", "other_trial", "other_trial_16_bits", "lost_30_and_jump_of_ticks",
 )  # fmt: skip
-"""Whatever is accepted of these is wrong."""
+"""Kinds of which any fit that is accepted is wrong."""
 END = 0.005
 """The share of a train that is its end."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What came of the trains of one kind.
+    """Results of the trains of one kind.
 
     Attributes:
         errors, stated: of every accepted fit, ns.
@@ -152,7 +152,7 @@ def faulty_train(rng: np.random.Generator, kind: str) -> Train:
 
 
 def _clock(rng: np.random.Generator, kind: str, sent: F64, tick: int) -> F64:
-    """What the device's clock is ahead by at times since the train began, ns."""
+    """Lead of the device's clock at times since the train began, ns."""
     span = float(sent[-1])
     sign = float(rng.choice([-1, 1]))
     away = sign * rng.uniform(0.1, 0.9)
@@ -175,7 +175,7 @@ def _clock(rng: np.random.Generator, kind: str, sent: F64, tick: int) -> F64:
 
 
 def _other_trial(rng: np.random.Generator, code: Callable[[int, int], U8]) -> Train:
-    """What the device saw of one trial with what the box sent in another, of the same length."""
+    """Pulses that the device saw in one trial, with those that the box sent in another as long."""
     seconds, tick = float(rng.uniform(20, 60)), int(rng.choice([10, 20, 50])) * 1_000_000
     one, other = (make_train(rng, seconds=seconds, tick=tick, code=code) for _ in range(2))
     return Train(one.device, other.reference, one.true, one.sent, tick)

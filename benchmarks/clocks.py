@@ -41,7 +41,7 @@ DRIFT_PPM = 400.0
 
 @dataclass(frozen=True)
 class Train:
-    """What a device stamped, what the box reported, and what it sent when on the device's clock.
+    """Stamps of a device, reports of the box, and true times of pulses on the device's clock.
 
     Attributes:
         device, reference: stamps, ns.

@@ -40,7 +40,7 @@ class _MockSimulation:
         return self._devices.sink(sink)
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """What really happened after these moments."""
+        """The truth of a trial after these moments."""
         clock = self._devices.world.clocks.arm
         hold_ns = None if hold_arm_ns is None else int(clock.to_device(hold_arm_ns))
         return self._devices.truth(int(clock.to_device(reference_arm_ns)), hold_ns)

@@ -130,7 +130,7 @@ def _not_counted(trials: Sequence[TrialLatency], kind: str) -> dict[str, int]:
 def _judge(
     found: int | None, onset: int, end: int, tolerance: int
 ) -> tuple[bool, float | None, float | None]:
-    """Whether it was false early; by how much it was late, and its latency if it counts, in ms."""
+    """Tell false early, by how much it was late, and its latency if it counts, in ms."""
     if found is None:
         return False, None, None
     if is_false_early(found, onset, tolerance):

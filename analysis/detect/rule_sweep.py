@@ -34,7 +34,7 @@ class Trials:
     tolerance_ns: I64
 
     def uncounted(self, found: I64) -> Uncounted:
-        """What of detections does not count.
+        """Count the detections that do not count.
 
         Args:
             found: int64 (n, ..., 2), incipient and gross, `NEVER` where there is none.

@@ -1,4 +1,4 @@
-"""When a trial's slip really began, became gross and ended: what every detection is judged by.
+"""Begin, gross onset and end of a trial's true slip, by which every detection is judged.
 
 Incipient slip ends where gross slip begins, and gross slip ends where the sensor and the plate stop
 moving on each other. A detection after that warns of nothing: it is late, however long the
@@ -57,7 +57,7 @@ def true_slip(label: Mapping[str, Any]) -> TrueSlip | None:
 
 
 def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:
-    """Whether a detection comes before the onset by MORE than the tolerance.
+    """Check if a detection comes before the onset by MORE than the tolerance.
 
     Args:
         found_ns: an integer or an array of them, `NEVER` where nothing was detected; likewise:
@@ -68,7 +68,7 @@ def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:
 
 
 def is_late(found_ns: Any, end_ns: Any) -> Any:
-    """Whether a detection comes at the end of its event or after it.
+    """Check if a detection comes at the end of its event or after it.
 
     Args:
         found_ns: an integer or an array of them, `NEVER` where nothing was detected (not late).

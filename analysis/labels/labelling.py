@@ -105,7 +105,7 @@ class Label:
 
     @property
     def end_ns(self) -> int:
-        """Where slip ended: the plate came to rest after gross onset, or the motion ended."""
+        """End of the slip: the plate came to rest after gross onset, or the motion ended."""
         gross = self.onsets.gross_ns
         if self.rest_ns is not None and (gross is None or self.rest_ns > gross):
             return min(self.rest_ns, self.stop_ns)

@@ -88,7 +88,7 @@ def displacements(
     reference_frames: slice | NDArray[np.bool_],
     plate_xy: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """How far each marker is from its mean place over the reference frames, (n, m) pixels.
+    """Distance of each marker from its mean place over the reference frames, (n, m) pixels.
 
     NaN where the marker or the plate is unknown in that frame, or in all of the reference frames.
     Arguments and errors as for `mean_places` and `on_plate`.

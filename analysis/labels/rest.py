@@ -1,4 +1,4 @@
-"""Where markers rested, and how far they are from there: what every label counts.
+"""Rest positions of markers and offsets from them, which every label counts.
 
 A recording begins with a hold, in which nothing should move. Rest is the mean over its first part,
 as in the paper, or over its last, just before the motion; what lies between the two is slip in the
@@ -24,7 +24,7 @@ Reference = Literal["hold_start", "hold_end"]
 
 @dataclass(frozen=True)
 class Offsets:
-    """How far m markers are from one place each, over n frames, and where they rested.
+    """Offsets of m markers from one place each, over n frames, and where they rested.
 
     Attributes:
         away: (n, m, 2) px, the camera's own motion taken out, NaN where a marker was not seen.
@@ -44,7 +44,7 @@ class Offsets:
 
     @property
     def hold_slip_px(self) -> F64:
-        """(m,) how far each marker moved in the hold; NaN where that is unknown."""
+        """Distance that each marker moved in the hold, (m,) px; NaN where that is unknown."""
         moved = self.rests["hold_end"] - self.rests["hold_start"]
         return np.hypot(moved[:, 0], moved[:, 1])
 

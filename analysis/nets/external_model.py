@@ -39,7 +39,7 @@ from protocols.yaml_file import KeyedError, StrictModel, load, register_tags
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Side = Annotated[int, Field(ge=1, le=512)]
 STATES = ("v_mem", "i_syn")
-"""What Sinabs' layers keep beside their parameters; every window begins without it."""
+"""States that Sinabs' layers keep with their parameters; every window begins without them."""
 
 
 class Conv(StrictModel):
@@ -102,14 +102,14 @@ register_tags("conv", "linear", "pool", "flatten", "iaf", "lif")
 
 
 class Description(StrictModel):
-    """What a state_dict does not say: the file beside it."""
+    """The file beside a state_dict: it says what that does not."""
 
     model: Literal[1]
     """Version of the file format."""
     weights: Annotated[str, Field(min_length=1, max_length=1000)]
     """The file that `torch.save(net.state_dict(), FILE)` wrote; relative to this one."""
     windows: Windows = Windows()
-    """What it takes: event counts (steps, channels, cells, cells)."""
+    """Input of the network: event counts (steps, channels, cells, cells)."""
     layers: tuple[Layer, ...] = Field(min_length=1, max_length=100)
     outputs: tuple[Literal["no_slip", "incipient", "gross"], ...] = CLASSES  # type: ignore[assignment]
     """The class of each output neuron; spikes of a class are added up."""
@@ -158,7 +158,7 @@ class ExternalModel:
         return _as_ours(self.description, _tensors(self.weights))
 
     def on_grid(self) -> bool:
-        """Whether the kernels' counts are Sinabs' by arithmetic."""
+        """Check if the kernels' counts are Sinabs' by arithmetic."""
         try:
             return exact(matrices(self.fast()))
         except ValueError:

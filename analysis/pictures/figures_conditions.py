@@ -85,7 +85,7 @@ def by_condition(
 
 
 def _room(panel: Panel) -> tuple[float, float]:
-    """What a panel shows: all trials and lines; the wide interval of a few trials is cut off."""
+    """Limits of a panel: all trials and lines; the wide interval of a few trials is cut off."""
     shown = [value for values in panel.values.values() for value in values]
     shown += [0.0] if panel.zero else []
     shown += [] if panel.published is None else [panel.published[0]]

@@ -198,7 +198,7 @@ def between_seeds(first: Values, second: Values) -> float | None:
 
 
 def drawn(n: int, seed: int = _SEED) -> npt.NDArray[np.int64]:
-    """Which of n trials are drawn, (DRAWS, n); the same ones at every call."""
+    """Indices of the trials drawn out of n, int64 (DRAWS, n); the same at every call."""
     return np.random.Generator(np.random.PCG64(seed)).integers(0, n, (DRAWS, n))
 
 

@@ -45,7 +45,7 @@ _MOVED_KNOTS = 4
 """As long as there are so few knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
-"""How often a straight clock's locked stamps are taken for bent."""
+"""Share of straight clocks with locked stamps that are taken for bent."""
 _KNOT = 3.5
 """A drift that changes by so many standard deviations gets a knot."""
 _STEP, _STEP_AT_END = 5.5, 4.5
@@ -224,7 +224,7 @@ def _jump(found: _Changes, hidden: float) -> float:
 
 
 def _doubt(found: _Changes) -> float:
-    """What a step would do that may be there: half of it is wrong on either side, ns."""
+    """Error by a step that may be there, ns: half of it on either side."""
     middle = 0.5 * abs(found.step_size) if found.step > _DOUBT else 0.0
     return max(middle, abs(found.end_size) if found.end > _DOUBT_AT_END else 0.0)
 

@@ -41,7 +41,7 @@ that only a stretch of two trials' codes is the same."""
 UNEVEN = 3.5
 """Standard deviations between the shares of pulses that fit before and after some time."""
 MIN_EITHER = 0.75
-"""Where less than this of both trains fits, both lost many."""
+"""Both trains lost many pulses where less than this share of each fits."""
 UNVOUCHED = 2
 """A clock that jumps at the last two pulses cannot be told from two late ones."""
 BEND_PPM_S = 2.0

@@ -208,7 +208,7 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # type: ignore[no-untyped-def]
-    """What stands out of the residuals of a line with knots: a change of its slope, and a step.
+    """Test the residuals of a line with knots for a change of its slope, and for a step.
 
     Each is tried at pulse after pulse, beside all that the line may do by itself: what is left of
     it then, times the residuals, has a standard deviation that chance explains.

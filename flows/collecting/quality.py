@@ -210,7 +210,7 @@ def _moving(run: TrialRun) -> StepTimes:
 
 
 def _hold_slip_px(frame_ns: I64, tracks: list[Any], sync: TrialSync, run: TrialRun) -> float:
-    """How far the marker that moved most in the recorded hold did so, px.
+    """Largest distance that a marker moved in the recorded hold, px.
 
     -1 when it cannot be told, because a clock has no map or no marker was seen at both ends.
 

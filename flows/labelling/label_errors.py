@@ -19,8 +19,8 @@ _TRUTH = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
 }
-"""What a rule's onset is held against: the true crossing, counted from the same end of the hold, or
-the true start of the slip in the motion."""
+"""The truth that a rule's onset is compared with: the true crossing, counted from the same end of
+the hold, or the true start of the slip in the motion."""
 
 
 def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:

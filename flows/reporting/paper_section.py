@@ -73,7 +73,7 @@ def _title(network: Json) -> str:
 
 
 def _how(network: Json) -> str:
-    """How a network beside the store's own was made and counted."""
+    """Text on how a network other than the store's own was made and counted."""
     margin = ", ".join(sorted({f"{rule['margin']:g}" for rule in network["detection"].values()}))
     rule = f"judged on the same windows and labels, by a margin of {margin} spikes"
     if network["preset"]:

@@ -69,7 +69,7 @@ def _gross(row: Json) -> str:
 
 
 def _verdict(found: Json, kind: str, counted: str) -> str:
-    """What became of one of a trial's detections."""
+    """Outcome of one of a trial's detections."""
     if found[f"missed_{kind}"]:
         return "missed"
     if found[f"false_early_{kind}"]:

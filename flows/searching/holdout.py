@@ -78,7 +78,7 @@ class Holdout:
         self.trials = trials
 
     def kept(self) -> Json | None:
-        """What was found the last time; None where it was never judged."""
+        """The result of the last time; None where it was never judged."""
         try:
             found: Json = read_json(self.path)
         except FileNotFoundError:

@@ -69,7 +69,7 @@ def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a network and a rule say of a store's test trials.
+    """Outputs of a network and a rule on a store's test trials.
 
     Attributes:
         counts, y, trial: of the chosen windows: spikes int64 (n, 3), classes int64 (n,), and the

@@ -67,7 +67,7 @@ def truth_of(
 
 
 def _moved_mm(world: World, start_ns: int, end_ns: int) -> list[float]:
-    """How far each marker is from where it stood on the plate, from one true time to another."""
+    """Distance of each marker from where it stood on the plate, from one true time to another."""
     n = len(world.physics.tips.state)
     places = world.physics.track.at(np.array([start_ns, end_ns], np.int64))[:, : 2 * n]
     moved = (places[1] - places[0]).reshape(n, 2)

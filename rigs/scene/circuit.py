@@ -50,7 +50,7 @@ class Circuit(NamedTuple):
     since: I64
     """True time of a cell, ns."""
     due: I64
-    """When a cell at rest leaks its next event, ns; `NEVER` for one that is not at rest."""
+    """Time at which a cell at rest leaks its next event, ns; `NEVER` for one not at rest."""
     mark: I64
     """Begin of the last block in which a rim was near, ns."""
     active: I64
@@ -62,7 +62,7 @@ class Circuit(NamedTuple):
     lowest: float
     """The lowest threshold of all."""
     leaks: bool
-    """Whether any memorised level falls."""
+    """True if any memorised level falls."""
 
 
 def no_circuit() -> Circuit:
@@ -148,7 +148,7 @@ def _wake(circuit, x, y, t_ns):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _difference(t, p0, p1, p2, rest, pace, leak):  # type: ignore[no-untyped-def]
-    """What the pixel sees less what it memorised, at t of a part, and its rate."""
+    """Seen less memorised level of a pixel at t of a part, and its rate."""
     value, rate = p0 + t * (p1 + leak + t * p2), p1 + leak + 2.0 * t * p2
     if pace > 0.0:
         left = rest * np.exp(-t * pace)

@@ -81,7 +81,7 @@ class EventOptics:
 
     @property
     def has_circuit(self) -> bool:
-        """Whether pixels have more than one threshold and a memory."""
+        """Check if pixels have more than one threshold and a memory."""
         off = self.threshold_off is not None or self.threshold_off_sigma is not None
         return off or self.cutoff_hz > 0 or self.leak == "reference"
 
@@ -149,7 +149,7 @@ class MarkerSensor:
 
     @property
     def scans(self) -> Scans:
-        """When the read-out scans in this trial."""
+        """Scan times of the read-out in this trial."""
         optics = self.optics
         return Scans(optics.period_ns, self._phase_ns, optics.column_ns, optics.width)
 

@@ -32,7 +32,7 @@ _I64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Scans:
-    """When a read-out scans its array and when it reads each column, true ns."""
+    """Times at which a read-out scans its array and reads each column, true ns."""
 
     period_ns: int
     """From one scan to the next; 0: every event has its own time."""

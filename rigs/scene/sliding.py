@@ -22,7 +22,7 @@ from rigs.scene.smooth import logarithm
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""
 _MARCH_MM = KNOT_MM / 8.0
-"""How far apart places are at which the balance of a tip is looked at one by one."""
+"""Distance between the places at which the balance of a tip is looked at one by one."""
 _MOST_PLACES = 4096.0
 _STEADY = 1.25
 """Speed over the next one up to which a line or a parabola through both tells of the one after."""
@@ -50,7 +50,7 @@ def along_slip(  # type: ignore[no-untyped-def]
     new_x, new_y, old_x, old_y, branch_x, branch_y, soft, damp, per_s, swerve, unit_x, unit_y,
     quick, lag,
 ):  # fmt: skip
-    """What `pulled` is told of a tip whose slip has the direction `unit`.
+    """Arguments of `pulled` for a tip whose slip has the direction `unit`.
 
     Args:
         new_x, new_y, old_x, old_y: stretch at both ends of the step if the tip did not slip, mm.

@@ -140,7 +140,7 @@ def _aim(w, law):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _begin(w, law, rough, h, swerve, decay, gain):  # type: ignore[no-untyped-def]
-    """What the search works on, and where it begins."""
+    """Set up the arrays of the search, and where it begins."""
     per_s = 1.0 / h
     for j in range(LANES):
         quick, lag, slides = foreseen(h, per_s, w[SLID_S, j], w[SPEED, j], w[EARLIER, j])

@@ -148,7 +148,7 @@ def _end(w, j, mode, x, y, force_x, force_y, normal, bent, slip, share, gain):  
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-untyped-def]
-    """Where tip `i` in lane `j` is after its base moved within `h` seconds.
+    """Move tip `i` in lane `j` after its base moved within `h` seconds.
 
     The base moves linearly, but for `swerve`: its speed along y at the end of the step over its
     mean one, mm/s, changing linearly. `decay` and `gain` are the relaxing branch's exact factors

@@ -1,4 +1,4 @@
-"""How the force of a tip leaves its friction cone, and which way the tip slides.
+"""The friction cone of a tip: how its force leaves it, and which way the tip slides.
 
 Where the direction turns, the tip is dragged behind its base on a line of the cone's radius: a
 tractrix, tan(theta/2) = tan(theta0/2) exp(-s / rho). That is exact for linear springs also while

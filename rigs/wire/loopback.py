@@ -105,7 +105,7 @@ class Loopback:
         return sink
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """What really happened after these moments of the arm controller's clock."""
+        """The truth of a trial after these moments of the arm controller's clock."""
         found: dict[str, Any] = self._ask("truth", reference_arm_ns, hold_arm_ns)
         return found
 

@@ -182,7 +182,7 @@ class Theatre:
         self._stamps_us.clear()
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """What really happened after these moments of the clock that the arm's times are told by.
+        """The truth of a trial after these moments of the clock that the arm's times are told by.
 
         See `rigs.mock.truth.truth_of`.
         """
