@@ -244,7 +244,7 @@ def is_steady(earlier, speed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def relaxed_speed(force, rise, before, after, steepness, slid_s, law):  # type: ignore[no-untyped-def]
+def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # type: ignore[no-untyped-def]
     """Speed of a tip that slid for `slid_s` seconds and whose earlier speeds tell nothing, mm/s.
 
     With x = (|f| / cone - 1) / strengthening the speed is weak (e^x - 1), and x' = a - b (e^x - 1)
@@ -254,12 +254,12 @@ def relaxed_speed(force, rise, before, after, steepness, slid_s, law):  # type: 
     Args:
         force, rise: size of the force, and by how much it rises if the tip does not slip, N.
         before, after: the cone's radii at both ends if it does not, N.
-        steepness: see `slide_step`.
+        cone, steepness: the cone's radius and steepness (see `slide_step`) on the way.
 
     Returns:
         the speed; negative: friction falls with the slip faster than the spring pulls.
     """
-    scale = 1.0 / (law.strengthening * 0.5 * (before + after))
+    scale = 1.0 / (law.strengthening * cone)
     over = max((force / before - 1.0) / law.strengthening, 0.0)
     a = (rise - (after - before) * force / before) * scale
     b = law.weak_mm_s * steepness * scale * slid_s

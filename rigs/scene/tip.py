@@ -227,6 +227,9 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
     if slid_s > 0.0:
         earlier_s = w[SLID_S, j] if keeps_on else 0.0
         quick, lag, slides = foreseen(slid_s, 1.0 / slid_s, earlier_s, w[SPEED, j], w[EARLIER, j])
+    if not keeps_on:
+        # it slips as far as its base moves from then on
+        slides = left * ((new_x - old_x) * unit_x + (new_y - old_y) * unit_y)
     ahead, aside, rest_x, rest_y, soft_x, soft_y = along_slip(
         new_x, new_y, old_x, old_y, branch_x, branch_y, w[TABLE + ACROSS, j] * maxwell * gain, damp,
         1.0 / h, swerve, unit_x, unit_y, quick, lag,
@@ -240,25 +243,36 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
         unknown = unknown and slows_down(
             w[SLID_S, j], w[SPEED, j], from_x, from_y, new_x - old_x, new_y - old_y, h, law
         )
-    if unknown:
-        first = np.sqrt(from_x * from_x + from_y * from_y)
-        grip, grip_slope = grip_at(field, i, path)
-        _, _, _, _, steepness = slide_step(
-            0.0, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
-            shortening, compliance, grip, grip_slope, 0.0, law.weak_mm_s,
-        )  # fmt: skip
-        speed = relaxed_speed(first, size - first, before, after, steepness, slid_s, law)
-        quick, lag = (0.0, speed) if speed >= 0.0 else (quick, lag)
-    found, hopeful, tried = False, True, 0
-    while not found and hopeful and tried < PASSES:
-        grip, grip_slope = grip_at(field, i, path + slip)
-        grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
-        slip, bend, found, hopeful, _ = slide_step(
-            slip, bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
-            shortening, compliance, grip, grip_slope, quick, law.weak_mm_s,
-        )  # fmt: skip
-        found = found and hopeful
-        tried += 1
+    first = np.sqrt(from_x * from_x + from_y * from_y)
+    at_slip, at_bend, cone = 0.0, bent, 0.5 * (before + after)
+    more = first / before if unknown else 1.0
+    found = False
+    # a tip that lets go is soon where its slip ends: its speed follows from how it is there
+    for _ in range(2 if unknown and not keeps_on else 1):
+        if unknown:
+            grip, grip_slope = grip_at(field, i, path + at_slip)
+            _, _, _, _, steepness = slide_step(
+                at_slip, at_bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along,
+                bending, shortening, compliance, grip * more, grip_slope * more, 0.0, law.weak_mm_s,
+            )  # fmt: skip
+            speed = relaxed_speed(first, size - first, before, after, cone, steepness, slid_s, law)
+            quick, lag = (0.0, speed) if speed >= 0.0 else (quick, lag)
+        found, hopeful, tried = False, True, 0
+        while not found and hopeful and tried < PASSES:
+            grip, grip_slope = grip_at(field, i, path + slip)
+            grip, grip_slope = strengthened(grip, grip_slope, slip, quick, lag, law)
+            slip, bend, found, hopeful, _ = slide_step(
+                slip, bend, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,
+                shortening, compliance, grip, grip_slope, quick, law.weak_mm_s,
+            )  # fmt: skip
+            found = found and hopeful
+            tried += 1
+        if not found:
+            break
+        _, normal, _, _ = column(bend, bending, shortening, pressed, along)
+        grip, _ = grip_at(field, i, path + slip)
+        more, _ = strengthened(1.0, 0.0, slip, quick, lag, law)
+        at_slip, at_bend, cone = slip, bend, grip * normal
     if not found or slip > far:
         slip, bend = slid_surely(
             bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, along, bending,

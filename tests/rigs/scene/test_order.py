@@ -21,6 +21,9 @@ SWITCHES: dict[str, dict[str, float]] = {
 }
 FLOOR_N = 3e-7
 """Below this errors are those of single events, which fall as it happens."""
+JUMP_N = 2e-5
+"""The same where static friction exceeds kinetic by so much that a tip is ten million times too
+fast for it when it lets go: in that one step its speed is right to a percent."""
 
 
 def turn(angle_deg: float, speed: float, first: float = 3.0, second: float = 2.0) -> list[Leg]:
@@ -66,9 +69,12 @@ def errors(
     return misses, slips, len(true.slips)
 
 
-def assert_second_order(misses: list[float], parts: tuple[int, ...], bound_n: float) -> None:
+def assert_second_order(
+    misses: list[float], parts: tuple[int, ...], bound_n: float, switch: str
+) -> None:
     """Stay below a bound that falls as the square of the step."""
-    assert misses == [pytest.approx(0.0, abs=max(bound_n / p**2, FLOOR_N)) for p in parts]
+    floor = JUMP_N if switch == "much static" else FLOOR_N
+    assert misses == [pytest.approx(0.0, abs=max(bound_n / p**2, floor)) for p in parts]
 
 
 @pytest.mark.parametrize(
@@ -76,7 +82,7 @@ def assert_second_order(misses: list[float], parts: tuple[int, ...], bound_n: fl
     [
         (2, "none", 60, 1.0), (3, "relaxation", 90, 1.0), (3, "no static", 90, 1.0),
         (3, "no static", 30, 1.0), (3, "all", 150, 4.0), (3, "static", 110, 1.0),
-        (3, "strengthening", 180, 3.0),
+        (3, "strengthening", 180, 3.0), (3, "much static", 90, 1.0),
     ],
 )  # fmt: skip
 def test_a_turn_is_of_second_order_in_the_step(
@@ -85,7 +91,7 @@ def test_a_turn_is_of_second_order_in_the_step(
     parts = (1, 4, 16)
     misses, slips, true = errors(level, switch, turn(angle_deg, speed), 8e-3, parts)
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=5e-4)
+    assert_second_order(misses, parts, 5e-4, switch)
 
 
 @pytest.mark.parametrize("switch", ["none", "all"])
@@ -94,7 +100,7 @@ def test_a_tremor_lets_go_as_often_as_it_does_and_is_of_second_order(switch: str
     misses, slips, true = errors(3, switch, tremor(2.0, 1.2), 4e-3, parts, tip=1, depth=2.0)
     assert true > 3
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=8e-4)
+    assert_second_order(misses, parts, 8e-4, switch)
 
 
 @pytest.mark.long
@@ -107,16 +113,10 @@ def test_turns_at_every_level_speed_and_switch(
     level: int, switch: str, angle_deg: float, speed: float
 ) -> None:
     parts = (1, 2, 4, 16)
-    if switch == "much static":
-        # a tip that lets go is 10^7 times too fast for friction at first: no step resolves that
-        misses, slips, true = errors(level, switch, turn(angle_deg, speed), 4e-3, parts)
-        assert slips == [true] * len(parts)
-        assert max(misses) < 1.5e-4
-        return
     h = {0.1: 32e-3, 1.0: 8e-3, 4.0: 4e-3, 10.0: 2e-3}[speed]
     misses, slips, true = errors(level, switch, turn(angle_deg, speed), h, parts)
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=2e-3)
+    assert_second_order(misses, parts, 2e-3, switch)
 
 
 @pytest.mark.parametrize("speed", [1e3, 1e6, 1e9])
@@ -137,4 +137,4 @@ def test_tremors_with_every_switch(switch: str, tip: int) -> None:
     parts = (1, 2, 4, 16)
     misses, slips, true = errors(3, switch, tremor(2.0, 3.0), 4e-3, parts, tip=tip, depth=2.8)
     assert slips == [true] * len(parts)
-    assert_second_order(misses, parts, bound_n=2e-3)
+    assert_second_order(misses, parts, 2e-3, switch)
