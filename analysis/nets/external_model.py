@@ -200,13 +200,23 @@ class SinabsNet:
         return out
 
 
+class EntryError(ValueError):
+    """An entry of a state_dict that is missing, surplus, or not what its layer takes."""
+
+    def __init__(self, entry: str, tensor: torch.Tensor | None, expected: str) -> None:
+        super().__init__(expected)
+        self.entry = entry
+        self.shape = None if tensor is None else list(tensor.shape)
+
+
 def load_external(path: Path) -> ExternalModel:
     """Read a description (YAML or JSON) and the weights that it names, and check both.
 
     Nothing in the weights is executed.
 
     Raises:
-        InputError: file, key, value and what would be right.
+        InputError: file, key, value and what would be right; of an entry of the weights its name
+            and its shape.
     """
     description = load(Description, path, "description of a model")
     file = path.parent / description.weights
@@ -219,6 +229,8 @@ def load_external(path: Path) -> ExternalModel:
         _assemble(description, _tensors(data))
     except KeyedError as error:
         raise InputError(path, error.key, error.value, str(error)) from None
+    except EntryError as error:
+        raise InputError(file, error.entry, error.shape, str(error)) from None
     except ValueError as error:
         raise InputError(file, "", None, str(error)) from None
     return ExternalModel(description, data)
@@ -232,28 +244,88 @@ def _tensors(data: bytes) -> dict[str, torch.Tensor]:
         found = None
     if not isinstance(found, dict) or not all(isinstance(v, torch.Tensor) for v in found.values()):
         raise ValueError("must be a state_dict: save it by torch.save(net.state_dict(), FILE)")
-    return {
-        str(name): value.float()
+    tensors = {
+        str(name): value
         for name, value in found.items()
         if str(name).rpartition(".")[2] not in STATES
     }
+    for name, value in tensors.items():
+        kept = value.layout is torch.strided and value.device.type == "cpu"
+        if not kept or value.is_complex() or value.is_quantized:
+            raise EntryError(name, value, "must be a plain tensor of real numbers")
+    return {name: value.float() for name, value in tensors.items()}
+
+
+class _Entries:
+    """A state_dict of which each entry is taken once, by one layer."""
+
+    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
+        self._all = tensors
+        self._left = dict(tensors)
+
+    def weight(self, name: str, layer: str, dimensions: int) -> torch.Tensor:
+        """The weights of a layer, finite and of so many dimensions."""
+        entry = f"{name}.weight"
+        found = self.perhaps(entry)
+        if found is None:
+            fit = [key for key, value in self._left.items() if value.ndim == dimensions]
+            why = f"is taken twice, again by {layer}" if entry in self._all else (
+                f"is missing, and {layer} takes it"
+            )  # fmt: skip
+            raise EntryError(
+                entry, None,
+                f"{why}; entries of {dimensions} dimensions that no layer before it takes: "
+                f"{', '.join(sorted(fit)) or 'none'}",
+            )  # fmt: skip
+        if found.ndim != dimensions or not found.numel():
+            sizes = "(outputs, inputs)" if dimensions == 2 else "(outputs, inputs, height, width)"
+            raise EntryError(entry, found, f"{layer} takes weights of the shape {sizes}")
+        return found
+
+    def bias(self, name: str, weight: torch.Tensor) -> torch.Tensor | None:
+        """The biases of a layer, one for each of its outputs; None where it has none."""
+        found = self.perhaps(f"{name}.bias")
+        if found is not None and found.shape != weight.shape[:1]:
+            raise EntryError(
+                f"{name}.bias", found,
+                f"must have the shape {list(weight.shape[:1])}, one for each output of "
+                f"{name}.weight {list(weight.shape)}",
+            )  # fmt: skip
+        return found
+
+    def perhaps(self, entry: str) -> torch.Tensor | None:
+        """An entry if it is there, finite; nobody else gets it."""
+        found = self._left.pop(entry, None)
+        if found is not None and not found.isfinite().all():
+            wrong = int((~found.isfinite()).sum())
+            raise EntryError(
+                entry, found, f"{wrong} of its {found.numel()} values are NaN, infinite, or beyond "
+                "32-bit floats; all must be finite",
+            )  # fmt: skip
+        return found
+
+    def refuse_surplus(self) -> None:
+        """Check that every entry was taken."""
+        for entry, tensor in self._left.items():
+            more = f", nor {len(self._left) - 1} more" if len(self._left) > 1 else ""
+            raise EntryError(
+                entry, tensor, f"no layer of the description takes it{more}; describe the layer, "
+                "or leave the entry out of the file",
+            )  # fmt: skip
 
 
 def _assemble(description: Description, tensors: dict[str, torch.Tensor]) -> SinabsNet:
     """The layers in order, with every tensor used and every shape checked."""
     windows = description.windows
-    left = dict(tensors)
+    entries = _Entries(tensors)
     shape: tuple[int, ...] = (windows.channels, windows.cells, windows.cells)
     layers: list[nn.Module] = []
     for place, layer in enumerate(description.layers):
-        made = _module(layer, f"layers[{place}]", left, shape, windows.steps)
+        made = _module(layer, f"layers[{place}]", entries, shape, windows.steps)
         layers.append(made)
         with torch.no_grad():
             shape = tuple(made(torch.zeros(windows.steps, *shape)).shape[1:])
-    if left:
-        raise KeyedError(
-            "layers", next(iter(left)), "is a tensor of the weights that no layer here takes"
-        )
+    entries.refuse_surplus()
     if not isinstance(description.layers[-1], Neurons):
         raise KeyedError("layers", description.layers[-1].kind, "must end with neurons")
     if shape != (len(description.outputs),):
@@ -265,31 +337,32 @@ def _assemble(description: Description, tensors: dict[str, torch.Tensor]) -> Sin
 
 
 def _module(
-    layer: Layer, key: str, left: dict[str, torch.Tensor], shape: tuple[int, ...], steps: int
+    layer: Layer, key: str, entries: _Entries, shape: tuple[int, ...], steps: int
 ) -> nn.Module:
-    """One layer; the tensors that it takes are taken out of `left`."""
+    """One layer with its entries."""
     if isinstance(layer, Neurons):
-        return _neurons(layer, key, left, steps)
+        return _neurons(layer, key, entries, steps)
     if isinstance(layer, Flatten):
         return nn.Flatten()
     if isinstance(layer, Linear):
-        weight, bias = _weights(layer.name, key, left, 2)
+        weight = entries.weight(layer.name, key, 2)
         if shape != weight.shape[1:]:
-            raise KeyedError(
-                f"{key}.name", layer.name, _unfit(layer.name, weight, shape, "flatten before it")
-            )
+            hint = "; a flatten belongs before it" if len(shape) > 1 else ""
+            raise _unfit(layer.name, weight, f"{key} is given {list(shape)}{hint}")
+        bias = entries.bias(layer.name, weight)
         made: nn.Module = nn.Linear(weight.shape[1], weight.shape[0], bias=bias is not None)
         return _filled(made, weight, bias)
     if len(shape) != 3:
         raise KeyedError(f"{key}.kind", layer.kind, f"needs channels and cells, not {list(shape)}")
     if isinstance(layer, Conv):
-        weight, bias = _weights(layer.name, key, left, 4)
+        weight = entries.weight(layer.name, key, 4)
         if weight.shape[1] != shape[0]:
-            raise KeyedError(f"{key}.name", layer.name, _unfit(layer.name, weight, shape))
+            raise _unfit(layer.name, weight, f"{key} is given {shape[0]} channels, {list(shape)}")
         outer = min(shape[1:]) + 2 * layer.padding
         if max(weight.shape[2:]) > outer:
             raise KeyedError(f"{key}.padding", layer.padding, f"leaves {outer} cells for a kernel "
                              f"of {max(weight.shape[2:])}")  # fmt: skip
+        bias = entries.bias(layer.name, weight)
         made = nn.Conv2d(
             weight.shape[1], weight.shape[0], (weight.shape[2], weight.shape[3]),
             stride=layer.stride, padding=layer.padding, bias=bias is not None,
@@ -303,25 +376,9 @@ def _module(
     return (nn.AvgPool2d if layer.how == "average" else nn.MaxPool2d)(layer.size, stride)
 
 
-def _weights(
-    name: str, key: str, left: dict[str, torch.Tensor], dimensions: int
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Weight and bias of a layer, taken out of `left`."""
-    weight = left.pop(f"{name}.weight", None)
-    if weight is None or weight.ndim != dimensions:
-        there = sorted({k.rpartition(".")[0] for k, v in left.items() if v.ndim == dimensions})
-        raise KeyedError(
-            f"{key}.name", name, f"must name weights of {dimensions} dimensions: "
-            f"{', '.join(there) or 'there are none left'}",
-        )  # fmt: skip
-    if not weight.isfinite().all():
-        raise KeyedError(f"{key}.name", name, "its weights are not all finite")
-    return weight, left.pop(f"{name}.bias", None)
-
-
-def _unfit(name: str, weight: torch.Tensor, shape: tuple[int, ...], hint: str = "") -> str:
-    wanted = f"{name}.weight takes {weight.shape[1]} inputs, and here are {list(shape)}"
-    return f"{wanted}; {hint}" if hint and len(shape) > 1 else wanted
+def _unfit(name: str, weight: torch.Tensor, given: str) -> EntryError:
+    """Weights for another number of inputs than the layer before gives."""
+    return EntryError(f"{name}.weight", weight, f"takes {weight.shape[1]} inputs, but {given}")
 
 
 def _filled(made: Any, weight: torch.Tensor, bias: torch.Tensor | None) -> Any:
@@ -332,23 +389,26 @@ def _filled(made: Any, weight: torch.Tensor, bias: torch.Tensor | None) -> Any:
     return made
 
 
-def _neurons(layer: Neurons, key: str, left: dict[str, torch.Tensor], steps: int) -> nn.Module:
+def _neurons(layer: Neurons, key: str, entries: _Entries, steps: int) -> nn.Module:
     """Neurons with the parameters of the description, or those of the state_dict."""
 
-    def of(parameter: str, said: float | None, called: str) -> float | None:
-        kept = left.pop(f"{layer.name}.{parameter}", None) if layer.name else None
+    def of(parameter: str, said: float | None, called: str, *, positive: bool) -> float | None:
+        entry = f"{layer.name}.{parameter}"
+        kept = entries.perhaps(entry) if layer.name else None
         if kept is None:
             return said
         if kept.numel() != 1:
-            raise KeyedError(f"{key}.name", layer.name, f"{parameter} differs between neurons")
+            raise EntryError(entry, kept, f"must be one number for all neurons of {key}")
         value = float(kept)
+        if positive and value <= 0:
+            raise EntryError(entry, kept, f"is {value:g} and must be above zero")
         if said is not None and np.float32(said) != np.float32(value):
             raise KeyedError(f"{key}.{called}", said, f"the state_dict has {value:g}")
         return value
 
-    threshold = of("spike_threshold", layer.threshold, "threshold")
-    lowest = of("min_v_mem", layer.lowest, "lowest")
-    tau = of("tau_mem", layer.tau_mem, "tau_mem")
+    threshold = of("spike_threshold", layer.threshold, "threshold", positive=True)
+    lowest = of("min_v_mem", layer.lowest, "lowest", positive=False)
+    tau = of("tau_mem", layer.tau_mem, "tau_mem", positive=True)
     if threshold is None:
         raise KeyedError(f"{key}.threshold", None, "is missing, and the state_dict has none")
     if (tau is None) == (layer.kind == "lif"):

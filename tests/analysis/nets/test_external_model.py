@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -176,17 +177,27 @@ def _at(place: int, **changes: Any) -> Callable[[list[dict[str, Any]]], None]:
 WRONG: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] = {
     "no such weights": (
         _at(0, name="first"),
-        r"layers\[0\]\.name = first: must name weights of 4 dimensions: 0, 2",
+        r"lab\.pt: first\.weight: is missing, and layers\[0\] takes it; entries of 4 dimensions "
+        r"that no layer before it takes: 0\.weight, 2\.weight",
+    ),
+    "weights taken twice": (
+        _at(2, name="0"),
+        r"lab\.pt: 0\.weight: is taken twice, again by layers\[2\]; .*: 2\.weight",
     ),
     "a matrix for a convolution": (
         _at(2, name="5"),
-        r"layers\[2\]\.name = 5: must name weights of 4 dimensions: 2",
+        r"lab\.pt: 5\.weight = \[16, 216\]: layers\[2\] takes weights of the shape "
+        r"\(outputs, inputs, height, width\)",
     ),
     "stride forgotten": (
         _at(2, stride=1),
-        r"layers\[5\]\.name = 5: 5\.weight takes 216 inputs, and here are \[864\]",
+        r"lab\.pt: 5\.weight = \[16, 216\]: takes 216 inputs, but layers\[5\] is given \[864\]",
     ),
-    "flatten forgotten": (lambda x: x.pop(4), r"layers\[4\]\.name = 5: .*flatten before it"),
+    "flatten forgotten": (
+        lambda x: x.pop(4),
+        r"lab\.pt: 5\.weight = \[16, 216\]: takes 216 inputs, but layers\[4\] is given "
+        r"\[6, 6, 6\]; a flatten belongs before it",
+    ),
     "threshold missing": (
         _at(3, threshold=None),
         r"layers\[3\]\.threshold: is missing, and the state_dict has none",
@@ -201,7 +212,7 @@ WRONG: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] = {
     "spikes not said": (lambda x: x[1].pop("spikes"), r"layers\[1\]\.spikes: is missing"),
     "a layer left out": (
         lambda x: (x.pop(7), x.pop(7)),
-        r"layers = 7\.weight: is a tensor of the weights that no layer here takes",
+        r"lab\.pt: 7\.weight = \[3, 16\]: no layer of the description takes it, nor 2 more; desc",
     ),
 }
 
@@ -216,7 +227,61 @@ def test_faults_are_named(name: str, tmp_path: Path) -> None:
     if name == "threshold missing":
         state = {k: v for k, v in net.state_dict().items() if not k.startswith("3.")}
         torch.save(state, tmp_path / "lab.pt")
-    with pytest.raises(InputError, match=rf"lab\.yaml: {message}"):
+    where = "" if message.startswith("lab") else r"lab\.yaml: "
+    with pytest.raises(InputError, match=where + message):
+        load_external(path)
+
+
+NAN, INF = float("nan"), float("inf")
+ENTRIES: dict[str, tuple[str, torch.Tensor | None, str]] = {
+    "one bias for all": ("5.bias", torch.ones(1), r"= \[1\]: must have the shape \[16\], one "),
+    "biases of another layer": ("5.bias", torch.ones(3), r"= \[3\]: must have the shape \[16\]"),
+    "biases in a column": ("5.bias", torch.ones(16, 1), r"= \[16, 1\]: must have the shape \[16\]"),
+    "a bias without a shape": ("5.bias", torch.tensor(1.0), r"= \[\]: must have the shape \[16\]"),
+    "a bias that is NaN": (
+        "7.bias", torch.tensor([0, NAN, 1]), r"= \[3\]: 1 of its 3 values are NaN, infinite",
+    ),
+    "a bias too large": (
+        "7.bias", torch.tensor([0, 1e300, -INF], dtype=torch.float64), "2 of its 3 values",
+    ),
+    "a convolution's biases": ("2.bias", torch.ones(4), r"= \[4\]: must have the shape \[6\]"),
+    "a convolution's NaN": ("0.bias", torch.full((4,), NAN), "4 of its 4 values"),
+    "weights that are NaN": ("5.weight", torch.full((16, 216), NAN), r"= \[16, 216\]: 3456 of its"),
+    "weights that are infinite": ("0.weight", torch.full((4, 1, 5, 5), INF), "100 of its 100"),
+    "weights for two channels": (
+        "0.weight", torch.ones(4, 2, 5, 5),
+        r"= \[4, 2, 5, 5\]: takes 2 inputs, but layers\[0\] is given 1 channels, \[1, 12, 12\]",
+    ),
+    "a row of weights": (
+        "5.weight", torch.ones(216), r"= \[216\]: layers\[5\] takes .* \(outputs, inputs\)"
+    ),
+    "no outputs": ("5.weight", torch.ones(0, 216), r"= \[0, 216\]: layers\[5\] takes weights"),
+    "complex weights": (
+        "5.weight", torch.ones(16, 216, dtype=torch.complex64), "must be a plain tensor of real",
+    ),
+    "sparse weights": ("5.weight", torch.ones(16, 216).to_sparse(), "must be a plain tensor"),
+    "missing weights": ("5.weight", None, r": is missing, and layers\[5\] takes it; .*: 7\.w"),
+    "a surplus entry": ("9.weight", torch.ones(3, 3), r"= \[3, 3\]: no layer of the description"),
+    "a threshold that is NaN": ("1.spike_threshold", torch.tensor(NAN), "1 of its 1 values"),
+    "a threshold below zero": (
+        "1.spike_threshold", torch.tensor(-1.0), r"= \[\]: is -1 and must be above zero",
+    ),
+    "a threshold for each": (
+        "1.spike_threshold", torch.ones(4), r"= \[4\]: must be one number for all neurons",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_entries_are_checked(name: str, tmp_path: Path) -> None:
+    entry, value, message = ENTRIES[name]
+    path = saved(tmp_path, papers(0.1))
+    state = torch.load(tmp_path / "lab.pt", weights_only=True)
+    state.pop(entry, None)
+    if value is not None:
+        state[entry] = value
+    torch.save(state, tmp_path / "lab.pt")
+    with pytest.raises(InputError, match=rf"lab\.pt: {re.escape(entry)}.*{message}"):
         load_external(path)
 
 

@@ -147,7 +147,7 @@ def test_what_cannot_be_judged_is_refused(store: Store, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"lab\.pt: cannot be read"):
         judge_model(store, campaigns, tmp_path / "lab.pt")
     path = lab(tmp_path, windows={"length_ms": 30, "pool_px": 40})
-    with pytest.raises(InputError, match=r"lab\.yaml: layers\[5\]\.name = 5"):
+    with pytest.raises(InputError, match=r"lab\.pt: 5\.weight = \[16, 600\]: .* layers\[5\]"):
         judge_model(store, campaigns, path)
     path.unlink()
     with pytest.raises(InputError, match=r"needs a description beside it, such as lab\.yaml"):
