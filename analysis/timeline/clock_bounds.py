@@ -24,7 +24,7 @@ MIN_PAIRS = 3
 
 
 class BoundsContradictError(ValueError):
-    """No straight clock fits between the bounds: it jumped, or a bound is wrong."""
+    """No straight clock lies between the bounds: it jumped, or a bound is wrong."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,11 @@ def fit_bounds(
     if device.size < MIN_PAIRS:
         raise ValueError(f"{device.size} pairs of bounds; at least {MIN_PAIRS} are needed")
     if (low > high).any():
-        raise BoundsContradictError("an instant's earliest time lies after its latest one")
+        raise BoundsContradictError(
+            f"{int((low > high).sum())} of {device.size} instants have an earliest time after "
+            f"their latest, by {int((low - high).max()) / 1e3:g} us at most; none may: "
+            "check the delays in the rig file, and that nothing sets the host's clock"
+        )
     origin, image = int(device.min()), int(low[0])
     x = (device - origin).astype(np.float64) * 1e-9
     least = (low - image - (device - origin)).astype(np.float64) * 1e-3
@@ -92,8 +96,10 @@ def fit_bounds(
             )
             if found.status != 0:
                 raise BoundsContradictError(
-                    "no clock that runs straight lies between the bounds: it jumped, it drifts by "
-                    f"more than {max_drift_ppm:g} ppm, or a message took longer than is allowed"
+                    f"no clock that drifts by at most {max_drift_ppm:g} ppm lies between the "
+                    f"bounds of all {device.size} instants: it jumped, or a message took longer "
+                    "than the rig file says; let nothing set a clock, or raise drift_ppm or the "
+                    "longest delay"
                 )
             ends.append(sign * float(found.fun))
         ranges.append((0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])))

@@ -48,7 +48,7 @@ _CHANCE = 1e-4
 """Share of straight clocks with locked stamps that are taken for bent."""
 _KNOT = 3.5
 """A drift that changes by so many standard deviations gets a knot."""
-_STEP, _STEP_AT_END = 5.5, 4.5
+STEP, STEP_AT_END = 5.5, 4.5
 """A clock has jumped where a step stands out by so many, among thousands of places or at an end."""
 _MORE_LIKELY, _MORE = 12.0, 1.1
 """By how much and by what share more of the squares a step must explain than a change of drift: of
@@ -56,6 +56,11 @@ a clock that bends smoothly a step explains less than a bend does, of one that j
 much in the median over the places of the jump."""
 _DOUBT, _DOUBT_AT_END = 4.0, 3.0
 """A step of so many may be one: what it would do is added to the uncertainty."""
+_CLIP = 3.0
+"""Residuals at an end count up to so many standard deviations."""
+_TAIL = 10
+"""So many pulses at an end are left out at the most, late ones among them: less than half a second
+at 100 ticks a second."""
 _DRAWS = 2048
 _SLOPES = 81
 _UNITS = 0.6
@@ -71,11 +76,11 @@ def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
     half = x.size // 2
     run = x[half : 2 * half] - x[:half]
     far = run > 0
-    gained = y[half : 2 * half] - y[:half]
+    rise = y[half : 2 * half] - y[:half]
     if far.all():
-        slope = median(gained / run) if half else 0.0
+        slope = median(rise / run) if half else 0.0
     else:
-        slope = median(gained[far] / run[far]) if far.any() else 0.0
+        slope = median(rise[far] / run[far]) if far.any() else 0.0
     return slope, median(y - slope * x)
 
 
@@ -93,6 +98,8 @@ class ClockLine:
             bends, ns.
         jump: by how much the clock jumped somewhere, ns; 0 if it did not.
         straightened: whether what is left over looks like chance.
+        aside: how many pieces at the begin and at the end follow pulses that nothing vouches for;
+            uncertainty, slopes and sudden are of the others.
     """
 
     knots: Floats
@@ -104,6 +111,12 @@ class ClockLine:
     sudden: float
     jump: float
     straightened: bool
+    aside: tuple[int, int] = (0, 0)
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """From where to where pulses may vouch for the line, ns."""
+        return float(self.knots[self.aside[0]]), float(self.knots[-1 - self.aside[1]])
 
     @cached_property
     def residual_p95(self) -> float:
@@ -112,9 +125,9 @@ class ClockLine:
 
     @cached_property
     def slopes(self) -> Floats:
-        """Slope of each piece, (k,)."""
-        result: Floats = np.diff(self.values) / np.diff(self.knots)
-        return result
+        """Slope of each piece."""
+        every: Floats = np.diff(self.values) / np.diff(self.knots)
+        return every[self.aside[0] : every.size - self.aside[1]]
 
 
 def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> ClockLine:
@@ -132,8 +145,9 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
     rough = y - slope * x - level
     # scatter between neighbours is free of any bend
     local = max(1.4826 * median(np.abs(rough[1:] - rough[:-1])) / 2**0.5, floor)
-    knots = x[[0, -1]]
+    knots, all_x, all_y = x[[0, -1]], x, y
     values, moved = slope * knots + level, True
+    left_out = 0
     while True:
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _ROUGHLY)
         noise = min(local, sigma)
@@ -146,6 +160,19 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         else:
             straight = found.knot < _KNOT
         pieces = knots.size - 1
+        tail = min(found.tail_at, x.size - found.tail_at)
+        doubtful = found.tail > max(_DOUBT_AT_END, 0.0 if straight else found.knot)
+        doubtful = doubtful and found.knot < STEP and not (step or locked)
+        if doubtful and left_out < 2 and tail <= min(_TAIL, x.size // 4):
+            # a jump, a bend or chance: what would tell comes after the end
+            left_out += 1
+            behind = found.tail_at
+            stays = slice(behind, None) if 2 * behind < x.size else slice(behind)
+            x, y = x[stays], y[stays]
+            before = knots
+            knots = np.concatenate([x[:1], knots[(knots > x[0]) & (knots < x[-1])], x[-1:]])
+            values = np.interp(knots, before, values)
+            continue
         if straight or (step and moved):
             break
         before = knots
@@ -164,9 +191,41 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         values, knots = np.interp(finer, knots, values), finer
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
     line = _judged(x, knots, at, values, residuals, inside, sigma, resolution, bend_per_ns)
-    return replace(
+    line = replace(
         line, uncertainty=line.uncertainty + _doubt(found), jump=step, straightened=bool(straight)
     )
+    return _followed(line, all_x, all_y) if left_out else line
+
+
+def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
+    """The line with a piece more over the pulses that were left out, which nobody vouches for."""
+    (knots, values), aside = (line.knots, line.values), [0, 0]
+    for end in (0, -1):
+        away = x - line.knots[end]
+        rest = y - gained(x, line.knots, line.values)
+        left = (away > 0 if end else away < 0) & (np.abs(rest) <= _GATE * line.sigma)
+        square = float((away[left] ** 2).sum())
+        top = float((away[left] * rest[left]).sum())
+        # chance alone turns a line by little
+        if abs(top) > _KNOT * line.sigma * square**0.5:
+            aside[end], turn = 1, top / square
+            value = gained(x[[end]], line.knots, line.values) + turn * away[end]
+            order = slice(None, None, -1 if end else 1)
+            knots = np.concatenate((x[[end]], knots)[order])
+            values = np.concatenate((value, values)[order])
+    residuals: Floats = y - gained(x, knots, values)
+    inside: Bools = np.abs(residuals) <= _GATE * line.sigma
+    return replace(
+        line, knots=knots, values=values, residuals=residuals, inside=inside,
+        aside=(aside[0], aside[1]),
+    )  # fmt: skip
+
+
+def gained(x: Floats, knots: Floats, values: Floats) -> Floats:
+    """The line at x; beyond its ends it goes on straight."""
+    piece, share = places_of(x, knots)
+    result: Floats = -residuals_at(piece, share, np.zeros(x.size), values)
+    return result
 
 
 def _cut(x: Floats, knots: Floats) -> Floats:
@@ -188,6 +247,8 @@ class _Changes:
     knot, knot_at: a change of the drift, and its pulse.
     step, step_size: a step, and its size in ns.
     end, end_size: the same within some pulses of an end.
+    tail, tail_size, tail_at: the mean of some pulses at an end, for which large residuals count
+        as they are; and the first pulse behind that step.
     """
 
     knot: float
@@ -196,6 +257,9 @@ class _Changes:
     step_size: float
     end: float
     end_size: float
+    tail: float
+    tail_size: float
+    tail_at: int
 
 
 def _changes(
@@ -207,18 +271,22 @@ def _changes(
     matrix = normal_equations(piece, share, np.zeros(x.size), rest, gate, limit, knots.size)[0]
     found = changes(
         (x - x[0]) / (x[-1] - x[0]), piece, share, rest, gate, limit,
+        _CLIP * noise,
         np.linalg.inv(_held(matrix)), max(1, x.size * knots.size**2 // 60_000), _PIECE_PULSES // 2,
     )  # fmt: skip
-    knot, at, step, step_size, end, end_size = found
-    return _Changes(knot / noise, int(at), step / noise, step_size, end / noise, end_size)
+    knot, at, step, step_size, end, end_size, tail, tail_size, tail_at = found
+    return _Changes(
+        knot / noise, int(at), step / noise, step_size, end / noise, end_size,
+        tail / noise, tail_size, int(tail_at),
+    )  # fmt: skip
 
 
 def _jump(found: _Changes, hidden: float) -> float:
     """The size of a step that is none by chance, no change of the drift, and not hidden; else 0."""
     bent = max(found.knot**2 + _MORE_LIKELY, _MORE * found.knot**2)
-    if found.step**2 > max(_STEP**2, bent) and abs(found.step_size) > hidden:
+    if found.step**2 > max(STEP**2, bent) and abs(found.step_size) > hidden:
         return found.step_size
-    if found.end**2 > max(_STEP_AT_END**2, bent) and abs(found.end_size) > hidden:
+    if found.end**2 > max(STEP_AT_END**2, bent) and abs(found.end_size) > hidden:
         return found.end_size
     return 0.0
 

@@ -18,9 +18,23 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.timeline.clock_line import ClockLine, fit_line, line_within_unit
+from analysis.timeline.clock_line import (
+    STEP,
+    STEP_AT_END,
+    ClockLine,
+    fit_line,
+    gained,
+    line_within_unit,
+)
 from analysis.timeline.pulse_kernels import median
-from analysis.timeline.pulse_match import MIN_PULSES, Match, NoMatchError, match_trains, tick_of
+from analysis.timeline.pulse_match import (
+    MIN_PULSES,
+    WIRED,
+    Match,
+    NoMatchError,
+    match_trains,
+    tick_of,
+)
 from analysis.timeline.pulse_runs import stray_stretch, unevenness
 from storage.clockmap import ClockMap
 
@@ -42,8 +56,11 @@ UNEVEN = 3.5
 """Standard deviations between the shares of pulses that fit before and after some time."""
 MIN_EITHER = 0.75
 """Both trains lost many pulses where less than this share of each fits."""
-UNVOUCHED = 2
-"""A clock that jumps at the last two pulses cannot be told from two late ones."""
+UNVOUCHED = 3
+"""A clock that jumps at the last two pulses cannot be told from two late ones, and a second report
+of one of three may stand where that pulse belongs."""
+UNDISTURBED = "let nothing set or restart a clock during a trial, and take it again"
+SAME_TRIAL = "check that both recordings are of the same trial, and the cable of the sync line"
 BEND_PPM_S = 2.0
 """By how much a clock's drift may change in a second without being taken for a jump; a crystal that
 warms up by 10 K in a minute makes 0.4."""
@@ -152,7 +169,7 @@ def fit_clock(
         for name, times in (("device", device_ns), ("reference", reference_ns)):
             back_ns = -int(np.diff(np.asarray(times)).min(initial=0))
             if back_ns > jitter_ns:
-                raise ClockRefused("residuals", f"the {name} clock jumps back by {back_ns / 1e9} s")
+                raise _fell_back(name, back_ns, jitter_ns)
     # differences to a pulse of each train; float64 holds them exactly up to 104 days
     device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
     shift = {"down": 0.5, "up": -0.5, "nearest": 0.0}[rounding] * resolution_ns
@@ -183,16 +200,10 @@ def fit_clock(
     i, j = match.device[inside], match.reference[inside]
     stray = stray_stretch(predicted, y, i, j, 5 * line.sigma)
     if stray is not None:
-        raise ClockRefused("residuals", f"{stray}: a clock jumped, or began to drift otherwise")
-    shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
-    uneven = max(shares) < MIN_EITHER and min(unevenness(i), unevenness(j)) > UNEVEN
-    if uneven or (max(shares) < MIN_EITHER and i.size < MIN_LOSSY):
         raise ClockRefused(
-            "no_match",
-            f"only {shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses "
-            f"fit (at least {MIN_EITHER:.0%} of one of them, or {MIN_LOSSY} pulses, and as many "
-            "early as late): a clock jumped, or not these pulses",
+            "residuals", f"{stray}: a clock jumped, or its drift changed at once; {UNDISTURBED}"
         )
+    _gate_lossy(i, j)
     return _fit(match, line, x, y, device_0, reference_0)
 
 
@@ -215,11 +226,13 @@ def _fit(
             [device_0 + int(knot) for knot in knots], [reference_0 + int(image) for image in images]
         )
     # what lies at the edge of chance does not vouch for what comes before it
-    seen = px[inside & (np.abs(line.residuals) <= 3 * line.sigma)]
+    begin, end = line.span
+    vouched = (px >= begin) & (px <= end)
+    seen = px[inside & vouched & (np.abs(line.residuals) <= 3 * line.sigma)]
     first, last = device_0 + int(seen[UNVOUCHED]), device_0 + int(seen[-1 - UNVOUCHED])
     in_span = (y >= py.min()) & (y <= py.max())
     middle_ns = (first + last) // 2
-    gained = np.interp(px[inside], line.knots, line.values)
+    ahead = gained(px[inside], line.knots, line.values)
     apart = px[inside] - px[inside].mean()
     return ClockFit(
         map=clock,
@@ -231,7 +244,7 @@ def _fit(
         residual_p95_ns=line.residual_p95,
         residual_max_ns=float(residuals.max()),
         offset_ns=clock.to_reference(middle_ns) - middle_ns,
-        drift_ppm=float((apart * gained).sum() / (apart**2).sum()) * 1e6,
+        drift_ppm=float((apart * ahead).sum() / (apart**2).sum()) * 1e6,
         uncertainty_ns=line.uncertainty,
         peak_ratio=match.peak_ratio,
         first_ns=first,
@@ -249,7 +262,8 @@ def _train(times: Ints, name: str) -> Ints:
         raise ValueError(f"{name} pulse times must be 1-D, not {array.shape}")
     if array.size < MIN_PULSES:
         raise ClockRefused(
-            "too_few_pulses", f"{array.size} {name} pulses; at least {MIN_PULSES} are needed"
+            "too_few_pulses",
+            f"the {name} has {array.size} pulses; at least {MIN_PULSES} are needed: {WIRED}",
         )
     return np.sort(array.astype(np.int64))
 
@@ -262,12 +276,8 @@ def _differences(times: Ints, origin: int) -> Floats:
 
 
 def _extended(line: ClockLine, x: Floats) -> Floats:
-    """x on the reference clock by the line, which goes on straight beyond its ends."""
-    slopes = line.slopes
-    gained = np.interp(x, line.knots, line.values)
-    gained += slopes[0] * np.minimum(x - line.knots[0], 0.0)
-    gained += slopes[-1] * np.maximum(x - line.knots[-1], 0.0)
-    result: Floats = x + gained
+    """x on the reference clock by the line."""
+    result: Floats = x + gained(x, line.knots, line.values)
     return result
 
 
@@ -276,7 +286,8 @@ def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
     matched = int(match.device.size)
     if matched < MIN_PULSES:
         raise ClockRefused(
-            "too_few_pulses", f"{matched} pulses found a partner; at least {MIN_PULSES} are needed"
+            "too_few_pulses",
+            f"{matched} pulses match; at least {MIN_PULSES} are needed: {WIRED}",
         )
     px, py = x[match.device], y[match.reference]
     lag = median(py - px)
@@ -288,9 +299,9 @@ def _gate_share(x: Floats, y: Floats, match: Match, tick: float) -> None:
     if share < MIN_MATCHED and (matched < MIN_LOSSY or share < MIN_LIFT * by_chance):
         raise ClockRefused(
             "no_match",
-            f"only {share:.0%} of the pulses have a partner (at least {MIN_MATCHED:.0%}, or "
-            f"{MIN_LIFT:g} times the {by_chance:.0%} of a wrong place and {MIN_LOSSY} pulses); "
-            f"{in_x} device and {in_y} reference pulses overlap",
+            f"{share:.0%} of the pulses match where the {in_x} of the device and the {in_y} of the "
+            f"reference overlap; at least {MIN_MATCHED:.0%} must, or {MIN_LIFT * by_chance:.0%} "
+            f"(chance gives {by_chance:.0%}) if {MIN_LOSSY} pulses match: {SAME_TRIAL}",
         )
 
 
@@ -302,8 +313,30 @@ def _gate_staggered(predicted: Floats, y: Floats, tick: float) -> None:
     if foreign > MOST_STAGGERED:
         raise ClockRefused(
             "no_match",
-            f"{foreign} pulses or more at one end are the device's alone and as many at the other "
-            "the reference's: two trials whose codes are the same where they overlap",
+            f"only the device has {foreign} pulses or more at one end, and only the reference as "
+            f"many at the other (at most {MOST_STAGGERED}): they are of two trials whose codes "
+            f"share a stretch; {SAME_TRIAL}",
+        )
+
+
+def _gate_lossy(i: Ints, j: Ints) -> None:
+    """Refuse trains that both lost many pulses and match too little, or better at some time."""
+    shares = [index.size / (int(index[-1]) - int(index[0]) + 1) for index in (i, j)]
+    if max(shares) >= MIN_EITHER:
+        return
+    said = f"{shares[0]:.0%} of the device's and {shares[1]:.0%} of the reference's pulses match"
+    if i.size < MIN_LOSSY:
+        raise ClockRefused(
+            "no_match",
+            f"{said}; at least {MIN_EITHER:.0%} of either must, or {MIN_LOSSY} pulses, and these "
+            f"are {i.size}: {SAME_TRIAL}",
+        )
+    uneven = min(unevenness(i), unevenness(j))
+    if uneven > UNEVEN:
+        raise ClockRefused(
+            "no_match",
+            f"{said}, and the shares before and after some moment differ by {uneven:.1f} standard "
+            f"deviations (at most {UNEVEN:g}): a clock jumped by whole ticks; {UNDISTURBED}",
         )
 
 
@@ -314,33 +347,52 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
     if p95 > 3 * jitter_ns or line.inside.mean() < MIN_MATCHED:
         raise ClockRefused(
             "residuals",
-            f"95 % of the pulses lie within {p95 / 1e3:.1f} us of the line (at most "
-            f"{3 * jitter_ns / 1e3:.1f} are allowed) and {line.inside.mean():.0%} inside the gate",
+            f"{line.inside.mean():.0%} of the pulses lie on a line, 95 % of these within "
+            f"{p95 / 1e3:.1f} us; at least {MIN_MATCHED:.0%} within {3 * jitter_ns / 1e3:.1f} us "
+            "are needed: look for noise on the sync line, or raise the device's jitter_us",
         )
     if line.jump:
         raise ClockRefused(
-            "residuals", f"a clock jumped by {abs(line.jump) / 1e3:.1f} us, or pulses did"
+            "residuals",
+            f"a clock jumped by {abs(line.jump) / 1e3:.1f} us, which is above {STEP:g} standard "
+            f"deviations of chance ({STEP_AT_END:g} near an end): {UNDISTURBED}",
         )
     for first, second in ((0, 1), (-1, -2)):
         off = line.residuals[first], line.residuals[second]
         if not line.inside[[first, second]].any() and abs(off[0] - off[1]) <= 5 * line.sigma:
             raise ClockRefused(
                 "residuals",
-                f"the two pulses at one end lie off the line alike, by {off[0] / 1e3:.1f} us: a "
-                "clock jumped",
+                f"the {'first' if first == 0 else 'last'} two pulses lie {off[0] / 1e3:.1f} and "
+                f"{off[1] / 1e3:.1f} us off the line (at most {5 * line.sigma / 1e3:.1f} is "
+                f"jitter), by the same amount: a clock jumped; {UNDISTURBED}",
             )
     if line.sudden > 3 * jitter_ns:
         raise ClockRefused(
             "residuals",
             f"the drift changes so fast that the line may be wrong by {line.sudden / 1e3:.1f} us "
-            f"there (at most {3 * jitter_ns / 1e3:.1f}): a clock jumped",
+            f"there (at most {3 * jitter_ns / 1e3:.1f} us is allowed): {UNDISTURBED}",
         )
     if abs(steepest) > max_drift_ppm:
         raise ClockRefused(
-            "drift", f"the clocks differ by {steepest:.1f} ppm, more than {max_drift_ppm:g}"
+            "drift",
+            f"the clocks differ by {steepest:.1f} ppm; at most {max_drift_ppm:g} ppm are allowed: "
+            "raise drift_ppm of the device or of the sync box if their clocks are no better",
         )
     if not line.straightened:
-        raise ClockRefused("residuals", "what the line leaves over is not jitter: a clock jumped")
+        raise ClockRefused(
+            "residuals",
+            f"residuals about a line of {line.slopes.size} pieces, the most that are tried, are "
+            f"still larger than jitter: a clock jumped, or its drift wanders; {UNDISTURBED}",
+        )
+
+
+def _fell_back(name: str, back_ns: int, jitter_ns: float) -> ClockRefused:
+    """What to say of stamps that do not rise."""
+    return ClockRefused(
+        "residuals",
+        f"stamps of the {name} fall back by {back_ns / 1e9:g} s (at most {jitter_ns / 1e9:g} s is "
+        f"jitter): its clock was set or restarted; {UNDISTURBED}",
+    )
 
 
 def fit_numbered(
@@ -371,8 +423,10 @@ def fit_numbered(
         ClockRefused: with its `reason`.
     """
     device, reference = _train(device_ns, "device"), _train(reference_ns, "reference")
-    if (np.diff(device_ns) < 0).any() or (np.diff(reference_ns) < 0).any():
-        raise ClockRefused("residuals", "a clock jumps back")
+    for name, times in (("device", device_ns), ("reference", reference_ns)):
+        back_ns = -int(np.diff(times).min())
+        if back_ns > 0:
+            raise _fell_back(name, back_ns, 0.0)
     period = float(np.median(np.diff(reference)))
     steps = np.rint(np.diff(reference) / period).astype(np.int64)
     counted = np.concatenate([[0], np.cumsum(steps)])
@@ -382,8 +436,9 @@ def fit_numbered(
     if int(counted[-1]) != int(numbers[-1]):
         raise ClockRefused(
             "ambiguous",
-            f"the device counts {int(numbers[-1]) + 1} exposures and the box stamped "
-            f"{int(counted[-1]) + 1}: nobody knows which one is missing",
+            f"the device counted {int(numbers[-1]) + 1} exposures and the box stamped "
+            f"{int(counted[-1]) + 1}, so it cannot be told which is which: start the box before "
+            "the camera, stop it later, and check the exposure line",
         )
     _, i, j = np.intersect1d(numbers, counted, return_indices=True)
     device_0, reference_0 = int(device[device.size // 2]), int(reference[reference.size // 2])
@@ -391,7 +446,9 @@ def fit_numbered(
     x = _differences(device, device_0) + shift
     y = _differences(reference, reference_0) + 0.5 * reference_resolution_ns
     if x.size != device.size or y.size != reference.size:
-        raise ClockRefused("residuals", "stamps of another age among the exposures")
+        raise ClockRefused(
+            "residuals", "some exposures lie more than 52 days from the others: " + UNDISTURBED
+        )
     match = Match(i.astype(np.int64), j.astype(np.int64), 0.0)
     px, py = x[match.device], y[match.reference]
     unit = max(resolution_ns, reference_resolution_ns)

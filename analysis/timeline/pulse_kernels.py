@@ -207,7 +207,7 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # type: ignore[no-untyped-def]
+def changes(x, piece, share, residuals, gate, limit, clip, inverse, every, apart):  # type: ignore[no-untyped-def]
     """Test the residuals of a line with knots for a change of its slope, and for a step.
 
     Each is tried at pulse after pulse, beside all that the line may do by itself: what is left of
@@ -217,6 +217,7 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
         x: (n,) from 0 to 1, rising.
         piece, share: (n,) see `places_of`.
         residuals: (n,) those beyond `gate` have no weight, those beyond `limit` less than 1.
+        clip: at the ends residuals count as they are up to this, for there each says much.
         inverse: (k, k) of the matrix of `normal_equations`, with the same weights.
         every: pulses from one that is tried to the next, but near the ends.
         apart: pulses between a change of slope and the next knot at the least.
@@ -224,10 +225,12 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
     Returns:
         the largest change of slope over its standard deviation for residuals of size 1, and its
         pulse; the same of a step, and its size; the same of steps among the first and the last
-        32 pulses, which leave out 3 pulses or more.
+        32 pulses, which leave out 3 pulses or more; and of the mean of 3 to 8 pulses at an end,
+        with the first pulse behind that step.
     """
     n, k = x.size, inverse.shape[0]
     used = total = 0
+    all_weights = all_clipped = clipped = 0.0
     in_piece = np.zeros(k - 1, np.int64)
     # what the line would take away of the residuals with these weights
     taken = np.zeros(k)
@@ -236,14 +239,18 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
         if size <= gate:
             total += 1
             in_piece[piece[j]] += 1
-            weighted = min(1.0, limit / max(size, 1e-9)) * residuals[j]
+            weight = min(1.0, limit / max(size, 1e-9))
+            weighted = weight * residuals[j]
+            all_weights += weight
+            all_clipped += min(max(residuals[j], -clip), clip)
             taken[piece[j]] += weighted * (1.0 - share[j])
             taken[piece[j] + 1] += weighted * share[j]
     taken = inverse @ taken
     flat, rising = np.zeros(k), np.zeros(k)
     sum_0 = sum_1 = sum_2 = rest_0 = rest_1 = 0.0
     knot = step = step_size = end = end_size = 0.0
-    at = used_in_piece = 0
+    tail = tail_size = 0.0
+    at = tail_at = used_in_piece = 0
     for j in range(n - 1, -1, -1):
         size = abs(residuals[j])
         if size > gate:
@@ -259,6 +266,7 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
         sum_2 += weight * t * t
         rest_0 += weight * residuals[j]
         rest_1 += weight * residuals[j] * t
+        clipped += min(max(residuals[j], -clip), clip)
         used += 1
         used_in_piece = used_in_piece + 1 if j < n - 1 and piece[j + 1] == p else 1
         edge = min(used, total - used)
@@ -276,6 +284,14 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
                 step, step_size = high, rest / left
             if edge <= 32 and high > end:
                 end, end_size = high, rest / left
+            if edge <= 8:
+                at_end = used == edge
+                # the line has taken the rest of a step at an end
+                kept = edge * left / (sum_0 if at_end else all_weights - sum_0)
+                mean = clipped if at_end else clipped - all_clipped
+                high = abs(mean) / np.sqrt(kept)
+                if high > tail:
+                    tail, tail_size, tail_at = high, mean / kept, j
         if not whole or used_in_piece < apart or in_piece[p] - used_in_piece < apart:
             continue
         left, rest = sum_2 - 2.0 * t * sum_1 + t * t * sum_0, rest_1 - t * rest_0
@@ -288,7 +304,7 @@ def changes(x, piece, share, residuals, gate, limit, inverse, every, apart):  # 
             high = abs(rest) / np.sqrt(left)
             if high > knot:
                 knot, at = high, j
-    return knot, at, step, step_size, end, end_size
+    return knot, at, step, step_size, end, end_size, tail, tail_size, tail_at
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

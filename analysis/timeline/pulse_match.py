@@ -25,6 +25,9 @@ MIN_PULSES = 24
 MAX_PEAK_RATIO = 0.9
 """Second correlation peak over the first: about 0.6 to 0.75 for the code, near 1 when regular."""
 
+WIRED = "check the cable of the sync line, and that the recording is long enough"
+"""What to do where pulses are too few."""
+
 _PIECE_TICKS = 400
 _PIECES = 5
 _BINS_A_TICK = 4
@@ -95,7 +98,11 @@ def tick_of(reference: Ints) -> float:
     steps = np.diff(reference)
     tick = quantile(steps[steps > 0], 0.1) if (steps > 0).any() else 0.0
     if tick < 1_000:
-        raise NoMatchError("no_match", f"reference pulses {tick:.0f} ns apart are no pulse train")
+        raise NoMatchError(
+            "no_match",
+            f"pulses of the reference come {tick:.0f} ns apart; at least 1000 ns are needed: check "
+            "that these are the sync box's pulses, in ns",
+        )
     return tick
 
 
@@ -103,8 +110,9 @@ def _refuse_ambiguous(ratio: float) -> None:
     if ratio > MAX_PEAK_RATIO:
         raise NoMatchError(
             "ambiguous",
-            f"the train fits in more than one place: second peak {ratio:.3f} of the first "
-            f"(at most {MAX_PEAK_RATIO}); a regular train, or not these pulses",
+            f"the train fits in more than one place: the second best fits {ratio:.3f} times as "
+            f"well as the best (at most {MAX_PEAK_RATIO}): send a code (lfsr), and check that both "
+            "recordings are of the same trial",
         )
 
 
@@ -117,7 +125,10 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
     y_start = y[0]
     if y[-1] - y_start > _MAX_BINS * width:
         raise NoMatchError(
-            "no_match", "the reference pulses span hours: stray stamps, or many trials"
+            "no_match",
+            f"the reference's pulses span {(y[-1] - y_start) / 3.6e12:.1f} h (at most "
+            f"{_MAX_BINS * width / 3.6e12:.1f} h with such ticks): leave out stray stamps and "
+            "other trials",
         )
     y_bins = np.zeros(int((y[-1] - y_start) / width) + 1, np.float32)
     y_bins[((y - y_start) / width).astype(np.int64)] = 1.0
@@ -143,7 +154,9 @@ def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_
             break
     if not best:
         raise NoMatchError(
-            "too_few_pulses", f"no stretch of {length / 1e9:.1f} s holds {MIN_PULSES} pulses"
+            "too_few_pulses",
+            f"no stretch of {length / 1e9:.1f} s has the {MIN_PULSES} pulses that are needed: "
+            f"{WIRED}",
         )
     if len(best) == 1 or len(best) > _MAX_PLACES:
         _refuse_ambiguous(least)
@@ -217,12 +230,17 @@ def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
         if marks.size != 1:
             raise NoMatchError(
                 "ambiguous",
-                f"the {name} train is regular and shows {marks.size} start markers (a pulse with "
-                f"{silence / 1e9:g} s of silence after it), not one",
+                f"the regular train of the {name} has {marks.size} start markers (a pulse with "
+                f"{silence / 1e9:g} s of silence after it) and needs exactly one: record from "
+                "before the box starts, or send a code (lfsr)",
             )
         after = once[marks[0] + 1 :]
         if after.size < MIN_PULSES:
-            raise NoMatchError("too_few_pulses", f"{after.size} {name} pulses after the marker")
+            raise NoMatchError(
+                "too_few_pulses",
+                f"the {name} has {after.size} pulses after the start marker; at least {MIN_PULSES} "
+                f"are needed: {WIRED}",
+            )
         found.append((float(once[marks[0]]), float(np.median(np.diff(after)))))
     (begin_x, step_x), (begin_y, step_y) = found
     half = 0.5 * silence + MIN_PULSES * tick
@@ -283,7 +301,11 @@ def _first_line(x: Floats, y: Floats, place: _Place, tick: float) -> tuple[float
     start = fullest(np.sort(difference), window)
     chosen = (difference >= start) & (difference <= start + window)
     if chosen.sum() < MIN_PULSES // 2:
-        raise NoMatchError("no_match", "the trains fit nowhere")
+        raise NoMatchError(
+            "no_match",
+            f"{int(chosen.sum())} pulses match where the trains fit best; at least "
+            f"{MIN_PULSES // 2} are needed: check that both recordings are of the same trial",
+        )
     return theil_sen(u[which[chosen]], y[partner[chosen]] - piece[which[chosen]])
 
 

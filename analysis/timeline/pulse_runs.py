@@ -60,12 +60,16 @@ def stray_stretch(
     places = reference.size.bit_length()
     # between pulses on the line: those that both trains have there, and neither on the line
     both = np.minimum(_left_out(i, predicted.size), _left_out(j, reference.size))
+    off_line = f"lie off the line, by more than {slack_ns / 1e3:.1f} us"
     run = int(both[1:-1].max(initial=0))
-    if run > max(BURST, _limit(run, bad_device, bad_reference, places)):
-        return f"{run} pulses one after the other lie off the line"
+    most = max(BURST, _limit(run, bad_device, bad_reference, places))
+    if run > most:
+        return f"{run} pulses in a row {off_line} (at most {most} may)"
     run = int(max(both[0], both[-1]))
-    if run > max(BURST_AT_END, _limit(run, bad_device, bad_reference, 1)):
-        return f"the {run} pulses at one end lie off the line"
+    most = max(BURST_AT_END, _limit(run, bad_device, bad_reference, 1))
+    if run > most:
+        which = "first" if both[0] == run else "last"
+        return f"the {which} {run} pulses {off_line} (at most {most} may)"
     fits = np.zeros(reference.size + 1, np.int64)
     fits[j + 1] = 1
     fits = np.cumsum(fits)
@@ -78,9 +82,10 @@ def stray_stretch(
             if width > reference.size:
                 continue
             off = most_off(width, fits, low, high, at_ends)
-            if off > max(least, _limit(width, bad_device, bad_reference, log_places)):
-                where = "at one end" if at_ends else "one after the other"
-                return f"of {width} pulses {where} {off} lie off the line"
+            most = max(least, _limit(width, bad_device, bad_reference, log_places))
+            if off > most:
+                where = "at one end" if at_ends else "in a row"
+                return f"of {width} pulses {where} {off} {off_line} (at most {most} may)"
     return None
 
 

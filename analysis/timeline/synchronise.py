@@ -20,7 +20,13 @@ from analysis.timeline.clock_bounds import (
     BoundsContradictError,
     fit_bounds,
 )
-from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock, fit_numbered
+from analysis.timeline.clocks import (
+    UNDISTURBED,
+    ClockFit,
+    ClockRefused,
+    fit_clock,
+    fit_numbered,
+)
 from analysis.timeline.counters import split_at_restarts
 from protocols.timing import DeviceClock, Timing
 from storage.clockmap import ClockMap
@@ -29,7 +35,7 @@ from storage.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 
-VERSION = 2
+VERSION = 3
 """Of what fitting does; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
@@ -228,8 +234,9 @@ class _Pulses:
             ]
             raise ClockRefused(
                 "residuals",
-                f"its clock fell back {len(stretches) - 1} times: the device began anew, or its "
-                "clock was set; the trial is in pieces",
+                f"its clock fell back by more than {RESTART_NS / 1e6:g} ms, {len(stretches) - 1} "
+                f"times during the trial: the device restarted, or its clock was set; "
+                f"{UNDISTURBED}",
             )
         return self._fit(stamps, clock, grade)
 
@@ -321,7 +328,8 @@ def _box(streams: SyncStreams, timing: Timing) -> BoundedClock:
 def _bounded(reads: ClockReadings, drift_ppm: float, name: str) -> BoundedClock:
     if reads.device_ns.size < MIN_PAIRS:
         raise BoundsContradictError(
-            f"{reads.device_ns.size} {name}; at least {MIN_PAIRS} are needed"
+            f"{reads.device_ns.size} {name}; at least {MIN_PAIRS} are needed: record for longer, "
+            "and check that the device answers"
         )
     try:
         return fit_bounds(reads.device_ns, reads.before_ns, reads.after_ns, drift_ppm)

@@ -57,13 +57,13 @@ def test_messages_with_a_known_longest_delay() -> None:
 
 def test_contradictions_are_errors() -> None:
     device = np.arange(10, dtype=np.int64) * 10**9
-    with pytest.raises(BoundsContradictError, match="after its latest"):
+    with pytest.raises(BoundsContradictError, match=r"10 of 10 instants .* by 0\.001 us at most"):
         fit_bounds(device, device + 1, device, 100.0)
     jumped = device + np.where(device > 5 * 10**9, 10**8, 0)
     with pytest.raises(BoundsContradictError, match="jumped"):
         fit_bounds(device, jumped - 1000, jumped + 1000, 100.0)
     fast = device + device // 1000
-    with pytest.raises(BoundsContradictError, match="more than 100 ppm"):
+    with pytest.raises(BoundsContradictError, match="drifts by at most 100 ppm"):
         fit_bounds(device, fast - 1000, fast + 1000, 100.0)
     with pytest.raises(ValueError, match="at least 3"):
         fit_bounds(device[:2], device[:2], device[:2], 100.0)

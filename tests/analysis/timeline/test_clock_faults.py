@@ -108,11 +108,11 @@ def test_stretches_are_told_from_scattered_pulses() -> None:
     every = np.arange(200)
     assert stray_stretch(times, times, every, every, 1.0) is None
     for bad, said in (
-        (np.arange(50, 60), "10 pulses one after the other"),
-        (np.arange(197, 200), "the 3 pulses at one end"),
-        (np.arange(0, 3), "the 3 pulses at one end"),
-        (np.arange(60, 100, 2), "of 24 pulses one after the other 12"),
-        (np.array([186, 188, 191, 194, 197]), "of 16 pulses at one end"),
+        (np.arange(50, 60), "10 pulses in a row lie off the line, by more than 0.0 us (at most 9"),
+        (np.arange(197, 200), "the last 3 pulses lie off the line"),
+        (np.arange(0, 3), "the first 3 pulses lie off the line"),
+        (np.arange(60, 100, 2), "of 24 pulses in a row 12 lie off"),
+        (np.array([186, 188, 191, 194, 197]), "of 16 pulses at one end 5 lie off"),
     ):
         left = np.setdiff1d(every, bad)
         found = stray_stretch(times, times, left, left, 1.0)

@@ -182,7 +182,7 @@ def test_exposures_are_counted_on_both_sides() -> None:
     again = np.sort(np.append(np.delete(edges, 700), edges[900] + 40_000))
     assert fit_numbered(seen[kept], number[kept], again).pulses_seen >= kept.sum() - 2
     for lost in (edges[1:], edges[:-1], np.append(edges, edges[-1] + TICK_NS)):
-        with pytest.raises(ClockRefused, match="nobody knows which"):
+        with pytest.raises(ClockRefused, match=r"counted \d+ exposures and the box stamped"):
             fit_numbered(seen[kept], number[kept], lost)
-    with pytest.raises(ClockRefused, match="jumps back"):
+    with pytest.raises(ClockRefused, match=r"stamps of the device fall back by .* s"):
         fit_numbered(seen[::-1], number, edges)

@@ -108,32 +108,42 @@ def test_a_change_stands_out_as_least_squares_says(n: int) -> None:
     weights = np.where(np.abs(residuals) <= 9.0, np.minimum(1.0, 4.0 / np.abs(residuals)), 0.0)
     inverse = np.linalg.inv(basis.T * weights @ basis)
     piece, share = places_of(x, knots)
-    found = changes(x, piece, share, residuals, 9.0, 4.0, inverse, 1, 5)
+    found = changes(x, piece, share, residuals, 9.0, 4.0, 6.0, inverse, 1, 5)
+
+    def shown(column: Floats) -> Floats:
+        # what is left of a column beside the basis, with weights
+        return column - basis @ (inverse @ (basis.T @ (weights * column)))
 
     def high(column: Floats) -> tuple[float, float]:
-        # what is left of a column beside the basis, with weights
-        left = column - basis @ (inverse @ (basis.T @ (weights * column)))
+        left = shown(column)
         norm = float((weights * left**2).sum())
         top = float((weights * left * residuals).sum())
         return (abs(top) / norm**0.5, top / norm) if norm > 0.5 else (0.0, 0.0)
 
     used = weights > 0
-    steps, ends, bends = [], [], []
+    steps, ends, tails, bends = [], [], [], []
     for j in np.flatnonzero(used):
         edge = min(used[j:].sum(), used[:j].sum())
         beside = min((used & (piece == piece[j]) & later).sum() for later in (x >= x[j], x < x[j]))
         if edge >= 3:
             steps.append(high((x >= x[j]) * 1.0))
             ends += steps[-1:] if edge <= 32 else []
+        if 3 <= edge <= 8:
+            behind = used & ((x >= x[j]) if used[j:].sum() == edge else (x < x[j]))
+            # the share of a step of these pulses that the line does not take
+            kept = (weights * shown((x >= x[j]) * 1.0) ** 2).sum() / weights[behind].sum()
+            total = np.clip(residuals[behind], -6.0, 6.0).sum()
+            tails.append((abs(total) / (edge * kept) ** 0.5, abs(total / (edge * kept)), j))
         if edge >= 3 and beside >= 5:
             slope = np.maximum(x - x[j], 0.0)
-            left = slope - basis @ (inverse @ (basis.T @ (weights * slope)))
+            left = shown(slope)
             norm = (weights * left**2).sum()
             bends.append((abs((weights * left * residuals).sum()) / norm**0.5, j))
     assert found[0] == pytest.approx(max(bends)[0], rel=1e-6)
     assert found[1] == max(bends)[1]
     assert found[2:4] == pytest.approx(max(steps), rel=1e-9)
-    assert found[4:] == pytest.approx(max(ends), rel=1e-9)
+    assert found[4:6] == pytest.approx(max(ends), rel=1e-9)
+    assert (found[6], abs(found[7]), found[8]) == pytest.approx(max(tails), rel=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 3, 9])
