@@ -2,13 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DONE := .venv/.installed
+LINKS := build/lint
 
-.PHONY: setup demo test test-long lint docs bench clean
+.PHONY: setup demo test test-long lint links docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
 
-$(DONE): pyproject.toml constraints.txt
+$(DONE): pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $(DONE)
@@ -24,14 +25,21 @@ test: $(DONE)
 test-long: $(DONE)
 	$(BIN)/python -m pytest -m long
 
-lint: $(DONE)
+lint: $(DONE) links
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	cd $(LINKS) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
+
+# the packages as they are installed: tools that only look at files do not find them otherwise
+links:
+	rm -rf $(LINKS)
+	mkdir -p $(LINKS)/sliplab
+	ln -s $(CURDIR)/sliplab/* $(LINKS)/sliplab
+	ln -s $(addprefix $(CURDIR)/,protocols rigs storage analysis flows) $(LINKS)/sliplab
 
 # every link, anchor and page is looked at; nothing is fetched
-docs: $(DONE)
+docs: $(DONE) links
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 bench: $(DONE)

@@ -33,17 +33,17 @@ import numpy as np
 
 from benchmarks.measure import SEED, Figures, queued_s, resident_mb
 from benchmarks.storage import noisy_frames
-from rigs.cameras.basler import BaslerCamera, find_camera
-from rigs.cameras.dvxplorer import DvxplorerCamera
-from rigs.cameras.settings import BaslerSettings
-from rigs.scene.randomness import generator
-from rigs.wire.basler import LossyDevice, emulate, show, write_frames
-from rigs.wire.dvxplorer import DvxplorerServer, Packet
-from storage.files import sync_file
-from storage.hdf5 import StreamReader
-from storage.streams import U8, EventChunk, FrameChunk
-from storage.video import count_frames
-from storage.writer import DATA, FRAMES, SPOOL, TrialWriter
+from sliplab.rigs.cameras.basler import BaslerCamera, find_camera
+from sliplab.rigs.cameras.dvxplorer import DvxplorerCamera
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.wire.basler import LossyDevice, emulate, show, write_frames
+from sliplab.rigs.wire.dvxplorer import DvxplorerServer, Packet
+from sliplab.storage.files import sync_file
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.streams import U8, EventChunk, FrameChunk
+from sliplab.storage.video import count_frames
+from sliplab.storage.writer import DATA, FRAMES, SPOOL, TrialWriter
 
 RATE_HZ = 100
 EMULATED_HZ = 102

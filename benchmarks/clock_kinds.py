@@ -26,11 +26,11 @@ from statistics import median
 import numpy as np
 from scipy import special
 
-from analysis.timeline.clocks import ClockRefused, fit_clock
 from benchmarks.clocks import DRIFT_PPM, Train, make_train
 from benchmarks.measure import SEED, Figures
-from rigs.pulse_code import U8, code_bits
-from storage.streams import F64
+from sliplab.analysis.timeline.clocks import ClockRefused, fit_clock
+from sliplab.rigs.pulse_code import U8, code_bits
+from sliplab.storage.streams import F64
 
 FAR = 3.0
 """A fit is wrong whose error is so many times the stated uncertainty."""

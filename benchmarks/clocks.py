@@ -27,10 +27,10 @@ import numpy as np
 from pyxdf.pyxdf import _robust_fit
 from scipy import fft, optimize
 
-from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
 from benchmarks.measure import SEED, Figures, spread
-from rigs.pulse_code import SEEDS, U8, code_bits
-from storage.streams import F64, I64
+from sliplab.analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
+from sliplab.rigs.pulse_code import SEEDS, U8, code_bits
+from sliplab.storage.streams import F64, I64
 
 DAY_NS = 86_400 * 10**9
 WRONG_US = 100.0

@@ -15,12 +15,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigs.scene.contact import advance
-from rigs.scene.friction import friction_knots
-from rigs.scene.plate import advance_free
-from rigs.scene.skin import Skin, SkinGeometry, make_skin
-from rigs.scene.springs import Springs, Tips, make_springs, new_tips, track_width
-from storage.streams import F64, I64
+from sliplab.rigs.scene.contact import advance
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.plate import advance_free
+from sliplab.rigs.scene.skin import Skin, SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import Springs, Tips, make_springs, new_tips, track_width
+from sliplab.storage.streams import F64, I64
 
 DEPTH_MM, SECONDS = 2.8, 8.192
 STEPS_MS = (8.0, 2.0, 0.5)

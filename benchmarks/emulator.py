@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from rigs.scene.edges import CUT, level_at
-from rigs.scene.events import EventOptics, Events
-from storage.streams import F64
+from sliplab.rigs.scene.edges import CUT, level_at
+from sliplab.rigs.scene.events import EventOptics, Events
+from sliplab.storage.streams import F64
 
 FRAME_NS = 1_000_000
 SOURCE = "SLIPLAB_V2E"

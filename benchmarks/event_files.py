@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from storage.columns import EVENT_CHUNK
-from storage.streams import EventChunk
+from sliplab.storage.columns import EVENT_CHUNK
+from sliplab.storage.streams import EventChunk
 
 WIDTH, HEIGHT = 640, 480
 Lists = list[list[list[int]]]

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from flows.searching.scene_runs import changed, ideal
-from protocols import Plan, Trial
-from protocols.hashing import hash_integer
-from protocols.model import Protocol
-from protocols.plan import make_plan
-from rigs.build import build_rig
-from rigs.rig_file import RigFile, load_rig_file
-from storage.streams import Json, Unheeded
+from sliplab.flows.searching.scene_runs import changed, ideal
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.plan import make_plan
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.storage.streams import Json, Unheeded
 
 ROOT = Path(__file__).parents[1]
 

@@ -19,14 +19,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from analysis.labels.markers import MarkerTracks, track
-from analysis.labels.plate import VideoTracks, track_video
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
-from rigs.mock.settings import FrameCamera, MockSettings
-from rigs.mock.world import World
-from rigs.scene.frames import FrameOptics, PlateView
-from storage.streams import F64, U8
-from storage.video import VideoWriter, read_frames
+from sliplab.analysis.labels.markers import MarkerTracks, track
+from sliplab.analysis.labels.plate import VideoTracks, track_video
+from sliplab.rigs.mock.settings import FrameCamera, MockSettings
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.storage.streams import F64, U8
+from sliplab.storage.video import VideoWriter, read_frames
 
 _CV2: Any = cv2  # its stubs lack the blob detector
 RATE_HZ = 100

@@ -21,21 +21,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels.labelling import Label, label_places
-from analysis.labels.markers import MarkerTracker, Measured, stack_tracks
-from analysis.labels.places import from_tracks
-from analysis.labels.plate import PlatePose, PlateTracker, bridge
 from benchmarks.labels_summary import FRAME_MS, Checked, summary, tables, verdicts
 from benchmarks.measure import SEED, Figures
-from flows.searching.scene_runs import MOTION, changed, sample_trials, with_true_times
-from protocols import Plan, Trial
-from protocols.hashing import hash_integer
-from protocols.plan import load_plan
-from protocols.settings import Labelling
-from rigs.build import build_rig
-from rigs.mock.fault_settings import MarkerOccluded
-from rigs.rig_file import RigFile, load_rig_file
-from storage.streams import FrameChunk, Json
+from sliplab.analysis.labels.labelling import Label, label_places
+from sliplab.analysis.labels.markers import MarkerTracker, Measured, stack_tracks
+from sliplab.analysis.labels.places import from_tracks
+from sliplab.analysis.labels.plate import PlatePose, PlateTracker, bridge
+from sliplab.flows.searching.scene_runs import MOTION, changed, sample_trials, with_true_times
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.plan import load_plan
+from sliplab.protocols.settings import Labelling
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.mock.fault_settings import MarkerOccluded
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.storage.streams import FrameChunk, Json
 
 ROOT = Path(__file__).parents[1]
 F64 = npt.NDArray[np.float64]

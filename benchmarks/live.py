@@ -14,12 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from analysis.detect.live import LiveDetector
-from analysis.nets.spiking import Engine
 from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
 from benchmarks.slides import slide_events
-from protocols.settings import Detection, Windows
+from sliplab.analysis.detect.live import LiveDetector
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.protocols.settings import Detection, Windows
 
 PACKET_US = 5_000
 HOUR_S = 3600.0

@@ -20,8 +20,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from analysis.nets.dataset import SampleSet
-from analysis.nets.network import (
+from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
+from benchmarks.network_rivals import Rival, installed
+from benchmarks.slides import slide_events
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.network import (
     build,
     by_class,
     by_parameter,
@@ -31,15 +34,12 @@ from analysis.nets.network import (
     set_weights,
     spike_counts,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from analysis.nets.training import fit
-from analysis.nets.windows import bin_events, list_events
-from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
-from benchmarks.network_rivals import Rival, installed
-from benchmarks.slides import slide_events
-from protocols.settings import Network, Training, Windows
-from storage.streams import I64, U8, EventChunk
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.nets.training import fit
+from sliplab.analysis.nets.windows import bin_events, list_events
+from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.streams import I64, U8, EventChunk
 
 BATCH = 32
 ROUNDS = 3

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from analysis.nets.network import WEIGHTED, build, by_class
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.network import WEIGHTED, build, by_class
+from sliplab.protocols.settings import Network, Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]
 """Currents (n, steps, ...) to spikes of the same shape, from rest."""

@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks.catalogues import catalogue_figures
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, spread
 from benchmarks.start_up import startup_seconds
-from flows.running.orchestration import Parcel, begin, embedded, prepare, run
+from sliplab.flows.running.orchestration import Parcel, begin, embedded, prepare, run
 
 DRAIN_LIMIT_S = 120.0
 
@@ -65,7 +65,7 @@ def _flows() -> Any:
     from prefect import flow
     from prefect.runtime import flow_run
 
-    from flows.collecting.collect import take_trials
+    from sliplab.flows.collecting.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
     def collect(wanted: Parcel[tuple[range, int, Any]]) -> str:
@@ -86,7 +86,7 @@ def _flows() -> Any:
 
 
 def _compare(trials: int, runs: int) -> Figures:
-    from flows.collecting.collect import MOCK_BATCH
+    from sliplab.flows.collecting.collect import MOCK_BATCH
 
     collect, empty = _flows()
     every = range(trials)

@@ -17,18 +17,18 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels import labelling
-from analysis.nets import dataset, training
-from analysis.nets.network import build, weights
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
 from benchmarks.trials import stretch
-from flows.syncing.sync_fit import fit_again
-from protocols import load_plan
-from storage.manifest import of_trial
-from storage.push import Wishes, push
-from storage.recording import Recording
-from storage.remote import Remote
-from storage.store import Store
+from sliplab.analysis.labels import labelling
+from sliplab.analysis.nets import dataset, training
+from sliplab.analysis.nets.network import build, weights
+from sliplab.flows.syncing.sync_fit import fit_again
+from sliplab.protocols import load_plan
+from sliplab.storage.manifest import of_trial
+from sliplab.storage.push import Wishes, push
+from sliplab.storage.recording import Recording
+from sliplab.storage.remote import Remote
+from sliplab.storage.store import Store
 
 ROOT = Path(__file__).parent.parent
 

@@ -26,17 +26,17 @@ from typing import Any
 
 import numpy as np
 
-from analysis.statistics.scene_error import match_events
 from benchmarks.emulator import FRAME_NS, emulate, find_emulator
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
 from benchmarks.trials import stretch
-from rigs.mock.physics import springs_of
-from rigs.mock.settings import MockSettings
-from rigs.mock.skins import skin_of
-from rigs.scene.events import EventOptics, Events, MarkerSensor
-from rigs.scene.slides import run_slide
-from storage.streams import F64, I64, EventChunk
+from sliplab.analysis.statistics.scene_error import match_events
+from sliplab.rigs.mock.physics import springs_of
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.rigs.scene.slides import run_slide
+from sliplab.storage.streams import F64, I64, EventChunk
 
 TRIALS = 30
 """Random trials of the grid; the same for every run."""

@@ -10,10 +10,10 @@ from functools import cache
 import numpy as np
 
 from benchmarks.measure import SEED
-from rigs.capabilities import Segment
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import MockSettings
-from storage.streams import F64, I64, EventChunk
+from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.storage.streams import F64, I64, EventChunk
 
 DEPTH_MM, SPEED_MM_S, LENGTH_MM = 2.8, 1.0, 15.0
 HOLD_S, CHUNK_S = 2.0, 0.1

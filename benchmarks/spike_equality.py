@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from analysis.nets import model_file
-from analysis.nets.dataset import SampleSet
-from analysis.nets.network import exact, matrices, spike_counts
-from analysis.nets.training import engine, restore
+from sliplab.analysis.nets import model_file
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.network import exact, matrices, spike_counts
+from sliplab.analysis.nets.training import engine, restore
 
 PART = 2048
 

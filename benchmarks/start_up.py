@@ -52,7 +52,7 @@ def main() -> None:
 
         def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
             """As without it, but for the one module."""
-            if name != "rigs.mock.arm":
+            if name != "sliplab.rigs.mock.arm":
                 return None
             sys.meta_path.remove(self)
             found: Any = find_spec(name)
@@ -66,7 +66,7 @@ def main() -> None:
             return found
 
     sys.meta_path.insert(0, _Watch())
-    from flows.__main__ import main as command_line
+    from sliplab.flows.__main__ import main as command_line
 
     command_line()
 

@@ -16,12 +16,12 @@ import numpy as np
 from benchmarks.event_files import rivals
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import many_events
-from rigs.scene.frames import FrameOptics, PlateView
-from rigs.scene.randomness import generator
-from storage.exchange.aedat4 import Aedat4File
-from storage.hdf5 import StreamFile, StreamReader
-from storage.streams import U8, EventChunk
-from storage.video import VideoWriter, read_frames
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.exchange.aedat4 import Aedat4File
+from sliplab.storage.hdf5 import StreamFile, StreamReader
+from sliplab.storage.streams import U8, EventChunk
+from sliplab.storage.video import VideoWriter, read_frames
 
 CHUNK = 20_000
 WINDOW_US = 30_000

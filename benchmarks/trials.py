@@ -17,11 +17,11 @@ import numpy as np
 import yaml
 
 from benchmarks.measure import SEED, peak_mb
-from flows.collecting.session import Session
-from flows.planning.orders import describe_campaign, make_order
-from protocols import Trial
-from rigs.build import build_rig
-from storage.store import Store
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.protocols import Trial
+from sliplab.rigs.build import build_rig
+from sliplab.storage.store import Store
 
 ROOT = Path(__file__).parent.parent
 

@@ -18,13 +18,13 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from protocols import Plan, Trial
-from protocols.plan import load_plan
-from rigs.build import simulated_rig
-from rigs.levels import with_level
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.rig_file import load_rig_file
-from storage.streams import EventChunk, FrameChunk, Unheeded
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.build import simulated_rig
+from sliplab.rigs.levels import with_level
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.streams import EventChunk, FrameChunk, Unheeded
 
 ROOT = Path(__file__).parent.parent
 WINDOW_US = 30_000

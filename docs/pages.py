@@ -67,7 +67,7 @@ def decisions() -> str:
 
 def protocol_file() -> str:
     """Every key of a protocol file."""
-    from flows.planning.schema import file_schema
+    from sliplab.flows.planning.schema import file_schema
 
     schema = file_schema("protocol")
     return f"""# Protocol files
@@ -80,7 +80,7 @@ go together, and how an editor completes and checks them, by [its schema](../sch
 
 def rig_file() -> str:
     """Every key of a rig file."""
-    from flows.planning.schema import file_schema
+    from sliplab.flows.planning.schema import file_schema
 
     models = file_schema("rig")["definitions"]
     return f"""# Rig files
@@ -96,7 +96,7 @@ def commands() -> str:
     """The whole command line, as `--help` says it."""
     import typer
 
-    from flows.cli.app import app
+    from sliplab.flows.cli.app import app
 
     lines = [
         "# Commands",

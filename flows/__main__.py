@@ -11,7 +11,7 @@ import os
 import sys
 from contextlib import suppress
 
-from flows.running.limits import exhausted, run_in_child, too_few_threads
+from sliplab.flows.running.limits import exhausted, run_in_child, too_few_threads
 
 
 def main() -> None:
@@ -19,8 +19,8 @@ def main() -> None:
     if reason := too_few_threads() or run_in_child():
         sys.exit(_fail(reason, 1))
     try:
-        from flows.running import garbage
-        from flows.running.standard_streams import OutputLost, guarded
+        from sliplab.flows.running import garbage
+        from sliplab.flows.running.standard_streams import OutputLost, guarded
 
         garbage.seldom()
         try:
@@ -36,14 +36,14 @@ def main() -> None:
 
 
 def _run() -> int:
-    from flows.running import console, stopping
+    from sliplab.flows.running import console, stopping
 
     console.begin(as_json="--json" in sys.argv[1:])
     with stopping.signals():
-        from flows.cli import errors
+        from sliplab.flows.cli import errors
 
         try:
-            from flows.cli.app import app
+            from sliplab.flows.cli.app import app
 
             code = app(standalone_mode=False)
             if code == console.INTERRUPTED:
@@ -57,9 +57,9 @@ def _run() -> int:
 
 def _explain(error: Exception) -> int:
     """Say what ended the command; returns the exit code."""
-    from flows.cli import errors
-    from flows.running import stopping
-    from protocols.errors import InputError
+    from sliplab.flows.cli import errors
+    from sliplab.flows.running import stopping
+    from sliplab.protocols.errors import InputError
 
     if stopping.requested() and not (isinstance(error, InputError) or errors.is_arm_fault(error)):
         return errors.interruption().report()
@@ -71,7 +71,7 @@ def _fail(message: str, code: int) -> int:
     said = message if code == 130 else f"error: {message}"
     with suppress(OSError):
         os.write(2, f"{said}\n".encode(errors="backslashreplace"))
-    console = sys.modules.get("flows.running.console")
+    console = sys.modules.get("sliplab.flows.running.console")
     if "--json" in sys.argv[1:] and not (console and console.printed()):
         known = {"file": None, "key": None, "value": None, "message": message, "exit_code": code}
         with suppress(OSError):

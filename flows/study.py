@@ -10,21 +10,21 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from flows.collecting.collect import collect
-from flows.labelling import label_check
-from flows.labelling.label import label
-from flows.labelling.label_check import check_labels
-from flows.labelling.label_errors import CHECK
-from flows.learning.evaluate import evaluate
-from flows.learning.train import train
-from flows.planning.orders import Order
-from flows.reporting.report import report
-from flows.running.campaigns import collected
-from flows.searching.holdout import STEP, measure_holdout
-from flows.study_ledger import Ledger, Row
-from flows.study_searches import Search, training_windows
-from flows.syncing.sync import sync
-from storage.store import Store
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling import label_check
+from sliplab.flows.labelling.label import label
+from sliplab.flows.labelling.label_check import check_labels
+from sliplab.flows.labelling.label_errors import CHECK
+from sliplab.flows.learning.evaluate import evaluate
+from sliplab.flows.learning.train import train
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report import report
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching.holdout import STEP, measure_holdout
+from sliplab.flows.study_ledger import Ledger, Row
+from sliplab.flows.study_searches import Search, training_windows
+from sliplab.flows.syncing.sync import sync
+from sliplab.storage.store import Store
 
 COLLECT_S = {"tracks": 0.3, "video": 5.0}
 """What a simulated trial is expected to take on two cores, by what the camera hands over; a real

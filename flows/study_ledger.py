@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.running import console
-from storage.files import read_json, write_json
+from sliplab.flows.running import console
+from sliplab.storage.files import read_json, write_json
 
 FILE = "study.json"
 TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"

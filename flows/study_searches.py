@@ -12,20 +12,20 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from flows.learning.window_baselines import window_baselines
-from flows.planning.orders import Order
-from flows.reporting.report_extras import FILES
-from flows.running.campaigns import Collected, training_campaigns
-from flows.searching.detector_tradeoff import detector_tradeoff
-from flows.searching.detector_tradeoff_data import Ask
-from flows.searching.detector_tradeoff_grid import Axes
-from flows.searching.generalisation import SKINS, measure_generalisation
-from flows.searching.guesses import GUESSES, TRIALS, measure_guesses
-from flows.searching.sensitivity import value_of
-from flows.searching.tradeoff import tradeoff
-from protocols.errors import InputError
-from storage.derived import Derived, make_key
-from storage.store import Store
+from sliplab.flows.learning.window_baselines import window_baselines
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report_extras import FILES
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.searching.detector_tradeoff import detector_tradeoff
+from sliplab.flows.searching.detector_tradeoff_data import Ask
+from sliplab.flows.searching.detector_tradeoff_grid import Axes
+from sliplab.flows.searching.generalisation import SKINS, measure_generalisation
+from sliplab.flows.searching.guesses import GUESSES, TRIALS, measure_guesses
+from sliplab.flows.searching.sensitivity import value_of
+from sliplab.flows.searching.tradeoff import tradeoff
+from sliplab.protocols.errors import InputError
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.store import Store
 
 SCENE_TRIALS = 4
 ASK, AXES = Ask(), Axes()

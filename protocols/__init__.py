@@ -1,9 +1,9 @@
 """What is to be done: protocol files, read, checked and expanded into plans."""
 
-from protocols.errors import InputError
-from protocols.model import Protocol
-from protocols.plan import Plan, Task, Trial, load_plan, make_plan
-from protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.plan import Plan, Task, Trial, load_plan, make_plan
+from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
 
 __all__ = [
     "Dwell",

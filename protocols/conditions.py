@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from protocols.factors import MAX_TRIALS, LevelField
-from protocols.quantity import (
+from sliplab.protocols.factors import MAX_TRIALS, LevelField
+from sliplab.protocols.quantity import (
     KilogramsOrRef,
     Millimetres,
     PositiveMillimetres,
@@ -17,8 +17,8 @@ from protocols.quantity import (
     PositiveSeconds,
     PositiveSpeed,
 )
-from protocols.timing import SyncGates
-from protocols.yaml_file import StrictModel
+from sliplab.protocols.timing import SyncGates
+from sliplab.protocols.yaml_file import StrictModel
 
 
 class Region(StrictModel):

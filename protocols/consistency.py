@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from decimal import Decimal
 from itertools import pairwise
 
-from protocols.factors import Factor, unknown_factor
-from protocols.model import Collection, Protocol
-from protocols.motion import check_reference_limits
-from protocols.phases import PlateMotion, Retract, Slide
-from protocols.quantity import canonical, check_size
-from protocols.settings import Split
-from protocols.split import check_split
-from protocols.yaml_file import KeyedError
+from sliplab.protocols.factors import Factor, unknown_factor
+from sliplab.protocols.model import Collection, Protocol
+from sliplab.protocols.motion import check_reference_limits
+from sliplab.protocols.phases import PlateMotion, Retract, Slide
+from sliplab.protocols.quantity import canonical, check_size
+from sliplab.protocols.settings import Split
+from sliplab.protocols.split import check_split
+from sliplab.protocols.yaml_file import KeyedError
 
 FULL_TURN = 360
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from protocols.shown import MASK, printable, shown, shown_key
+from sliplab.protocols.shown import MASK, printable, shown, shown_key
 
 
 class InputError(ValueError):

@@ -17,9 +17,9 @@ from pydantic import (
     model_validator,
 )
 
-from protocols.quantity import UNITS, canonical, check_size, number_meant, to_decimal
-from protocols.shown import foreign_character
-from protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.quantity import UNITS, canonical, check_size, number_meant, to_decimal
+from sliplab.protocols.shown import foreign_character
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
 
 MAX_TRIALS = 1_000_000
 _UNITS = sorted({kind for kind, _ in UNITS.values()})

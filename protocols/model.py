@@ -12,12 +12,19 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from protocols.conditions import Gates, Limits, Maintenance, PlateSetup, Recording, References
-from protocols.factors import MAX_TRIALS, Factor, unknown_factor
-from protocols.phases import Phase
-from protocols.quantity import FactorRef
-from protocols.settings import AnalysisSettings
-from protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
+from sliplab.protocols.conditions import (
+    Gates,
+    Limits,
+    Maintenance,
+    PlateSetup,
+    Recording,
+    References,
+)
+from sliplab.protocols.factors import MAX_TRIALS, Factor, unknown_factor
+from sliplab.protocols.phases import Phase
+from sliplab.protocols.quantity import FactorRef
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.yaml_file import NAME_PATTERN, KeyedError, StrictModel
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 

@@ -12,9 +12,9 @@ from decimal import Decimal
 from itertools import product
 from typing import Any
 
-from protocols.factors import Level
-from protocols.model import Collection, Protocol
-from protocols.phases import (
+from sliplab.protocols.factors import Level
+from sliplab.protocols.model import Collection, Protocol
+from sliplab.protocols.phases import (
     Approach,
     Hold,
     PlateMotion,
@@ -24,9 +24,9 @@ from protocols.phases import (
     Return,
     Slide,
 )
-from protocols.program import Dwell, Move, PlateStep, Position, Program, Step
-from protocols.quantity import FactorRef, canonical
-from protocols.yaml_file import KeyedError
+from sliplab.protocols.program import Dwell, Move, PlateStep, Position, Program, Step
+from sliplab.protocols.quantity import FactorRef, canonical
+from sliplab.protocols.yaml_file import KeyedError
 
 Condition = Mapping[str, Level]
 

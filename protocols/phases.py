@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
-from protocols.quantity import (
+from sliplab.protocols.quantity import (
     REF_SCHEMA,
     DegreesOrRef,
     FactorRef,
@@ -19,7 +19,7 @@ from protocols.quantity import (
     Seconds,
     SpeedOrRef,
 )
-from protocols.yaml_file import StrictModel, register_tags
+from sliplab.protocols.yaml_file import StrictModel, register_tags
 
 
 class Approach(StrictModel):

@@ -14,17 +14,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from protocols.conditions import Gates
-from protocols.consistency import check_consistency
-from protocols.errors import InputError
-from protocols.factors import Level, unknown_factor
-from protocols.hashing import hash_data, hash_integer
-from protocols.model import Protocol
-from protocols.motion import build_program, check_limits
-from protocols.program import Dwell, Program
-from protocols.quantity import FILE_UNITS, canonical, to_decimal
-from protocols.split import assign, check_split
-from protocols.yaml_file import KeyedError, load
+from sliplab.protocols.conditions import Gates
+from sliplab.protocols.consistency import check_consistency
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.factors import Level, unknown_factor
+from sliplab.protocols.hashing import hash_data, hash_integer
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.motion import build_program, check_limits
+from sliplab.protocols.program import Dwell, Program
+from sliplab.protocols.quantity import FILE_UNITS, canonical, to_decimal
+from sliplab.protocols.split import assign, check_split
+from sliplab.protocols.yaml_file import KeyedError, load
 
 Role = Literal["measured", "reference"]
 MAX_ID = 240

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, PlainSerializer, WithJsonSchema
 
-from protocols.shown import foreign_character
+from sliplab.protocols.shown import foreign_character
 
 # unit -> (canonical unit of its kind, factor to it); all factors are exact decimals
 UNITS: dict[str, tuple[str, Decimal]] = {

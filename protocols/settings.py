@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from protocols.presets import COMPARED, PAPER, Value, at, expanded
-from protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.presets import COMPARED, PAPER, Value, at, expanded
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
 
 Scale = Annotated[float, Field(ge=0, le=1e6)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]

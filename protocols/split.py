@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from protocols.factors import Factor, Level, unknown_factor
-from protocols.hashing import hash_integer
-from protocols.quantity import canonical, parse
-from protocols.settings import Split
-from protocols.yaml_file import KeyedError
+from sliplab.protocols.factors import Factor, Level, unknown_factor
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.quantity import canonical, parse
+from sliplab.protocols.settings import Split
+from sliplab.protocols.yaml_file import KeyedError
 
 GOLDEN = 0.6180339887498949
 _SCALE = float(1 << 63)

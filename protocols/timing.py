@@ -12,8 +12,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from protocols.quantity import PositiveSeconds
-from protocols.yaml_file import KeyedError, StrictModel
+from sliplab.protocols.quantity import PositiveSeconds
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
 
 Code = Literal["lfsr", "irregular", "regular"]
 """What the box sends: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""

@@ -22,9 +22,9 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from protocols.errors import InputError
-from protocols.quantity import number_meant
-from protocols.shown import MASK, foreign_character, holds_secret, is_secret
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.quantity import number_meant
+from sliplab.protocols.shown import MASK, foreign_character, holds_secret, is_secret
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32

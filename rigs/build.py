@@ -5,20 +5,20 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from rigs.arms.settings import ArmSettings, PlaneSettings
-from rigs.capabilities import FrameCamera, Operator, Plate, Pose, RigError, Simulation
-from rigs.devices import DeviceSettings
-from rigs.host_clock import HostClock
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.operator import ConsoleOperator
-from rigs.people import PersonAtPlate
-from rigs.plate_frame import PlateFrame
-from rigs.rig import Rig
-from rigs.rig_file import RigFile
-from storage.streams import Sink
+from sliplab.rigs.arms.settings import ArmSettings, PlaneSettings
+from sliplab.rigs.capabilities import FrameCamera, Operator, Plate, Pose, RigError, Simulation
+from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.host_clock import HostClock
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.operator import ConsoleOperator
+from sliplab.rigs.people import PersonAtPlate
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig import Rig
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.streams import Sink
 
 if TYPE_CHECKING:
-    from rigs.wire.loopback import Loopback
+    from sliplab.rigs.wire.loopback import Loopback
 
 
 DRIVEN_TAIL_S = 0.3
@@ -115,7 +115,7 @@ def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     """Real drivers; stand-ins in a process of their own show the simulated scene."""
-    from rigs.wire.loopback import Loopback
+    from sliplab.rigs.wire.loopback import Loopback
 
     with ExitStack() as undo:
         stage = Loopback(file.scene, file.timing, devices.arm)
@@ -135,7 +135,7 @@ def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
     Raises:
         RigError: a stand-in is not there.
     """
-    from rigs.wire.live_basler import LiveBasler
+    from sliplab.rigs.wire.live_basler import LiveBasler
 
     assert file.devices is not None
     exposure_ns = file.scene.frame_camera.exposure_us * 1000
@@ -158,9 +158,9 @@ def _driven_rig(
         camera: the device behind the frame camera's driver, None to search for it.
         ending: called when the rig is closed, last.
     """
-    from rigs.arms import build_arm
-    from rigs.cameras import build_event_camera, build_frame_camera
-    from rigs.sync_box import SerialSyncBox
+    from sliplab.rigs.arms import build_arm
+    from sliplab.rigs.cameras import build_event_camera, build_frame_camera
+    from sliplab.rigs.sync_box import SerialSyncBox
 
     assert devices.sync_box is not None
     scale = {"px_per_mm": file.frame_camera.scale_px_per_mm}

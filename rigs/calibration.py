@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from protocols.quantity import parse, quantity_schema
-from protocols.yaml_file import StrictModel
+from sliplab.protocols.quantity import parse, quantity_schema
+from sliplab.protocols.yaml_file import StrictModel
 
 
 def _mm(raw: object) -> float:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol, runtime_checkable
 
-from protocols.program import PlateAction
-from protocols.timing import Code
-from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
+from sliplab.protocols.program import PlateAction
+from sliplab.protocols.timing import Code
+from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
 
 
 class RigError(RuntimeError):

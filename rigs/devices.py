@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from protocols.yaml_file import StrictModel, register_tags_of
-from rigs.arms.settings import ArmSettings
-from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
-from rigs.sync_settings import SyncBoxSettings
+from sliplab.protocols.yaml_file import StrictModel, register_tags_of
+from sliplab.rigs.arms.settings import ArmSettings
+from sliplab.rigs.cameras.settings import BaslerSettings, DvxplorerSettings
+from sliplab.rigs.sync_settings import SyncBoxSettings
 
 register_tags_of("arm", "ur", "abb", "abb_socket")
 register_tags_of("source", "usb", "network")

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocols.plan import Plan
-from protocols.program import Dwell, Move, Program
-from rigs.mock.settings import MockSettings
-from rigs.mock.skins import skin_of
-from rigs.rig_file import RigFile
-from rigs.scene.onsets import Material, slide_onsets
-from rigs.scene.randomness import generator
+from sliplab.protocols.plan import Plan
+from sliplab.protocols.program import Dwell, Move, Program
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.scene.onsets import Material, slide_onsets
+from sliplab.rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
 

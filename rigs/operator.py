@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from protocols.shown import printable
-from rigs.capabilities import RigError
+from sliplab.protocols.shown import printable
+from sliplab.rigs.capabilities import RigError
 
 
 class ConsoleOperator:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from protocols.program import PlateAction
-from rigs.capabilities import Operator, RigError
+from sliplab.protocols.program import PlateAction
+from sliplab.rigs.capabilities import Operator, RigError
 
 _MASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(kg|g)\s*")
 _TASKS: dict[PlateAction, tuple[str, str]] = {

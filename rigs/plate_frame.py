@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from protocols.program import Position
-from rigs.capabilities import Pose
+from sliplab.protocols.program import Position
+from sliplab.rigs.capabilities import Pose
 
 Vector = npt.NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from protocols.timing import MARKER_TICKS, Code
+from sliplab.protocols.timing import MARKER_TICKS, Code
 
 SEEDS = (1 << 32) - 2
 """Seeds are 1 to this, whatever the code."""

@@ -6,11 +6,11 @@ import os
 import socket
 from collections.abc import Callable
 
-from rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
-from rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
-from rigs.capabilities import RigError
-from rigs.devices import DeviceSettings
-from rigs.sync_settings import SyncBoxSettings
+from sliplab.rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
+from sliplab.rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.sync_settings import SyncBoxSettings
 
 ANSWER_S = 1.0
 """For each connection, s."""
@@ -57,7 +57,7 @@ def _listens(host: str, port: int) -> str | None:
 
 
 def _event_camera(settings: DvxplorerSettings) -> str | None:
-    from rigs.cameras.event_source import find_camera, greet
+    from sliplab.rigs.cameras.event_source import find_camera, greet
 
     source = settings.source
     if isinstance(source, NetworkStream):
@@ -69,7 +69,7 @@ def _event_camera(settings: DvxplorerSettings) -> str | None:
 
 
 def _frame_camera(settings: BaslerSettings) -> str | None:
-    from rigs.cameras.basler import look_for_camera
+    from sliplab.rigs.cameras.basler import look_for_camera
 
     look_for_camera(settings.serial)
     return None

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-from protocols.program import Move, Position, Program, Step, step_seconds
-from rigs.capabilities import ArmFault
-from rigs.rig import Rig, arm_fault
-from storage.streams import Sink
+from sliplab.protocols.program import Move, Position, Program, Step, step_seconds
+from sliplab.rigs.capabilities import ArmFault
+from sliplab.rigs.rig import Rig, arm_fault
+from sliplab.storage.streams import Sink
 
 ACTING = ("slide", "retract")
 """The phases in which a reflex may act: those that this program itself moves the arm in."""

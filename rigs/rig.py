@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
-from protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
-from protocols.timing import Timing
-from rigs.capabilities import (
+from sliplab.protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.capabilities import (
     Arm,
     ArmFault,
     ArmState,
@@ -29,10 +29,10 @@ from rigs.capabilities import (
     Simulation,
     SyncBox,
 )
-from rigs.plate_frame import PlateFrame
-from rigs.pulse_code import SEEDS
-from rigs.touching import LOOK_S, QUIET_S, RateTouch, count_central
-from storage.streams import Json, Sink, StepTimes
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.pulse_code import SEEDS
+from sliplab.rigs.touching import LOOK_S, QUIET_S, RateTouch, count_central
+from sliplab.storage.streams import Json, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1

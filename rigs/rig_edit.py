@@ -15,11 +15,11 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from protocols.errors import InputError
-from protocols.yaml_file import parse_yaml, read_text, validate
-from rigs.rig_file import RigFile
-from rigs.rig_inheritance import KEY, read_rig, shipped_rigs
-from storage.files import write_text
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import parse_yaml, read_text, validate
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_inheritance import KEY, read_rig, shipped_rigs
+from sliplab.storage.files import write_text
 
 _WIDEST = 1 << 20
 """Lines are not folded."""

@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from protocols.errors import InputError
-from protocols.hashing import hash_text
-from protocols.plan import Plan
-from protocols.program import Move
-from protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
-from protocols.shown import MASK
-from protocols.timing import Timing
-from protocols.yaml_file import (
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_text
+from sliplab.protocols.plan import Plan
+from sliplab.protocols.program import Move
+from sliplab.protocols.quantity import PositiveMillimetres, PositiveSeconds, PositiveSpeed
+from sliplab.protocols.shown import MASK
+from sliplab.protocols.timing import Timing
+from sliplab.protocols.yaml_file import (
     NAME_PATTERN,
     KeyedError,
     StrictModel,
@@ -25,12 +25,12 @@ from protocols.yaml_file import (
     validate,
     without_secrets,
 )
-from rigs.arms.settings import check_units
-from rigs.calibration import Calibration, without_taught
-from rigs.devices import DeviceSettings
-from rigs.mock.promises import check_promises
-from rigs.mock.settings import MockSettings
-from rigs.rig_inheritance import read_rig, rig_path
+from sliplab.rigs.arms.settings import check_units
+from sliplab.rigs.calibration import Calibration, without_taught
+from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.mock.promises import check_promises
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.rig_inheritance import read_rig, rig_path
 
 SCALE_ERROR = 0.005
 """How far a measured scale may be from the true one, as a share."""

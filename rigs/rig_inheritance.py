@@ -14,8 +14,8 @@ from typing import Any
 
 import yaml
 
-from protocols.errors import InputError
-from protocols.yaml_file import Document, parse_yaml, read_text
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import Document, parse_yaml, read_text
 
 KEY = "extends"
 _DEEPEST = 8

@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from rigs.capabilities import RigError
-from rigs.rig_file import RigFile
-from storage.lock import NoLocks, exclusive
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.lock import NoLocks, exclusive
 
 ENVIRONMENT = "SLIPLAB_RUNTIME"
 _FOLDER = Path("/tmp/sliplab-rigs")

@@ -13,14 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from protocols.timing import Code
-from rigs.capabilities import DeviceHealth, RigError
-from rigs.pulse_code import SEEDS
-from rigs.sync_line import LEAST_HZ, MOST_HZ, NAME, whole
-from rigs.sync_port import DEVICE, SyncBoxFault, SyncPort, began_anew
-from rigs.sync_settings import SyncBoxSettings
-from rigs.sync_train import Losses, Train
-from storage.streams import ClockReads, PulseChunk
+from sliplab.protocols.timing import Code
+from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.rigs.pulse_code import SEEDS
+from sliplab.rigs.sync_line import LEAST_HZ, MOST_HZ, NAME, whole
+from sliplab.rigs.sync_port import DEVICE, SyncBoxFault, SyncPort, began_anew
+from sliplab.rigs.sync_settings import SyncBoxSettings
+from sliplab.rigs.sync_train import Losses, Train
+from sliplab.storage.streams import ClockReads, PulseChunk
 
 MOST_WAITING = 100_000
 """Pulses or exposures kept for who reads them: 17 minutes at 100 Hz. More are counted, not kept."""

@@ -12,9 +12,9 @@ from collections.abc import Callable
 
 import serial
 
-from rigs.capabilities import RigError
-from rigs.sync_line import NAME, LineReader, seal
-from rigs.sync_settings import SyncBoxSettings
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.sync_line import NAME, LineReader, seal
+from sliplab.rigs.sync_settings import SyncBoxSettings
 
 DEVICE = "sync box"
 TRIES = 3

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from protocols.yaml_file import StrictModel
-from rigs.sync_line import BAUD
+from sliplab.protocols.yaml_file import StrictModel
+from sliplab.rigs.sync_line import BAUD
 
 
 class SyncBoxSettings(StrictModel):

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from protocols.timing import Code
-from rigs.pulse_code import LONGEST_GAP_TICKS, code_bits
+from sliplab.protocols.timing import Code
+from sliplab.rigs.pulse_code import LONGEST_GAP_TICKS, code_bits
 
 _BITS = 1 << 12
 """Bits of the code that are made at first; more when they are needed."""

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from protocols.program import Move, Position
-from rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
-from rigs.pulse_code import SEEDS
-from rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
-from rigs.touching import LOOK_S, QUIET_S, MarkerTouch, RateTouch
-from storage.streams import FrameChunk
+from sliplab.protocols.program import Move, Position
+from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.pulse_code import SEEDS
+from sliplab.rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested, arm_fault
+from sliplab.rigs.touching import LOOK_S, QUIET_S, MarkerTouch, RateTouch
+from sliplab.storage.streams import FrameChunk
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

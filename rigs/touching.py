@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from storage.streams import EventChunk
+from sliplab.storage.streams import EventChunk
 
 F64 = npt.NDArray[np.float64]
 

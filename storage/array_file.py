@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from storage.files import write_blocks
+from sliplab.storage.files import write_blocks
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -7,12 +7,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.files import make_folder, sync_folder, write_json
-from storage.manifest import Manifest, check_against_sums
-from storage.remote import Remote, RemoteError
-from storage.streams import Json
-from storage.whole import ELSEWHERE, byte_problem, read_sums
-from storage.writer import DATA, FRAMES
+from sliplab.storage.files import make_folder, sync_folder, write_json
+from sliplab.storage.manifest import Manifest, check_against_sums
+from sliplab.storage.remote import Remote, RemoteError
+from sliplab.storage.streams import Json
+from sliplab.storage.whole import ELSEWHERE, byte_problem, read_sums
+from sliplab.storage.writer import DATA, FRAMES
 
 BIG = frozenset({DATA, FRAMES})
 """Files of a trial that a mirror fetches when they are first read."""

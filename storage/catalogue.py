@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from storage import catalogue_index
-from storage.recording import Recording
-from storage.store import Campaign, Store, StoreError
-from storage.whole import partial
+from sliplab.storage import catalogue_index
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign, Store, StoreError
+from sliplab.storage.whole import partial
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:

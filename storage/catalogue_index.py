@@ -23,9 +23,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from storage.files import make_folder, write_bytes
-from storage.store import SYNC, Campaign, Store
-from storage.streams import I64, Json
+from sliplab.storage.files import make_folder, write_bytes
+from sliplab.storage.store import SYNC, Campaign, Store
+from sliplab.storage.streams import I64, Json
 
 VERSION = 1
 """Of this file and of the catalogue's rows: whoever changes either counts on."""

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from storage.errors import StoreError
-from storage.files import make_folder, read_json, write_new_json
-from storage.process import now, user_name
-from storage.store import Store, safe_name
-from storage.streams import Json
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import make_folder, read_json, write_new_json
+from sliplab.storage.process import now, user_name
+from sliplab.storage.store import Store, safe_name
+from sliplab.storage.streams import Json
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]
 FOLDER = "control"

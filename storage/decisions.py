@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from storage.errors import StoreError
-from storage.files import read_json, write_json
-from storage.store import AGAIN, CAUSE, FORGIVEN, Campaign
-from storage.streams import Json
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import AGAIN, CAUSE, FORGIVEN, Campaign
+from sliplab.storage.streams import Json
 
 SKIPPED = "skipped.json"
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocols.hashing import hash_data
-from storage.files import read_json, write_bytes, write_json
-from storage.store import Store, inside, safe_name
-from storage.streams import Json
+from sliplab.protocols.hashing import hash_data
+from sliplab.storage.files import read_json, write_bytes, write_json
+from sliplab.storage.store import Store, inside, safe_name
+from sliplab.storage.streams import Json
 
 
 def make_key(step: str, version: int, inputs: Any, parameters: Any) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from protocols.errors import InputError
-from storage.files import disk_fault, disk_full
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import disk_fault, disk_full
 
 
 class StoreError(RuntimeError):

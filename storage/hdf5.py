@@ -17,7 +17,7 @@ from types import TracebackType
 import h5py
 import numpy as np
 
-from storage.columns import (
+from sliplab.storage.columns import (
     COLUMNS,
     INDEX,
     INDEX_CUT_FORMAT,
@@ -33,9 +33,17 @@ from storage.columns import (
     blank,
     create,
 )
-from storage.errors import StoreError
-from storage.rows import RowFile, Rows
-from storage.streams import I64, U8, ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.storage.errors import StoreError
+from sliplab.storage.rows import RowFile, Rows
+from sliplab.storage.streams import (
+    I64,
+    U8,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    PoseChunk,
+    PulseChunk,
+)
 
 _LAST_32 = 2**32 - 1
 _READS = ("t", "before", "after")

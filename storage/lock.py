@@ -18,10 +18,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from storage.errors import StoreError
-from storage.files import disk_fault
-from storage.process import named, this_process
-from storage.streams import Json
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import disk_fault
+from sliplab.storage.process import named, this_process
+from sliplab.storage.streams import Json
 
 STORE_LOCK = ".lock"
 """Of a store, in its folder."""

@@ -19,14 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from protocols.hashing import hash_data
-from storage.decisions import SKIPPED
-from storage.files import json_text, read_json, sha256
-from storage.remote import SMALL_BYTES, Remote, RemoteError, RemoteMissing
-from storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError, safe_name
-from storage.streams import Json
-from storage.whole import read_sums
-from storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD, SPOOL
+from sliplab.protocols.hashing import hash_data
+from sliplab.storage.decisions import SKIPPED
+from sliplab.storage.files import json_text, read_json, sha256
+from sliplab.storage.remote import SMALL_BYTES, Remote, RemoteError, RemoteMissing
+from sliplab.storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError, safe_name
+from sliplab.storage.streams import Json
+from sliplab.storage.whole import read_sums
+from sliplab.storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD, SPOOL
 
 Kind = Literal["about", "trials", "quarantine"]
 FORMAT = 1

@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from storage.files import make_folder, write_bytes, write_json
-from storage.store import INFO, PROTOCOL, RIG, STORE, Store, StoreError
-from storage.whole import write_sums
-from storage.writer import CHECKSUMS
+from sliplab.storage.files import make_folder, write_bytes, write_json
+from sliplab.storage.store import INFO, PROTOCOL, RIG, STORE, Store, StoreError
+from sliplab.storage.whole import write_sums
+from sliplab.storage.writer import CHECKSUMS
 
 Step = Callable[[Store], None]
 

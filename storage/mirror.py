@@ -14,17 +14,17 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
-from protocols.hashing import hash_text
-from storage.bring import bring
-from storage.errors import StoreError, disk_explained
-from storage.files import make_folder, write_json
-from storage.manifest import Manifest, objects_folder, read_manifests
-from storage.pull import ORIGIN, Pulled, origin_of, pull
-from storage.remote import Remote, RemoteError, RemoteMissing
-from storage.store import FORMAT, STORE, Store
-from storage.streams import Json
-from storage.urls import check_url, is_url
-from storage.whole import partial
+from sliplab.protocols.hashing import hash_text
+from sliplab.storage.bring import bring
+from sliplab.storage.errors import StoreError, disk_explained
+from sliplab.storage.files import make_folder, write_json
+from sliplab.storage.manifest import Manifest, objects_folder, read_manifests
+from sliplab.storage.pull import ORIGIN, Pulled, origin_of, pull
+from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
+from sliplab.storage.store import FORMAT, STORE, Store
+from sliplab.storage.streams import Json
+from sliplab.storage.urls import check_url, is_url
+from sliplab.storage.whole import partial
 
 CACHE = "SLIPLAB_CACHE"
 """Names the folder that mirrors stand in."""

@@ -10,8 +10,8 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from storage.secrets import masked
-from storage.streams import Json
+from sliplab.storage.secrets import masked
+from sliplab.storage.streams import Json
 
 _COMMAND_CHARACTERS = 300
 _STARTED = 19

@@ -10,15 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from storage.bring import BIG, bring, get, holds
-from storage.errors import StoreError, disk_explained
-from storage.files import make_folder, read_json, sync_folder, write_bytes, write_json
-from storage.lock import STORE_LOCK, exclusive
-from storage.manifest import Manifest, read_manifests, take_of
-from storage.remote import OnBytes, Remote, RemoteError
-from storage.store import Campaign, Store, safe_name
-from storage.whole import ELSEWHERE, partial, to_fetch
-from storage.writer import CHECKSUMS
+from sliplab.storage.bring import BIG, bring, get, holds
+from sliplab.storage.errors import StoreError, disk_explained
+from sliplab.storage.files import make_folder, read_json, sync_folder, write_bytes, write_json
+from sliplab.storage.lock import STORE_LOCK, exclusive
+from sliplab.storage.manifest import Manifest, read_manifests, take_of
+from sliplab.storage.remote import OnBytes, Remote, RemoteError
+from sliplab.storage.store import Campaign, Store, safe_name
+from sliplab.storage.whole import ELSEWHERE, partial, to_fetch
+from sliplab.storage.writer import CHECKSUMS
 
 ORIGIN = "origin.json"
 """In a store that was pulled: from where."""

@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from storage import manifest as manifests
-from storage.errors import StoreError
-from storage.manifest import Kind, Manifest, objects_folder, read_manifests
-from storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
-from storage.store import AGAIN, INFO, Campaign, Store
-from storage.streams import Json
-from storage.whole import byte_problem
+from sliplab.storage import manifest as manifests
+from sliplab.storage.errors import StoreError
+from sliplab.storage.manifest import Kind, Manifest, objects_folder, read_manifests
+from sliplab.storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
+from sliplab.storage.store import AGAIN, INFO, Campaign, Store
+from sliplab.storage.streams import Json
+from sliplab.storage.whole import byte_problem
 
 OnTrial = Callable[[str], None]
 _TRIES = 2

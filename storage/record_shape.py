@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from storage.clockmap import ClockMap
-from storage.streams import Json
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.streams import Json
 
 DEVICES = ("events", "frames", "arm")
 """Those whose clocks have maps; what else stands among the clocks is for people."""

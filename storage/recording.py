@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from storage.clockmap import ClockMap
-from storage.errors import StoreError
-from storage.files import read_json
-from storage.hdf5 import StreamReader
-from storage.record_shape import check_clocks, check_record
-from storage.streams import F64, I64, U8, EventChunk, Json
-from storage.video import FrameReader, read_frame, read_frames
-from storage.whole import byte_problem, read_sums, to_fetch
-from storage.writer import DATA, FRAMES, RECORD
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.record_shape import check_clocks, check_record
+from sliplab.storage.streams import F64, I64, U8, EventChunk, Json
+from sliplab.storage.video import FrameReader, read_frame, read_frames
+from sliplab.storage.whole import byte_problem, read_sums, to_fetch
+from sliplab.storage.writer import DATA, FRAMES, RECORD
 
 RECORD_FORMAT = 1
 """What this version writes into a record as its ``format``."""
@@ -109,7 +109,7 @@ class Recording:
             if name not in self._sums:
                 raise self._damaged(f"{path}: is not among the checksums")
             if to_fetch(path):
-                from storage.mirror import fetch  # which stands on this module
+                from sliplab.storage.mirror import fetch  # which stands on this module
 
                 fetch(path, self._sums[name])
             if (problem := byte_problem(path, self._sums[name])) is not None:

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from protocols.errors import InputError
-from protocols.shown import is_secret
-from storage.errors import NoStore, StoreError
-from storage.files import json_text, make_folder, read_blocks, write_blocks
-from storage.streams import Json
-from storage.urls import check_url
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.shown import is_secret
+from sliplab.storage.errors import NoStore, StoreError
+from sliplab.storage.files import json_text, make_folder, read_blocks, write_blocks
+from sliplab.storage.streams import Json
+from sliplab.storage.urls import check_url
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
 SMALL_BYTES = 8_000_000

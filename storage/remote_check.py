@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from storage.manifest import Kind, Manifest, check_against_sums, objects_folder, read_manifests
-from storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
-from storage.store import StoreError, safe_name
-from storage.verify import Problem
-from storage.writer import CHECKSUMS
+from sliplab.storage.manifest import (
+    Kind,
+    Manifest,
+    check_against_sums,
+    objects_folder,
+    read_manifests,
+)
+from sliplab.storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
+from sliplab.storage.store import StoreError, safe_name
+from sliplab.storage.verify import Problem
+from sliplab.storage.writer import CHECKSUMS
 
 KINDS: tuple[Kind, ...] = ("about", "trials", "quarantine")
 

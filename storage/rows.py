@@ -15,8 +15,8 @@ import h5py
 import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 
-from storage.columns import Array
-from storage.streams import I64
+from sliplab.storage.columns import Array
+from sliplab.storage.streams import I64
 
 _BLOCK = 1 << 15
 _FEW = 16

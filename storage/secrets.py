@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 
-from protocols.shown import MASK, is_secret, password_in, without_passwords
+from sliplab.protocols.shown import MASK, is_secret, password_in, without_passwords
 
 _SHORTEST = 8
 """A shorter value is a switch, or stands in many a word."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.streams import U8
+from sliplab.storage.streams import U8
 
 QUEUE_BYTES = 1 << 29
 """The most that waits in memory, bytes: five seconds of 1000 x 1000 px at 100/s."""

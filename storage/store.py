@@ -25,8 +25,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from storage.errors import NoStore, StoreError, disk_explained
-from storage.files import (
+from sliplab.storage.errors import NoStore, StoreError, disk_explained
+from sliplab.storage.files import (
     json_text,
     make_folder,
     read_json,
@@ -35,11 +35,11 @@ from storage.files import (
     write_bytes,
     write_json,
 )
-from storage.recording import Recording
-from storage.secrets import masked
-from storage.streams import Json
-from storage.whole import partial, write_sums
-from storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
+from sliplab.storage.recording import Recording
+from sliplab.storage.secrets import masked
+from sliplab.storage.streams import Json
+from sliplab.storage.whole import partial, write_sums
+from sliplab.storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
 
 __all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError", "safe_name"]
 

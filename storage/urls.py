@@ -6,7 +6,7 @@ import os
 import re
 from urllib.parse import urlsplit
 
-from protocols.errors import InputError
+from sliplab.protocols.errors import InputError
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]*)://.+")
 

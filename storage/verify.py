@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
-from protocols.yaml_file import parse_yaml
-from storage.columns import TIMING, TRACKS
-from storage.errors import StoreError
-from storage.files import own_fault, read_json, temporary_files
-from storage.hdf5 import StreamReader
-from storage.record_shape import check_record
-from storage.recording import RECORD_FORMAT
-from storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
-from storage.streams import Json
-from storage.video import count_frames
-from storage.whole import ELSEWHERE, byte_problem, read_sums, to_fetch
-from storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.storage.columns import TIMING, TRACKS
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import own_fault, read_json, temporary_files
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.record_shape import check_record
+from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.streams import Json
+from sliplab.storage.video import count_frames
+from sliplab.storage.whole import ELSEWHERE, byte_problem, read_sums, to_fetch
+from sliplab.storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD
 
 _KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")

@@ -20,7 +20,7 @@ from typing import Any
 import av
 import numpy as np
 
-from storage.streams import U8
+from sliplab.storage.streams import U8
 
 CODEC_OPTIONS = {"level": "3", "coder": "rice", "context": "0", "g": "1", "slices": "9"}
 _QUEUE_FRAMES = 32

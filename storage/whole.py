@@ -7,9 +7,9 @@ import re
 import stat
 from pathlib import Path
 
-from storage.files import own_fault, read_json, sha256, write_json
-from storage.streams import Json
-from storage.writer import CHECKSUMS, DATA, RECORD
+from sliplab.storage.files import own_fault, read_json, sha256, write_json
+from sliplab.storage.streams import Json
+from sliplab.storage.writer import CHECKSUMS, DATA, RECORD
 
 ELSEWHERE = "elsewhere.json"
 """Of a trial in a mirror (`storage.mirror`): files that it lacks are fetched when they are read."""

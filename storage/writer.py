@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.files import sha256, sync_file, sync_folder, write_json_aside
-from storage.hdf5 import StreamFile
-from storage.secrets import masked
-from storage.spool import Spool
-from storage.streams import (
+from sliplab.storage.files import sha256, sync_file, sync_folder, write_json_aside
+from sliplab.storage.hdf5 import StreamFile
+from sliplab.storage.secrets import masked
+from sliplab.storage.spool import Spool
+from sliplab.storage.streams import (
     I64,
     U8,
     ClockReads,
@@ -23,7 +23,7 @@ from storage.streams import (
     PoseChunk,
     PulseChunk,
 )
-from storage.video import VideoWriter
+from sliplab.storage.video import VideoWriter
 
 DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
 SPOOL = "frames.raw"

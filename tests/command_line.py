@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from flows.__main__ import main
+from sliplab.flows.__main__ import main
 from tests.conftest import ROOT
 
 SECRET = "marked-secret-51b2"
 """In the environment of every command; must never be found in a store."""
-SLIPLAB = [sys.executable, "-m", "flows"]
+SLIPLAB = [sys.executable, "-m", "sliplab"]
 
 
 def sliplab(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:

@@ -33,7 +33,7 @@ DATED = ("provenance.json",)
 
 def command(store: Path, arguments: list[str]) -> list[str]:
     """What runs a study in `store`."""
-    return [sys.executable, "-m", "flows", "study", str(store), "--json", *arguments]
+    return [sys.executable, "-m", "sliplab", "study", str(store), "--json", *arguments]
 
 
 def live(store: Path, arguments: list[str], log: Path, kill_s: float | None = None) -> int:

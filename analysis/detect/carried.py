@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.metrics import CLASSES
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
 
 
 def carried_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:

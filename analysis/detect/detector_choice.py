@@ -13,9 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from analysis.detect.detectors import Detector, Evidence, Labelled, Levels, decide, first_above
-from analysis.detect.latency import TrialLatency, score_trial
-from analysis.detect.true_slip import TrueSlip
+from sliplab.analysis.detect.detectors import (
+    Detector,
+    Evidence,
+    Labelled,
+    Levels,
+    decide,
+    first_above,
+)
+from sliplab.analysis.detect.latency import TrialLatency, score_trial
+from sliplab.analysis.detect.true_slip import TrueSlip
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.detect.detector_choice import (
+from sliplab.analysis.detect.detector_choice import (
     Judged,
     allowed_early,
     judge,
@@ -20,7 +20,7 @@ from analysis.detect.detector_choice import (
     outcomes,
     set_levels,
 )
-from analysis.detect.detectors import (
+from sliplab.analysis.detect.detectors import (
     Detector,
     Heard,
     Labelled,
@@ -30,9 +30,9 @@ from analysis.detect.detectors import (
     decide,
     learn,
 )
-from analysis.detect.latency import TrialLatency, summarise_latency, summarise_lead
-from analysis.statistics.intervals import exact_interval
-from protocols.settings import Comparison, Detection, Windows
+from sliplab.analysis.detect.latency import TrialLatency, summarise_latency, summarise_lead
+from sliplab.analysis.statistics.intervals import exact_interval
+from sliplab.protocols.settings import Comparison, Detection, Windows
 
 CURVE_RATE = 0.06
 """The curves end at this share of false early validation trials."""

@@ -15,12 +15,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.detection import Found, lead_of
-from analysis.detect.hidden_markov import Chain, fit_chain, forward, log_odds
-from analysis.detect.sequential import cusum
-from analysis.detect.true_slip import TrueSlip
-from analysis.detect.window_likelihood import Likelihood, fit_histograms, fit_logistic
-from analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, NO_SLIP
+from sliplab.analysis.detect.detection import Found, lead_of
+from sliplab.analysis.detect.hidden_markov import Chain, fit_chain, forward, log_odds
+from sliplab.analysis.detect.sequential import cusum
+from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.analysis.detect.window_likelihood import Likelihood, fit_histograms, fit_logistic
+from sliplab.analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, NO_SLIP
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.detect.detection import Found
-from analysis.detect.true_slip import TrueSlip, is_false_early, is_late
+from sliplab.analysis.detect.detection import Found
+from sliplab.analysis.detect.true_slip import TrueSlip, is_false_early, is_late
 
 Summary = dict[str, float | int | None]
 

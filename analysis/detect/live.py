@@ -23,12 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.live_decision import Decision, Losses
-from analysis.detect.live_rule import StepRule
-from analysis.nets.training import Fitted, engine
-from analysis.nets.windows import bin_events
-from protocols.settings import Detection, Windows
-from storage.streams import EventChunk
+from sliplab.analysis.detect.live_decision import Decision, Losses
+from sliplab.analysis.detect.live_rule import StepRule
+from sliplab.analysis.nets.training import Fitted, engine
+from sliplab.analysis.nets.windows import bin_events
+from sliplab.protocols.settings import Detection, Windows
+from sliplab.storage.streams import EventChunk
 
 Counting = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.int64]]
 """Output spikes int64 (1, 3) of one window, uint8 (1, steps, channels, cells, cells)."""

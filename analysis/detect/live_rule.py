@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, winners
-from protocols.settings import Detection
+from sliplab.analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, winners
+from sliplab.protocols.settings import Detection
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.detection import lead_of
-from analysis.detect.detector_choice import allowed_early
-from analysis.detect.true_slip import NEVER, is_false_early, is_late
-from analysis.nets.metrics import GROSS, INCIPIENT
+from sliplab.analysis.detect.detection import lead_of
+from sliplab.analysis.detect.detector_choice import allowed_early
+from sliplab.analysis.detect.true_slip import NEVER, is_false_early, is_late
+from sliplab.analysis.nets.metrics import GROSS, INCIPIENT
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.detection import detect
-from analysis.detect.detector_choice import allowed_early, merit
-from analysis.detect.latency import score_trial, summarise_latency
-from analysis.detect.true_slip import TrueSlip
-from protocols.settings import Detection
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.detector_choice import allowed_early, merit
+from sliplab.analysis.detect.latency import score_trial, summarise_latency
+from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.protocols.settings import Detection
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.labels.onsets import NO_ONSET, Onsets, paper_onsets
-from protocols.settings import Labelling
+from sliplab.analysis.labels.onsets import NO_ONSET, Onsets, paper_onsets
+from sliplab.protocols.settings import Labelling
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

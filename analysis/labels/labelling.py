@@ -12,14 +12,14 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels.camera_shift import CameraShift
-from analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
-from analysis.labels.onsets import Onsets, paper_onsets, rest_time
-from analysis.labels.places import Places, places_of
-from analysis.labels.rest import Reference, offsets
-from analysis.labels.slip_times import SlipTimes, slip_times
-from protocols.settings import Labelling
-from storage.recording import Recording
+from sliplab.analysis.labels.camera_shift import CameraShift
+from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, Doubts, slipped_in_hold, uncertain, unseen
+from sliplab.analysis.labels.onsets import Onsets, paper_onsets, rest_time
+from sliplab.analysis.labels.places import Places, places_of
+from sliplab.analysis.labels.rest import Reference, offsets
+from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
+from sliplab.protocols.settings import Labelling
+from sliplab.storage.recording import Recording
 
 F64 = npt.NDArray[np.float64]
 VERSION = 5

@@ -19,8 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from analysis.labels.blobs import Blobs, Floats, Frame, checked_frame, find_blobs, match_layout
-from analysis.labels.marker_kernels import (
+from sliplab.analysis.labels.blobs import (
+    Blobs,
+    Floats,
+    Frame,
+    checked_frame,
+    find_blobs,
+    match_layout,
+)
+from sliplab.analysis.labels.marker_kernels import (
     AREA,
     BRIGHT,
     DARK,

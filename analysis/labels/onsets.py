@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protocols.settings import Labelling
+from sliplab.protocols.settings import Labelling
 
 NO_ONSET = -1
 """Stands in `Onsets.per_marker_ns` for a marker that never slipped."""

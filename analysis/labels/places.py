@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels.markers import MarkerTracks
-from analysis.labels.plane import Plane, plane_of
-from analysis.labels.plate import PlateTrack, track_video
-from storage.recording import Recording
+from sliplab.analysis.labels.markers import MarkerTracks
+from sliplab.analysis.labels.plane import Plane, plane_of
+from sliplab.analysis.labels.plate import PlateTrack, track_video
+from sliplab.storage.recording import Recording
 
 F64 = npt.NDArray[np.float64]
 

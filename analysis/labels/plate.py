@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.labels.blobs import Floats, Frame, checked_frame
-from analysis.labels.markers import MarkerTracker, MarkerTracks, Measured, stack_tracks
-from analysis.labels.plate_kernels import cells, refine_square
+from sliplab.analysis.labels.blobs import Floats, Frame, checked_frame
+from sliplab.analysis.labels.markers import MarkerTracker, MarkerTracks, Measured, stack_tracks
+from sliplab.analysis.labels.plate_kernels import cells, refine_square
 
 MAX_BRIDGED = 5
 """Longer gaps stay unknown: over six intervals at 100 frames/s a plate in free fall departs 4 mm

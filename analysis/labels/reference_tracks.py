@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from analysis.labels.blobs import Floats, Frame, find_blobs, match_layout
+from sliplab.analysis.labels.blobs import Floats, Frame, find_blobs, match_layout
 
 
 def reference_track(

@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
-from analysis.labels.onsets import mean_places, on_plate
-from analysis.labels.places import SURE_PX, Places
+from sliplab.analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
+from sliplab.analysis.labels.onsets import mean_places, on_plate
+from sliplab.analysis.labels.places import SURE_PX, Places
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.labels.change_point import change_point, departure
-from analysis.labels.doubts import Doubts
-from analysis.labels.onsets import NO_ONSET, Onsets
+from sliplab.analysis.labels.change_point import change_point, departure
+from sliplab.analysis.labels.doubts import Doubts
+from sliplab.analysis.labels.onsets import NO_ONSET, Onsets
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets.network import SPIKING, WEIGHTED, reset_states
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED, reset_states
 
 
 @dataclass(frozen=True)

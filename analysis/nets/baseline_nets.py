@@ -19,10 +19,10 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets import metrics
-from analysis.nets.dataset import SampleSet
-from analysis.nets.metrics import CLASSES
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.sparse import SparseWindows
 
 EPOCHS = 10
 BATCH = 128

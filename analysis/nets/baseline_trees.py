@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from analysis.nets.baselines import cell_sums, step_sums
-from analysis.nets.dataset import SampleSet
-from analysis.nets.metrics import CLASSES
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.baselines import cell_sums, step_sums
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.sparse import SparseWindows
 
 ROUNDS = 100
 """Of boosting, at most; each grows a tree a class."""

@@ -19,8 +19,8 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 from threadpoolctl import threadpool_limits
 
-from analysis.nets.metrics import CLASSES, Labels, accuracy, check_labels
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.metrics import CLASSES, Labels, accuracy, check_labels
+from sliplab.analysis.nets.sparse import SparseWindows
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -21,8 +21,8 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from analysis.nets.network import SPIKING, WEIGHTED
-from analysis.nets.spiking import neuron
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED
+from sliplab.analysis.nets.spiking import neuron
 
 
 def _forward(current: torch.Tensor, threshold: float) -> tuple[torch.Tensor, torch.Tensor]:

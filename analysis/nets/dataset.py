@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.samples import choose_windows, consecutive_windows
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.windows import list_events
-from protocols.settings import Samples, Windows
-from storage.array_file import Arrays, map_arrays, write_arrays
-from storage.recording import Recording
+from sliplab.analysis.nets.samples import choose_windows, consecutive_windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.windows import list_events
+from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.array_file import Arrays, map_arrays, write_arrays
+from sliplab.storage.recording import Recording
 
 VERSION = 1
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_softmax
 
-from analysis.nets import metrics
+from sliplab.analysis.nets import metrics
 
 SILENT_RATE = 1e-5
 """Spikes per neuron and step at or below which a layer counts as silent."""

@@ -22,8 +22,8 @@ from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, Singl
 from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
 from torch import nn
 
-from analysis.nets.metrics import CLASSES
-from analysis.nets.network import (
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.network import (
     SPIKING,
     WEIGHTED,
     build,
@@ -32,9 +32,9 @@ from analysis.nets.network import (
     parameters,
     set_weights,
 )
-from protocols.errors import InputError
-from protocols.settings import Network, Windows
-from protocols.yaml_file import KeyedError, StrictModel, load, register_tags
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.settings import Network, Windows
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, load, register_tags
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Side = Annotated[int, Field(ge=1, le=512)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from protocols.settings import Training
+from sliplab.protocols.settings import Training
 
 
 def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.activity import Activity
-from analysis.nets.metrics import CLASSES, class_balance, score
-from analysis.nets.training import Fitted
+from sliplab.analysis.nets.activity import Activity
+from sliplab.analysis.nets.metrics import CLASSES, class_balance, score
+from sliplab.analysis.nets.training import Fitted
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from analysis.nets.epoch_record import EpochRecord
-from analysis.nets.training import Fitted, restore
-from protocols.settings import Network, Training, Windows
-from storage.files import write_bytes
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.nets.training import Fitted, restore
+from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.files import write_bytes
 
 FORMAT = "sliplab-model-1"
 

@@ -19,8 +19,8 @@ from sinabs.activation import MembraneReset, SingleExponential, SingleSpike
 from sinabs.layers import IAFSqueeze
 from torch import nn
 
-from analysis.nets.metrics import CLASSES
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.protocols.settings import Network, Windows
 
 WEIGHTED = ("conv1", "conv2", "fc1", "fc2")
 """Names of the layers with weights, in order; ``settings.weight_scale`` belongs to them."""

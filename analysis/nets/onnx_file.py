@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from analysis.nets.metrics import CLASSES
-from analysis.nets.network import SPIKING, WEIGHTED, parameters, spike_counts
-from protocols.settings import Windows
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED, parameters, spike_counts
+from sliplab.protocols.settings import Windows
 
 OPSET = 17
 IR_VERSION = 8

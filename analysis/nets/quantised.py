@@ -18,10 +18,17 @@ import torch
 from numba import njit
 from torch import nn
 
-from analysis.nets.metrics import winners
-from analysis.nets.network import SPIKING, WEIGHTED, build, by_class, parameters, set_weights
-from analysis.nets.speck import STATE_BITS, WEIGHT_BITS
-from analysis.nets.training import Fitted
+from sliplab.analysis.nets.metrics import winners
+from sliplab.analysis.nets.network import (
+    SPIKING,
+    WEIGHTED,
+    build,
+    by_class,
+    parameters,
+    set_weights,
+)
+from sliplab.analysis.nets.speck import STATE_BITS, WEIGHT_BITS
+from sliplab.analysis.nets.training import Fitted
 
 LOWEST = np.float32(-(1 << STATE_BITS - 1))
 HIGHEST = np.float32((1 << STATE_BITS - 1) - 1)

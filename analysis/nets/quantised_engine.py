@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from analysis.nets.network import SPIKING, WEIGHTED, build, set_weights
-from analysis.nets.quantised import Quantised
-from analysis.nets.training import Fitted
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED, build, set_weights
+from sliplab.analysis.nets.quantised import Quantised
+from sliplab.analysis.nets.training import Fitted
 
 MOST, BLOCK = 1 << 20, 1 << 13
 """Where the search for a common threshold ends, and how many are tried at once."""

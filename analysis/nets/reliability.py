@@ -15,8 +15,8 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
 
-from analysis.nets.metrics import Counts, IntArray, Labels, check
-from analysis.nets.window_groups import share
+from sliplab.analysis.nets.metrics import Counts, IntArray, Labels, check
+from sliplab.analysis.nets.window_groups import share
 
 FloatArray = npt.NDArray[np.float64]
 

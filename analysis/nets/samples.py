@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.nets.metrics import GROSS, INCIPIENT, NO_SLIP
+from sliplab.analysis.nets.metrics import GROSS, INCIPIENT, NO_SLIP
 
 
 def consecutive_windows(start_ns: int, end_ns: int, window_ns: int) -> NDArray[np.int64]:

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from analysis.nets.metrics import CLASSES
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.protocols.settings import Network, Windows
 
 KI = 1024
 

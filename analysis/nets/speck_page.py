@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from analysis.nets.model_card import latency_table, percent, table
-from analysis.nets.speck import KI
+from sliplab.analysis.nets.model_card import latency_table, percent, table
+from sliplab.analysis.nets.speck import KI
 
 NOT_SHOWN = (
     "The chip has no time steps: it looks at a neuron's threshold after every spike, where this "

@@ -18,11 +18,11 @@ import torch
 from sinabs.activation import MembraneReset, SingleExponential, SingleSpike
 from torch import nn
 
-from analysis.nets import spiking_gradients, spiking_kernels
-from analysis.nets.metrics import CLASSES
-from analysis.nets.network import SPIKING, matrices
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking_layout import Layout
+from sliplab.analysis.nets import spiking_gradients, spiking_kernels
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.network import SPIKING, matrices
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking_layout import Layout
 
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]

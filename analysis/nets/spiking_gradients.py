@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from analysis.nets.lanes import LANES, add, add_times
-from analysis.nets.spiking_kernels import add_bias, fire, scatter, scatter_counts
+from sliplab.analysis.nets.lanes import LANES, add, add_times
+from sliplab.analysis.nets.spiking_kernels import add_bias, fire, scatter, scatter_counts
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 _U0, _LANES = np.uint64(0), np.uint64(LANES)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from analysis.nets.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
+from sliplab.analysis.nets.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
 
 _U0, _U1 = np.uint64(0), np.uint64(1)
 _LANES, _BLOCK = np.uint64(LANES), np.uint64(BLOCK)

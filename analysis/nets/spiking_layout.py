@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.lanes import BLOCK, LANES
+from sliplab.analysis.nets.lanes import BLOCK, LANES
 
 F32 = npt.NDArray[np.float32]
 I64 = npt.NDArray[np.int64]

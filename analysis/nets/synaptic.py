@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from analysis.nets.metrics import CLASSES
-from analysis.nets.network import SPIKING, WEIGHTED
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Trainer, side_by_side
-from analysis.nets.spiking_gradients import forward_kept
-from analysis.nets.training import Fitted, restore
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Trainer, side_by_side
+from sliplab.analysis.nets.spiking_gradients import forward_kept
+from sliplab.analysis.nets.training import Fitted, restore
 
 I64 = npt.NDArray[np.int64]
 

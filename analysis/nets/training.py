@@ -21,13 +21,13 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets import metrics
-from analysis.nets.epoch_record import EpochRecord, epoch_record, layer_warnings
-from analysis.nets.network import build, set_weights
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine, Samples
-from analysis.nets.training_run import Run
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.epoch_record import EpochRecord, epoch_record, layer_warnings
+from sliplab.analysis.nets.network import build, set_weights
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine, Samples
+from sliplab.analysis.nets.training_run import Run
+from sliplab.protocols.settings import Network, Training, Windows
 
 VERSION = 8
 """Raised when the same samples, settings and seed give other weights."""

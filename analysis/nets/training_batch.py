@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from analysis.nets.metrics import IntArray
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.metrics import IntArray
+from sliplab.analysis.nets.sparse import SparseWindows
 
 
 @dataclass(frozen=True)

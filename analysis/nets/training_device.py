@@ -19,17 +19,17 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets.compiled_neuron import compiled_net, exact_net, why_not
-from analysis.nets.metrics import IntArray
-from analysis.nets.network import (
+from sliplab.analysis.nets.compiled_neuron import compiled_net, exact_net, why_not
+from sliplab.analysis.nets.metrics import IntArray
+from sliplab.analysis.nets.network import (
     SPIKING,
     by_class,
     parameters,
     reset_states,
     set_matrices,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.training_batch import Batch
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.training_batch import Batch
 
 CPU = "cpu"
 

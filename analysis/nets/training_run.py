@@ -11,10 +11,10 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-from analysis.nets import metrics
-from analysis.nets.epoch_record import EpochRecord
-from analysis.nets.learning_rate import learning_rate
-from analysis.nets.network import (
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.nets.learning_rate import learning_rate
+from sliplab.analysis.nets.network import (
     SPIKING,
     build,
     matrices,
@@ -24,9 +24,9 @@ from analysis.nets.network import (
     set_weights,
     weights,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.training_work import work_on
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.training_work import work_on
+from sliplab.protocols.settings import Network, Training, Windows
 
 
 class Run:

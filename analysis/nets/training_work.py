@@ -13,12 +13,12 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from analysis.nets.metrics import IntArray
-from analysis.nets.network import SPIKING, by_parameter
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Job, Trainer, WindowLoss
-from analysis.nets.training_batch import Batch, Work
-from analysis.nets.training_device import CPU, on_device
+from sliplab.analysis.nets.metrics import IntArray
+from sliplab.analysis.nets.network import SPIKING, by_parameter
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Job, Trainer, WindowLoss
+from sliplab.analysis.nets.training_batch import Batch, Work
+from sliplab.analysis.nets.training_device import CPU, on_device
 
 MICRO_BATCH = 4
 """Samples whose gradients are computed at once by the kernels; they are summed up to

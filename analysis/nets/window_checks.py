@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from analysis.nets import metrics, training
-from analysis.nets.metrics import CLASSES, Counts, IntArray, Labels
-from analysis.nets.network import set_weights
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from analysis.nets.training import Fitted, restore
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets import metrics, training
+from sliplab.analysis.nets.metrics import CLASSES, Counts, IntArray, Labels
+from sliplab.analysis.nets.network import set_weights
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.nets.training import Fitted, restore
+from sliplab.protocols.settings import Network, Training, Windows
 
 
 class CheckFailed(Exception):

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.metrics import CLASSES, Counts, IntArray, Labels, check, winners
-from analysis.statistics.intervals import mean_interval, share_interval
+from sliplab.analysis.nets.metrics import CLASSES, Counts, IntArray, Labels, check, winners
+from sliplab.analysis.statistics.intervals import mean_interval, share_interval
 
 FloatArray = npt.NDArray[np.float64]
 

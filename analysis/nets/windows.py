@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.nets.sparse import SparseWindows
-from protocols.settings import Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.protocols.settings import Windows
 
 _UNSORTED = -1
 

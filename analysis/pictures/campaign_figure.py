@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 
-from analysis.pictures.figure_style import BLUE, STYLE, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, STYLE, svg_text
 
 
 def event_rates(numbers: Sequence[int], rates: Sequence[float], *, simulated: bool) -> str:

@@ -6,7 +6,16 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
 
-from analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, STYLE, svg_text
+from sliplab.analysis.pictures.figure_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    RED,
+    STYLE,
+    svg_text,
+)
 
 _LINES = (
     (GREY, "-", "o"),

@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator, NullLocator
 
-from analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, svg_text
 
 Array = npt.NDArray[Any]
 

@@ -8,7 +8,16 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, WIDTH, svg_text
+from sliplab.analysis.pictures.figure_style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    STYLE,
+    WIDTH,
+    svg_text,
+)
 
 DENSE = 250
 """From this many marks on they are drawn as pixels, not as shapes."""

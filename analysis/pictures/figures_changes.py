@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
 
-from analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
 
 _ROW, _AROUND = 0.3, 1.5
 _APART = 0.16

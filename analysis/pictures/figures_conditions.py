@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import matplotlib.pyplot as plt
 import numpy as np
 
-from analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
-from analysis.statistics.intervals import interval
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
+from sliplab.analysis.statistics.intervals import interval
 
 _ROW, _AROUND = 0.26, 1.25
 _SEED = 0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import matplotlib.pyplot as plt
 from matplotlib.ticker import MaxNLocator, NullLocator
 
-from analysis.pictures.figure_style import BLUE, GREY, RED, STYLE, WIDTH, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, RED, STYLE, WIDTH, svg_text
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import MaxNLocator
 
-from analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, svg_text
+from sliplab.analysis.pictures.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, svg_text
 
 F64 = npt.NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from analysis.nets.metrics import CLASSES
-from analysis.pictures.figure_style import BLUE, GREY, STYLE, svg_text
-from analysis.pictures.figures import CLASS_COLOURS, CLASS_WORDS
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, STYLE, svg_text
+from sliplab.analysis.pictures.figures import CLASS_COLOURS, CLASS_WORDS
 
 
 def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:

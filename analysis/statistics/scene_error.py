@@ -13,11 +13,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets.metrics import GROSS, INCIPIENT, NO_SLIP
-from analysis.nets.samples import consecutive_windows
-from analysis.nets.windows import bin_events
-from protocols.settings import Windows
-from storage.streams import EventChunk
+from sliplab.analysis.nets.metrics import GROSS, INCIPIENT, NO_SLIP
+from sliplab.analysis.nets.samples import consecutive_windows
+from sliplab.analysis.nets.windows import bin_events
+from sliplab.protocols.settings import Windows
+from sliplab.storage.streams import EventChunk
 
 I64 = npt.NDArray[np.int64]
 Onsets = tuple[int | None, int | None]

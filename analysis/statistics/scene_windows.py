@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from analysis.nets.metrics import CLASSES, NO_SLIP
-from analysis.nets.samples import choose_windows
-from analysis.nets.windows import window_totals
-from analysis.statistics.scene_error import Seen
-from protocols.settings import Samples, Windows
+from sliplab.analysis.nets.metrics import CLASSES, NO_SLIP
+from sliplab.analysis.nets.samples import choose_windows
+from sliplab.analysis.nets.windows import window_totals
+from sliplab.analysis.statistics.scene_error import Seen
+from sliplab.protocols.settings import Samples, Windows
 
 PHASES = ("hold", "loading", "incipient", "gross")
 

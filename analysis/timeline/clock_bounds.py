@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from storage.clockmap import ClockMap
+from sliplab.storage.clockmap import ClockMap
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

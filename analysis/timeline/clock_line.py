@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from analysis.timeline.pulse_kernels import (
+from sliplab.analysis.timeline.pulse_kernels import (
     changes,
     largest_sizes,
     median,

@@ -18,7 +18,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.timeline.clock_line import (
+from sliplab.analysis.timeline.clock_line import (
     STEP,
     STEP_AT_END,
     ClockLine,
@@ -26,8 +26,8 @@ from analysis.timeline.clock_line import (
     gained,
     line_within_unit,
 )
-from analysis.timeline.pulse_kernels import median
-from analysis.timeline.pulse_match import (
+from sliplab.analysis.timeline.pulse_kernels import median
+from sliplab.analysis.timeline.pulse_match import (
     MIN_PULSES,
     WIRED,
     Match,
@@ -35,8 +35,8 @@ from analysis.timeline.pulse_match import (
     match_trains,
     tick_of,
 )
-from analysis.timeline.pulse_runs import stray_stretch, unevenness
-from storage.clockmap import ClockMap
+from sliplab.analysis.timeline.pulse_runs import stray_stretch, unevenness
+from sliplab.storage.clockmap import ClockMap
 
 Reason = Literal["too_few_pulses", "ambiguous", "no_match", "drift", "residuals"]
 Rounding = Literal["down", "up", "nearest"]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from analysis.timeline.clock_line import theil_sen
-from analysis.timeline.pulse_kernels import fullest, pair, partners, quantile
+from sliplab.analysis.timeline.clock_line import theil_sen
+from sliplab.analysis.timeline.pulse_kernels import fullest, pair, partners, quantile
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from analysis.timeline.pulse_kernels import most_off
+from sliplab.analysis.timeline.pulse_kernels import most_off
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

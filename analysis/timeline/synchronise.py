@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.timeline.clock_bounds import (
+from sliplab.analysis.timeline.clock_bounds import (
     MIN_PAIRS,
     BoundedClock,
     BoundsContradictError,
     fit_bounds,
 )
-from analysis.timeline.clocks import (
+from sliplab.analysis.timeline.clocks import (
     UNDISTURBED,
     ClockFit,
     ClockRefused,
     fit_clock,
     fit_numbered,
 )
-from analysis.timeline.counters import split_at_restarts
-from protocols.timing import DeviceClock, Timing
-from storage.clockmap import ClockMap
-from storage.hdf5 import StreamReader
-from storage.recording import Recording
+from sliplab.analysis.timeline.counters import split_at_restarts
+from sliplab.protocols.timing import DeviceClock, Timing
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from protocols.errors import InputError
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from analysis.calibration.charuco import Board
+    from sliplab.analysis.calibration.charuco import Board
 
 PNG_PX_PER_MM = 50
 _MM_PER_INCH = 25.4

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flows.calibrating.measuring import Bench, Finding, px
-from flows.running import console
-from protocols.errors import InputError
-from rigs.capabilities import RigError
-from rigs.rig import StopRequested
-from rigs.teaching import look, stir
+from sliplab.flows.calibrating.measuring import Bench, Finding, px
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig import StopRequested
+from sliplab.rigs.teaching import look, stir
 
 MOST_LENS_PX = 0.5
 MOST_CROP_PX = 5.0
@@ -76,7 +76,7 @@ def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today:
     Raises:
         RigError: pictures from which they cannot be found, or a residual above 0.5 px.
     """
-    from analysis.calibration.charuco import BoardError, find_corners, fit_lens
+    from sliplab.analysis.calibration.charuco import BoardError, find_corners, fit_lens
 
     sizes = {picture.shape for picture in pictures}
     if len(sizes) != 1:
@@ -139,7 +139,7 @@ def calibrate_crop(bench: Bench, depth_mm: float, radius_mm: float) -> Finding:
     Raises:
         RigError: no skin found, or its two halves differ by more than 5 px.
     """
-    from analysis.calibration.crop import CropError, find_crop
+    from sliplab.analysis.calibration.crop import CropError, find_crop
 
     rig = bench.rig
     with console.bar(f"{bench.simulated}rounds", 1) as bar:

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flows.calibrating.measuring import Bench, Finding, Planned, mm
-from flows.running import console
-from protocols.errors import InputError
-from protocols.program import Position
-from rigs.capabilities import Pose, RigError
-from rigs.plate_frame import PlateFrame
-from rigs.rig_file import RigFile
-from rigs.teaching import ASLANT, Creep, MarkerFinder, Touch, jogged, touch
-from storage.streams import FrameChunk
+from sliplab.flows.calibrating.measuring import Bench, Finding, Planned, mm
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.program import Position
+from sliplab.rigs.capabilities import Pose, RigError
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.teaching import ASLANT, Creep, MarkerFinder, Touch, jogged, touch
+from sliplab.storage.streams import FrameChunk
 
 F64 = npt.NDArray[np.float64]
 
@@ -169,7 +169,7 @@ def _plane_found(
 
 def marker_finder(bench: Bench) -> MarkerFinder:
     """Finds the markers in what the rig's outside camera hands over, from the first frame on."""
-    from analysis.labels.markers import MarkerTracker
+    from sliplab.analysis.labels.markers import MarkerTracker
 
     layout = np.array(bench.file.skin.layout_mm()) * bench.file.frame_camera.scale_px_per_mm
     tracker = MarkerTracker(layout)
@@ -242,7 +242,7 @@ def teach_tool(bench: Bench, poses: int, tool: Pose) -> Finding:
     """
     from scipy.spatial.transform import Rotation
 
-    from analysis.calibration.pivot import PivotError, find_tip
+    from sliplab.analysis.calibration.pivot import PivotError, find_tip
 
     prompts = [
         (

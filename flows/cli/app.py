@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.calibrate import calibrate_app, teach_app
-from flows.cli.chain import register as register_chain
-from flows.cli.common import (
+from sliplab.flows.cli.calibrate import calibrate_app, teach_app
+from sliplab.flows.cli.chain import register as register_chain
+from sliplab.flows.cli.common import (
     EnableOption,
     JsonOption,
     ProtocolArgument,
@@ -18,22 +18,22 @@ from flows.cli.common import (
     finish,
     prepare_store,
 )
-from flows.cli.control import register as register_control
-from flows.cli.detect import register as register_detect
-from flows.cli.exchange import register as register_exchange
-from flows.cli.generalise import register as register_generalise
-from flows.cli.guesses import register as register_guesses
-from flows.cli.holdout import register as register_holdout
-from flows.cli.models import register as register_models
-from flows.cli.remote import register as register_remote
-from flows.cli.review import register as register_review
-from flows.cli.rigs import rigs
-from flows.cli.schema import register as register_schema
-from flows.cli.serve import register as register_serve
-from flows.cli.steps import register as register_steps
-from flows.cli.store import register as register_store
-from flows.cli.tradeoff import register as register_tradeoff
-from flows.running import console
+from sliplab.flows.cli.control import register as register_control
+from sliplab.flows.cli.detect import register as register_detect
+from sliplab.flows.cli.exchange import register as register_exchange
+from sliplab.flows.cli.generalise import register as register_generalise
+from sliplab.flows.cli.guesses import register as register_guesses
+from sliplab.flows.cli.holdout import register as register_holdout
+from sliplab.flows.cli.models import register as register_models
+from sliplab.flows.cli.remote import register as register_remote
+from sliplab.flows.cli.review import register as register_review
+from sliplab.flows.cli.rigs import rigs
+from sliplab.flows.cli.schema import register as register_schema
+from sliplab.flows.cli.serve import register as register_serve
+from sliplab.flows.cli.steps import register as register_steps
+from sliplab.flows.cli.store import register as register_store
+from sliplab.flows.cli.tradeoff import register as register_tradeoff
+from sliplab.flows.running import console
 
 app = typer.Typer(
     name="sliplab",
@@ -55,15 +55,15 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
-    from flows.planning import plan_view
-    from protocols.plan import load_plan
+    from sliplab.flows.planning import plan_view
+    from sliplab.protocols.plan import load_plan
 
     found = load_plan(protocol, enable or ())
     needed, scene = None, None
     if rig is not None:
-        from flows.planning.estimate import plan_bytes
-        from flows.planning.plan_scene import scene_of
-        from rigs.rig_file import check_plan, load_rig_file
+        from sliplab.flows.planning.estimate import plan_bytes
+        from sliplab.flows.planning.plan_scene import scene_of
+        from sliplab.rigs.rig_file import check_plan, load_rig_file
 
         rig_file, _ = load_rig_file(rig)
         check_plan(rig_file, found, str(rig))
@@ -84,7 +84,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Look at everything that can be known before anything moves."""
-    from flows.planning import preflight
+    from sliplab.flows.planning import preflight
 
     found = preflight.check(protocol, rig, store, tuple(enable or ()))
     if as_json:
@@ -123,9 +123,9 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    from flows.planning.orders import Bench, check_disk, make_order
-    from flows.running import orchestration
-    from storage.store import Store
+    from sliplab.flows.planning.orders import Bench, check_disk, make_order
+    from sliplab.flows.running import orchestration
+    from sliplab.storage.store import Store
 
     order = make_order(
         protocol,
@@ -142,13 +142,13 @@ def collect(
     prepare_store(store)
     if order.wanted(Store(store).campaign(order.campaign)):
         orchestration.begin()  # starts beside all that is imported below
-    from flows.collecting.collect import collect as run
+    from sliplab.flows.collecting.collect import collect as run
 
     result = run(order)
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
     if not as_json:
-        from flows.collecting.aside_view import show_aside
+        from sliplab.flows.collecting.aside_view import show_aside
 
         show_aside(result["causes"])
         result = {key: value for key, value in result.items() if key != "causes"}

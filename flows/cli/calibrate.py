@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from flows.calibrating.measuring import Bench, Finding
-    from rigs.teaching import Creep
+    from sliplab.flows.calibrating.measuring import Bench, Finding
+    from sliplab.rigs.teaching import Creep
 
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
 teach_app = typer.Typer(help="Teach a rig where its plate and its tip are.", **_SETTINGS)  # type: ignore[arg-type]
@@ -82,8 +82,8 @@ def teach_plane(
     as_json: JsonOption = False,
 ) -> None:
     """The contact plane: touches at the centre, to the right, above, and one that checks them."""
-    from flows.calibrating import teach as steps
-    from flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating import teach as steps
+    from sliplab.flows.calibrating.measuring import Measurement
 
     command = Measurement(rig, out, "plane", as_json)
     if by is By.HAND:
@@ -112,8 +112,8 @@ def teach_zero(
     as_json: JsonOption = False,
 ) -> None:
     """Depth zero: touches at the centre, seen by both cameras."""
-    from flows.calibrating import teach as steps
-    from flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating import teach as steps
+    from sliplab.flows.calibrating.measuring import Measurement
 
     command = Measurement(rig, out, "zero", as_json)
     creep = _creep(speed, search, clearance)
@@ -140,9 +140,9 @@ def teach_tool(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """The tool centre point: a person brings the tip onto one point, leaning in many ways."""
-    from flows.calibrating import teach as steps
-    from flows.calibrating.measuring import Measurement
-    from rigs.build import tool_of
+    from sliplab.flows.calibrating import teach as steps
+    from sliplab.flows.calibrating.measuring import Measurement
+    from sliplab.rigs.build import tool_of
 
     command = Measurement(rig, out, "tool", as_json)
     set_now = None if tool is None else _tool(tool)
@@ -169,8 +169,8 @@ def calibrate_lens(
     as_json: JsonOption = False,
 ) -> None:
     """Lens and scale of the outside camera, from a printed ChArUco board. Nothing moves."""
-    from flows.calibrating import calibrate as steps
-    from flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating import calibrate as steps
+    from sliplab.flows.calibrating.measuring import Measurement
 
     board = _board(columns, rows, square)
     command = Measurement(rig, out, "lens", as_json)
@@ -198,8 +198,8 @@ def calibrate_crop(
     as_json: JsonOption = False,
 ) -> None:
     """Where the skin is in the event camera's picture: press, and move in a circle."""
-    from flows.calibrating import calibrate as steps
-    from flows.calibrating.measuring import Measurement, Planned
+    from sliplab.flows.calibrating import calibrate as steps
+    from sliplab.flows.calibrating.measuring import Measurement, Planned
 
     command = Measurement(rig, out, "crop", as_json)
     limit = float(command.file.limits.depth)
@@ -224,7 +224,7 @@ def calibrate_board(
     as_json: JsonOption = False,
 ) -> None:
     """Make the board to print, with its true size on it."""
-    from flows.calibrating.board_print import print_board
+    from sliplab.flows.calibrating.board_print import print_board
 
     board = _board(columns, rows, square)
     sizes = print_board(board, out)
@@ -236,13 +236,13 @@ def calibrate_board(
 
 
 def _creep(speed: float, search: float, clearance: float) -> Creep:
-    from rigs.teaching import Creep
+    from sliplab.rigs.teaching import Creep
 
     return Creep(speed, search, clearance)
 
 
 def _tool(text: str) -> Any:
-    from rigs.capabilities import Pose
+    from sliplab.rigs.capabilities import Pose
 
     try:
         numbers = [float(part) for part in text.split(",")]
@@ -255,7 +255,7 @@ def _tool(text: str) -> Any:
 
 
 def _board(columns: int, rows: int, square: float) -> Any:
-    from analysis.calibration.charuco import Board, BoardError
+    from sliplab.analysis.calibration.charuco import Board, BoardError
 
     try:
         return Board(columns, rows, square, 0.75 * square)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from flows.cli.common import JsonOption, RigOption, prepare_store
-from flows.running import console
+from sliplab.flows.cli.common import JsonOption, RigOption, prepare_store
+from sliplab.flows.running import console
 
 FULL = ("kinematic", "gravity", "disturbance")
 PILOT = ("pilot", "pilot_gravity")
@@ -21,9 +22,8 @@ HELD_OUT = 144
 
 
 def package_file(package: str, name: str) -> Path:
-    """A file that ships with a package."""
-    module = __import__(package)
-    return Path(module.__path__[0]) / name
+    """A file that ships with one of the packages below `sliplab`."""
+    return Path(import_module(f"sliplab.{package}").__path__[0]) / name
 
 
 def shipped(pilot: bool, extra: bool) -> dict[Path, tuple[str, ...]]:
@@ -90,8 +90,8 @@ def study(
 
 def _status(folder: Path, as_json: bool) -> None:
     """How far a study is."""
-    from flows.study_ledger import FILE, print_rows, read
-    from protocols.errors import InputError
+    from sliplab.flows.study_ledger import FILE, print_rows, read
+    from sliplab.protocols.errors import InputError
 
     rows = read(folder)
     if not rows:
@@ -126,15 +126,15 @@ def _chain(
     holdout: int = 0,
 ) -> None:
     """Run the whole chain and print what came out."""
-    from flows.planning.orders import check_disk, make_order
+    from sliplab.flows.planning.orders import check_disk, make_order
 
     orders = [make_order(file, rig, folder, enable=on) for file, on in protocols.items()]
     check_disk(orders)
     prepare_store(folder)
-    from flows.reporting.report import read_summary
-    from flows.study import study as run
-    from flows.study_searches import searches
-    from storage.store import Store
+    from sliplab.flows.reporting.report import read_summary
+    from sliplab.flows.study import study as run
+    from sliplab.flows.study_searches import searches
+    from sliplab.storage.store import Store
 
     outcome = run(orders, check, searches(orders) if more else (), holdout)
     summary = read_summary(Store.open(folder))
@@ -150,8 +150,8 @@ def _chain(
             }
         )
         return
-    from flows.reporting.sections import headline
-    from flows.study_ledger import print_rows
+    from sliplab.flows.reporting.sections import headline
+    from sliplab.flows.study_ledger import print_rows
 
     print_rows(outcome.rows)
     simulated = " (simulated)" if summary["simulated"] else ""

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.running import console
+from sliplab.flows.running import console
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
@@ -32,22 +32,22 @@ CampaignOption = Annotated[
     list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
 ]
 STEPS = {
-    "sync": "flows.syncing.sync",
-    "label": "flows.labelling.label",
-    "train": "flows.learning.train",
-    "evaluate": "flows.learning.evaluate",
-    "judge_model": "flows.learning.other_networks",
-    "window_baselines": "flows.learning.window_baselines",
-    "window_checks": "flows.learning.window_checks",
-    "report": "flows.reporting.report",
+    "sync": "sliplab.flows.syncing.sync",
+    "label": "sliplab.flows.labelling.label",
+    "train": "sliplab.flows.learning.train",
+    "evaluate": "sliplab.flows.learning.evaluate",
+    "judge_model": "sliplab.flows.learning.other_networks",
+    "window_baselines": "sliplab.flows.learning.window_baselines",
+    "window_checks": "sliplab.flows.learning.window_checks",
+    "report": "sliplab.flows.reporting.report",
 }
 """Where each step stands: the module whose function has the step's name."""
 
 
 def prepare_store(folder: Path) -> None:
     """Make the store and point Prefect at it; everything that imports Prefect comes after."""
-    from flows.running import orchestration
-    from storage.store import Store
+    from sliplab.flows.running import orchestration
+    from sliplab.storage.store import Store
 
     orchestration.prepare(Store.create(folder).folder)
 
@@ -58,8 +58,8 @@ def located(place: str) -> Path:
     Raises:
         StoreError: there is none.
     """
-    from storage.mirror import open_mirror
-    from storage.urls import is_url
+    from sliplab.storage.mirror import open_mirror
+    from sliplab.storage.urls import is_url
 
     if not is_url(place):
         return Path(place)
@@ -91,12 +91,12 @@ def run_step(
     """
     from importlib import import_module
 
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)
-    from flows.running.campaigns import collected
-    from flows.running.cluster import connected
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.running.cluster import connected
 
     campaigns = collected(store, names)
     with connected(dask) as cluster:

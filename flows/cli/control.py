@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.running import console
+from sliplab.flows.running import console
 
 if TYPE_CHECKING:
-    from flows.collecting.controlling import Outcome
-    from storage.control import Kind
+    from sliplab.flows.collecting.controlling import Outcome
+    from sliplab.storage.control import Kind
 
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
 TrialsArgument = Annotated[list[str], typer.Argument(help="Ids of trials, as in `sliplab plan`.")]
@@ -59,12 +59,12 @@ def stop(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Stop a running collection now, the arm first, as Ctrl-C in its terminal would."""
-    from flows.collecting.halting import halt
-    from storage.store import Store
+    from sliplab.flows.collecting.halting import halt
+    from sliplab.storage.store import Store
 
     opened = Store.open(store)
     told = halt(store)  # before anything that takes long to load
-    from flows.collecting import controlling
+    from sliplab.flows.collecting import controlling
 
     outcome = controlling.note_stop(opened, *told, who=who, why=why, limit_s=wait)
     words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
@@ -96,8 +96,8 @@ def register(app: typer.Typer) -> None:
 
 
 def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcome:
-    from flows.collecting import controlling
-    from storage.store import Store
+    from sliplab.flows.collecting import controlling
+    from sliplab.storage.store import Store
 
     return controlling.request(Store.open(store), kind, who=who, why=why, limit_s=wait)
 
@@ -106,9 +106,9 @@ def _decide(
     store: Path, kind: Kind, trials: list[str], campaign: str | None, who: str, why: str,
     wait: float, as_json: bool,
 ) -> None:  # fmt: skip
-    from flows.collecting import controlling
-    from protocols.errors import InputError
-    from storage.store import Store
+    from sliplab.flows.collecting import controlling
+    from sliplab.protocols.errors import InputError
+    from sliplab.storage.store import Store
 
     if not why.strip():
         raise InputError("--why", "", why, "must say something: it is kept with the trial")

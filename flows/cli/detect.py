@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.common import EnableOption, JsonOption, RigOption
-from flows.running import console
+from sliplab.flows.cli.common import EnableOption, JsonOption, RigOption
+from sliplab.flows.running import console
 
 
 def detect(
@@ -51,8 +51,8 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Say what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
-    from flows.detecting.detect import detect as run
-    from flows.detecting.detect_order import make_detect_order
+    from sliplab.flows.detecting.detect import detect as run
+    from sliplab.flows.detecting.detect_order import make_detect_order
 
     order = make_detect_order(
         rig,

@@ -18,12 +18,12 @@ import typer
 from pydantic import ValidationError
 from typer.exceptions import TyperException
 
-from flows.running import console
-from flows.running.limits import exhausted
-from flows.running.standard_streams import OutputLost
-from protocols.errors import InputError
-from storage.errors import StoreError, disk_error
-from storage.files import disk_fault
+from sliplab.flows.running import console
+from sliplab.flows.running.limits import exhausted
+from sliplab.flows.running.standard_streams import OutputLost
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError, disk_error
+from sliplab.storage.files import disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
 _EXPECTED = {

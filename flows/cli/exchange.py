@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import JsonOption, StoreArgument, StoreOption, finish
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import JsonOption, StoreArgument, StoreOption, finish
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 
 def import_(
@@ -30,10 +30,10 @@ def import_(
     """
     from dataclasses import replace
 
-    from flows.collecting.stretch import owned
-    from storage.exchange.find import KINDS, kind_of, trials_in
-    from storage.exchange.take_in import take_in
-    from storage.store import Store, StoreError, safe_name
+    from sliplab.flows.collecting.stretch import owned
+    from sliplab.storage.exchange.find import KINDS, kind_of, trials_in
+    from sliplab.storage.exchange.take_in import take_in
+    from sliplab.storage.store import Store, StoreError, safe_name
 
     where = Path(kind_or_path) if path is None else path
     kind = kind_of(where) if path is None else kind_or_path
@@ -67,9 +67,9 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trials as files that other programs read, or their labels as a table."""
-    from storage.exchange.hand_out import SUFFIXES, hand_out
-    from storage.exchange.tables import label_table, write_table
-    from storage.store import Store
+    from sliplab.storage.exchange.hand_out import SUFFIXES, hand_out
+    from sliplab.storage.exchange.tables import label_table, write_table
+    from sliplab.storage.store import Store
 
     opened = Store.open(store)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
-from flows.running import console
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from sliplab.flows.running import console
 
 
 def generalise(
@@ -37,12 +37,12 @@ def generalise(
     as_json: JsonOption = False,
 ) -> None:
     """Train without a level and test on it; test the network on other simulated skins."""
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)
-    from flows.running.campaigns import collected
-    from flows.searching.generalisation import COLUMNS, measure_generalisation, row_cells
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.searching.generalisation import COLUMNS, measure_generalisation, row_cells
 
     result = measure_generalisation(
         store, collected(store, campaign), factor or (), level or (), every, skins, trials, epochs

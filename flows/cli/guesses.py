@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
-from flows.running import console
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from sliplab.flows.running import console
 
 
 def guesses(
@@ -23,13 +23,13 @@ def guesses(
     as_json: JsonOption = False,
 ) -> None:
     """Take some test trials again with each guess 20 % down and up, and judge them anew."""
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)
-    from flows.running.campaigns import collected
-    from flows.searching.guess_changes import FIGURES, UNITS
-    from flows.searching.guesses import GUESSES, measure_guesses
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.searching.guess_changes import FIGURES, UNITS
+    from sliplab.flows.searching.guesses import GUESSES, measure_guesses
 
     result = measure_guesses(store, collected(store, campaign), tuple(guess or GUESSES), trials)
     if as_json:

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.chain import HELD_OUT
-from flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
-from flows.running import console
+from sliplab.flows.cli.chain import HELD_OUT
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from sliplab.flows.running import console
 
 
 def holdout(
@@ -24,13 +24,13 @@ def holdout(
     as_json: JsonOption = False,
 ) -> None:
     """Judge the network once on another simulated skin and seed, which choose nothing."""
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)
-    from flows.reporting.holdout_section import COLUMNS, rows_of
-    from flows.running.campaigns import collected
-    from flows.searching.holdout import measure_holdout
+    from sliplab.flows.reporting.holdout_section import COLUMNS, rows_of
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.searching.holdout import measure_holdout
 
     done = measure_holdout(store, collected(store, campaign), trials, again)
     if as_json:

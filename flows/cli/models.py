@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.common import CampaignOption, JsonOption, prepare_store
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import CampaignOption, JsonOption, prepare_store
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 
 def export_model(
@@ -32,8 +32,8 @@ def export_model(
     as_json: JsonOption = False,
 ) -> None:
     """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
-    from flows.detecting.detect_order import load_model
-    from storage.store import Store
+    from sliplab.flows.detecting.detect_order import load_model
+    from sliplab.storage.store import Store
 
     if out.exists() and not out.is_dir():
         raise InputError("--out", "", str(out), "must be a folder")
@@ -43,7 +43,7 @@ def export_model(
         raise InputError("--store", "", None, f"is needed: {model} lies in no store")
     opened = Store.open(folder)
     prepare_store(folder)
-    from flows.learning.model_export import export_model as run
+    from sliplab.flows.learning.model_export import export_model as run
 
     result = run(model, fitted, out, opened, campaign, onnx=onnx, checked=windows)
     for warning in (*result["warnings"], *result["problems"]):

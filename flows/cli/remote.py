@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.common import CampaignOption, JsonOption, StoreArgument
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from storage.store import Campaign, Store
+    from sliplab.storage.store import Campaign, Store
 
 UrlArgument = Annotated[
     str, typer.Argument(help="Where pushed stores are: s3://bucket/folder, file:///shared/folder.")
@@ -47,12 +47,12 @@ def push(
 
     It may run while trials are taken. Keys and addresses of servers come from the environment.
     """
-    from flows.collecting.halting import holder_of
-    from flows.running import stopping
-    from storage.push import Wishes
-    from storage.push import push as send
-    from storage.remote import Remote
-    from storage.store import Store
+    from sliplab.flows.collecting.halting import holder_of
+    from sliplab.flows.running import stopping
+    from sliplab.storage.push import Wishes
+    from sliplab.storage.push import push as send
+    from sliplab.storage.remote import Remote
+    from sliplab.storage.store import Store
 
     opened = Store.open(store)
     chosen = _chosen(opened, campaign)
@@ -85,8 +85,8 @@ def pull(
     as_json: JsonOption = False,
 ) -> None:
     """Bring pushed trials into a store, each checked; run it again to bring what is new."""
-    from storage.pull import pull as bring
-    from storage.remote import Remote
+    from sliplab.storage.pull import pull as bring
+    from sliplab.storage.remote import Remote
 
     with console.bar(f"pull {url} (trials)", 0) as bar:
 
@@ -107,9 +107,9 @@ def verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
     Raises:
         InputError: something was to be set aside there.
     """
-    from flows.running import stopping
-    from storage.remote import Remote
-    from storage.remote_check import verify_remote
+    from sliplab.flows.running import stopping
+    from sliplab.storage.remote import Remote
+    from sliplab.storage.remote_check import verify_remote
 
     if quarantine:
         raise InputError(

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.common import CampaignOption, JsonOption, StoreArgument
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from flows.reviewing.review_list import TrialList
+    from sliplab.flows.reviewing.review_list import TrialList
 
 
 def review(
@@ -30,8 +30,8 @@ def review(
 
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
-    from flows.reviewing.review_server import serve
-    from storage.store import Store
+    from sliplab.flows.reviewing.review_server import serve
+    from sliplab.storage.store import Store
 
     def ready(address: str, trials: TrialList) -> None:
         waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
@@ -57,8 +57,8 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
-    from flows.reviewing import view as looking
-    from storage.store import Store
+    from sliplab.flows.reviewing import view as looking
+    from sliplab.storage.store import Store
 
     subject = looking.find(Store.open(store), trial, campaign)
     if save is None:

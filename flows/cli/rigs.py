@@ -7,15 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.running import console
-from protocols.errors import InputError
-from rigs.capabilities import RigError
-from rigs.reach import reach
-from rigs.rig_file import RigFile, load_rig_file
-from rigs.rig_inheritance import shipped_rigs
-from rigs.rig_lock import held
-from storage.lock import Locked
-from storage.secrets import masked
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.reach import reach
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
+from sliplab.rigs.rig_lock import held
+from sliplab.storage.lock import Locked
+from sliplab.storage.secrets import masked
 
 
 def rigs(

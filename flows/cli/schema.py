@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import JsonOption, finish
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import JsonOption, finish
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 KINDS = ("protocol", "rig")
 
@@ -24,8 +24,8 @@ def schema(
     """Print the JSON Schema of a protocol or rig file."""
     if kind not in KINDS:
         raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
-    from flows.planning.schema import file_schema
-    from storage.files import write_json
+    from sliplab.flows.planning.schema import file_schema
+    from sliplab.storage.files import write_json
 
     made = file_schema("protocol" if kind == "protocol" else "rig")
     if out is None:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import JsonOption, RigOption, StoreOption, prepare_store
-from flows.running import console
+from sliplab.flows.cli.common import JsonOption, RigOption, StoreOption, prepare_store
+from sliplab.flows.running import console
 
 
 def serve(
@@ -32,9 +32,9 @@ def serve(
     as_json: JsonOption = False,
 ) -> None:
     """Serve collect, label, train, evaluate, report, study and chain; Ctrl-C ends, arm first."""
-    from flows.serving.serve_file import load_schedules
-    from rigs.rig_file import load_rig_file
-    from rigs.rig_inheritance import rig_path
+    from sliplab.flows.serving.serve_file import load_schedules
+    from sliplab.rigs.rig_file import load_rig_file
+    from sliplab.rigs.rig_inheritance import rig_path
 
     found = [] if schedules is None else load_schedules(schedules)
     file, _ = load_rig_file(rig)
@@ -47,8 +47,8 @@ def serve(
             console.print_table(f"schedules of {schedules}", columns, rows)
         return
     prepare_store(store)
-    from flows.serving.serve import serve as run
-    from storage.store import Store
+    from sliplab.flows.serving.serve import serve as run
+    from sliplab.storage.store import Store
 
     run(
         Store.open(store),

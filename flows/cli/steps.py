@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.common import (
+from sliplab.flows.cli.common import (
     CampaignOption,
     DaskOption,
     JsonOption,
@@ -18,8 +18,8 @@ from flows.cli.common import (
     run_step,
     step,
 )
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 
 class Engine(StrEnum):
@@ -45,7 +45,7 @@ def sync(
     if as_json:
         console.print_json(result)
         return
-    from flows.syncing.sync import COLUMNS, tables
+    from sliplab.flows.syncing.sync import COLUMNS, tables
 
     for title, rows in tables(result):
         console.print_table(title, COLUMNS, rows)
@@ -178,13 +178,13 @@ def report(
     """Write report/index.html and report/summary.json, and compare with another report."""
     folder = located(store)
     if against is not None:
-        from flows.reporting.report_against import load_other
+        from sliplab.flows.reporting.report_against import load_other
 
         load_other(against)  # wrong input is told before anything is made
     result = run_step(folder, campaign, "report")
     if against is not None:
-        from flows.reporting import report, report_against_page
-        from storage.store import Store
+        from sliplab.flows.reporting import report, report_against_page
+        from sliplab.storage.store import Store
 
         compared = report.against(Store.open(folder), against)
         if as_json:

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.common import JsonOption, PlaceArgument, StoreArgument, located
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import JsonOption, PlaceArgument, StoreArgument, located
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 SHOWN = (
     "campaign", "trial", "recorded_s", "events", "frames", "frame_source", "attempt", "simulated"
@@ -28,9 +28,9 @@ def trials(
     as_json: JsonOption = False,
 ) -> None:
     """The catalogue of committed trials as a table, and what was set aside, with causes."""
-    from flows.collecting.aside_view import all_aside, show_aside
-    from storage.catalogue import catalogue, query
-    from storage.store import Store
+    from sliplab.flows.collecting.aside_view import all_aside, show_aside
+    from sliplab.storage.catalogue import catalogue, query
+    from sliplab.storage.store import Store
 
     unreadable: list[str] = []
     opened = Store.open(located(store))
@@ -47,7 +47,7 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from storage.exchange.tables import write_table
+        from sliplab.storage.exchange.tables import write_table
 
         write_table(table, output)
         console.say(f"{len(table)} trials: {output}")
@@ -81,13 +81,13 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Check every checksum, count and clock of a store; changes nothing unless told to."""
-    from storage.store import Store
-    from storage.urls import is_url
-    from storage.verify import set_aside, trial_folders
-    from storage.verify import verify as look
+    from sliplab.storage.store import Store
+    from sliplab.storage.urls import is_url
+    from sliplab.storage.verify import set_aside, trial_folders
+    from sliplab.storage.verify import verify as look
 
     if is_url(store):
-        from flows.cli.remote import verify_pushed
+        from sliplab.flows.cli.remote import verify_pushed
 
         verify_pushed(store, quarantine, as_json)
         return
@@ -97,7 +97,7 @@ def verify(
         problems = look(opened, lambda name: bar.advance(1, name))
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
-        from flows.collecting.stretch import owned
+        from sliplab.flows.collecting.stretch import owned
 
         with owned(opened):
             moved = set_aside(opened, problems)
@@ -129,11 +129,11 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
 
     `collect` does the same before it begins.
     """
-    from storage.errors import disk_explained
-    from storage.lock import exclusive
-    from storage.migrate import kept
-    from storage.migrate import migrate as bring
-    from storage.store import Store
+    from sliplab.storage.errors import disk_explained
+    from sliplab.storage.lock import exclusive
+    from sliplab.storage.migrate import kept
+    from sliplab.storage.migrate import migrate as bring
+    from sliplab.storage.store import Store
 
     opened = Store.open(store)
     with (

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.common import CampaignOption, DaskOption, JsonOption, located, prepare_store
-from flows.cli.steps import ReviewedOption
-from flows.running import console
-from protocols.errors import InputError
+from sliplab.flows.cli.common import CampaignOption, DaskOption, JsonOption, located, prepare_store
+from sliplab.flows.cli.steps import ReviewedOption
+from sliplab.flows.running import console
+from sliplab.protocols.errors import InputError
 
 SCENE_OUT = Path("sliplab-tradeoff")
 
@@ -141,8 +141,8 @@ def _scene(
     dask: str | None,
     as_json: bool,
 ) -> None:
-    from flows.searching import tradeoff as steps
-    from flows.searching.tradeoff_page import choice_pairs, short_table
+    from sliplab.flows.searching import tradeoff as steps
+    from sliplab.flows.searching.tradeoff_page import choice_pairs, short_table
 
     result = steps.tradeoff(scene, rig, out, trials, sensitivity, dask=dask)
     if as_json:
@@ -163,16 +163,16 @@ def _detector(
     options: dict[str, Any],
     as_json: bool,
 ) -> None:
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     folder = located(place)
     store = Store.open(folder)
     prepare_store(folder)
-    from flows.running.campaigns import collected
-    from flows.searching import detector_tradeoff as steps
-    from flows.searching.detector_tradeoff_data import Ask
-    from flows.searching.detector_tradeoff_grid import Axes
-    from flows.searching.detector_tradeoff_text import short_table
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.searching import detector_tradeoff as steps
+    from sliplab.flows.searching.detector_tradeoff_data import Ask
+    from sliplab.flows.searching.detector_tradeoff_grid import Axes
+    from sliplab.flows.searching.detector_tradeoff_text import short_table
 
     asked = Ask(**{name: value for name, value in how.items() if value is not None})
     given = Axes(**{name: tuple(sorted(set(each))) for name, each in axes.items() if each})

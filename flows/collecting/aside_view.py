@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from flows.planning.orders import set_aside
-from flows.running import console
-from flows.running.campaigns import Collected
-from protocols import InputError
-from storage.store import IMPORTED, Store, StoreError
+from sliplab.flows.planning.orders import set_aside
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols import InputError
+from sliplab.storage.store import IMPORTED, Store, StoreError
 
 
 def all_aside(

@@ -10,16 +10,16 @@ import time
 from collections.abc import Callable
 from datetime import datetime
 
-from flows.collecting.disk_watch import DiskWatch
-from flows.collecting.reference_watch import ReferenceWatch
-from flows.collecting.stops import CampaignStopped, WindowOver
-from flows.planning.orders import Order, pending_trials
-from flows.running import console, stopping
-from protocols import Trial
-from storage import control, decisions
-from storage.control import Request
-from storage.store import Campaign, Store
-from storage.streams import Json
+from sliplab.flows.collecting.disk_watch import DiskWatch
+from sliplab.flows.collecting.reference_watch import ReferenceWatch
+from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
+from sliplab.flows.planning.orders import Order, pending_trials
+from sliplab.flows.running import console, stopping
+from sliplab.protocols import Trial
+from sliplab.storage import control, decisions
+from sliplab.storage.control import Request
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.streams import Json
 
 PAUSE_LIMIT_S = 12 * 3600.0
 LOOK_S = 0.5

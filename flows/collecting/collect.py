@@ -11,18 +11,18 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.collecting.boundary import carry_out, refuse_paused
-from flows.collecting.remaining import Remaining
-from flows.collecting.session import Session
-from flows.collecting.showing import shown
-from flows.collecting.stretch import owned, refresh, stretch
-from flows.planning.orders import Order, campaign_counts, check_disk
-from flows.running import console, stopping
-from flows.running.orchestration import Parcel, run
-from flows.running.timing import timed
-from protocols import Trial
-from storage import control
-from storage.store import Store
+from sliplab.flows.collecting.boundary import carry_out, refuse_paused
+from sliplab.flows.collecting.remaining import Remaining
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.showing import shown
+from sliplab.flows.collecting.stretch import owned, refresh, stretch
+from sliplab.flows.planning.orders import Order, campaign_counts, check_disk
+from sliplab.flows.running import console, stopping
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.timing import timed
+from sliplab.protocols import Trial
+from sliplab.storage import control
+from sliplab.storage.store import Store
 
 MOCK_BATCH = 25
 

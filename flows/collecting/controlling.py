@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from flows.collecting.boundary import carry_out
-from flows.collecting.halting import halt, holder_of
-from flows.collecting.stretch import owned
-from flows.running import console, stopping
-from flows.running.campaigns import collected
-from protocols import InputError
-from storage import control, process
-from storage.control import Kind, Request
-from storage.lock import Locked
-from storage.store import Store
-from storage.streams import Json
+from sliplab.flows.collecting.boundary import carry_out
+from sliplab.flows.collecting.halting import halt, holder_of
+from sliplab.flows.collecting.stretch import owned
+from sliplab.flows.running import console, stopping
+from sliplab.flows.running.campaigns import collected
+from sliplab.protocols import InputError
+from sliplab.storage import control, process
+from sliplab.storage.control import Kind, Request
+from sliplab.storage.lock import Locked
+from sliplab.storage.store import Store
+from sliplab.storage.streams import Json
 
 LOOK_S = 0.2
 

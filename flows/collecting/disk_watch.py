@@ -6,12 +6,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from flows.collecting.stops import CampaignStopped
-from flows.planning.estimate import RESERVE, trial_bytes
-from flows.planning.orders import Order
-from flows.running.console import size
-from protocols import Trial
-from storage.store import Campaign
+from sliplab.flows.collecting.stops import CampaignStopped
+from sliplab.flows.planning.estimate import RESERVE, trial_bytes
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.running.console import size
+from sliplab.protocols import Trial
+from sliplab.storage.store import Campaign
 
 _LOOK_BACK = 50
 """Committed trials that a stretch of work learns from when it begins."""

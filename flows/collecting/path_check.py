@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigs.rig import Way
-from storage.streams import F64, I64
+from sliplab.rigs.rig import Way
+from sliplab.storage.streams import F64, I64
 
 WINDOW_S = 0.5
 """The shortest stretch over which a speed is measured, s."""

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from analysis.labels.places import handed_over
-from analysis.labels.rest import offsets
-from analysis.timeline.synchronise import TrialSync, streams_of, synchronise
-from flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
-from protocols.conditions import Gates
-from protocols.settings import Labelling
-from protocols.timing import Timing
-from rigs.rig import TrialRun
-from storage.columns import TRACKS
-from storage.hdf5 import StreamReader
-from storage.streams import I64, StepTimes
-from storage.writer import DATA
+from sliplab.analysis.labels.places import handed_over
+from sliplab.analysis.labels.rest import offsets
+from sliplab.analysis.timeline.synchronise import TrialSync, streams_of, synchronise
+from sliplab.flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
+from sliplab.protocols.conditions import Gates
+from sliplab.protocols.settings import Labelling
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.rig import TrialRun
+from sliplab.storage.columns import TRACKS
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.streams import I64, StepTimes
+from sliplab.storage.writer import DATA
 
 UNVOUCHED_S = 0.3
 """A recording may begin and end this much before and after the pulses on which a clock's fit

@@ -6,11 +6,11 @@ read from the outside camera's pictures by `sliplab label`.
 
 from __future__ import annotations
 
-from flows.collecting.stops import CampaignStopped
-from flows.planning.orders import Order
-from protocols import Trial
-from storage.recording import Recording
-from storage.store import Campaign
+from sliplab.flows.collecting.stops import CampaignStopped
+from sliplab.flows.planning.orders import Order
+from sliplab.protocols import Trial
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign
 
 
 def hold_rate(recording: Recording) -> float:

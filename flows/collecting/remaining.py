@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from flows.running.console import duration
-from protocols import Plan, Trial
+from sliplab.flows.running.console import duration
+from sliplab.protocols import Plan, Trial
 
 
 class Remaining:

@@ -17,19 +17,19 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 
-from flows.collecting.boundary import Boundary
-from flows.collecting.quality import Assessment, assess
-from flows.running import stopping
-from protocols import Plan, Task, Trial
-from protocols.hashing import hash_integer
-from rigs.capabilities import RigError
-from rigs.rig import Rig, StopRequested, TrialRun
-from rigs.rig_file import RigFile
-from storage.errors import disk_explained
-from storage.recording import RECORD_FORMAT
-from storage.store import Campaign
-from storage.streams import Json
-from storage.writer import TrialWriter
+from sliplab.flows.collecting.boundary import Boundary
+from sliplab.flows.collecting.quality import Assessment, assess
+from sliplab.flows.running import stopping
+from sliplab.protocols import Plan, Task, Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig import Rig, StopRequested, TrialRun
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.errors import disk_explained
+from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.store import Campaign
+from sliplab.storage.streams import Json
+from sliplab.storage.writer import TrialWriter
 
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 

@@ -16,12 +16,12 @@ from contextlib import contextmanager, suppress
 from typing import Any
 from uuid import UUID
 
-from flows.planning.orders import Order, campaign_counts
-from flows.running import orchestration, server_calls, stopping
-from protocols import Trial
-from protocols.hashing import hash_text
-from storage.store import Store, StoreError
-from storage.streams import Json
+from sliplab.flows.planning.orders import Order, campaign_counts
+from sliplab.flows.running import orchestration, server_calls, stopping
+from sliplab.protocols import Trial
+from sliplab.protocols.hashing import hash_text
+from sliplab.storage.store import Store, StoreError
+from sliplab.storage.streams import Json
 
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0
@@ -168,7 +168,7 @@ class _Page:
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
     def _tell_picture(self, client: Any) -> None:
-        from analysis.pictures.campaign_figure import event_rates
+        from sliplab.analysis.pictures.campaign_figure import event_rates
 
         numbers, rates = self._rates()
         if rates:

@@ -11,20 +11,20 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from flows.collecting.boundary import Boundary, carry_out
-from flows.collecting.session import Session
-from flows.planning.orders import Order, describe_campaign, pending_trials
-from flows.running import stopping
-from protocols import Trial
-from rigs.build import build_rig
-from rigs.capabilities import RigError
-from rigs.rig_lock import held
-from storage import control
-from storage.errors import disk_explained
-from storage.files import sweep_temporary
-from storage.lock import STORE_LOCK, exclusive
-from storage.migrate import migrate
-from storage.store import Campaign, Store
+from sliplab.flows.collecting.boundary import Boundary, carry_out
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import Order, describe_campaign, pending_trials
+from sliplab.flows.running import stopping
+from sliplab.protocols import Trial
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig_lock import held
+from sliplab.storage import control
+from sliplab.storage.errors import disk_explained
+from sliplab.storage.files import sweep_temporary
+from sliplab.storage.lock import STORE_LOCK, exclusive
+from sliplab.storage.migrate import migrate
+from sliplab.storage.store import Campaign, Store
 
 
 @dataclass(frozen=True)

@@ -13,21 +13,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from analysis.detect.live import ClockFellBack, Counting, LiveDetector, counting_of
-from analysis.nets import training
-from flows.detecting.detect_order import DetectOrder
-from flows.detecting.detect_sink import DetectSink, Timed
-from flows.detecting.detect_view import DetectView
-from flows.running import stopping
-from protocols.errors import InputError
-from protocols.hashing import hash_integer
-from rigs.build import build_rig
-from rigs.capabilities import RigError
-from rigs.reacting import Reaction, run_watched
-from rigs.rig import Rig, StopRequested
-from rigs.rig_file import RigFile
-from rigs.rig_lock import held
-from storage.errors import disk_explained
+from sliplab.analysis.detect.live import ClockFellBack, Counting, LiveDetector, counting_of
+from sliplab.analysis.nets import training
+from sliplab.flows.detecting.detect_order import DetectOrder
+from sliplab.flows.detecting.detect_sink import DetectSink, Timed
+from sliplab.flows.detecting.detect_view import DetectView
+from sliplab.flows.running import stopping
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_integer
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.reacting import Reaction, run_watched
+from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_lock import held
+from sliplab.storage.errors import disk_explained
 
 RATE_HZ = 100
 FOREVER_S = 1e9

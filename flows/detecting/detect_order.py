@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.nets import model_file
-from analysis.nets.training import Fitted
-from protocols import InputError, Plan, Trial, load_plan
-from protocols.program import Move, Program
-from protocols.settings import AnalysisSettings, Detection
-from rigs.levels import with_level
-from rigs.reacting import ACTING, Reflex
-from rigs.rig_file import RigFile, check_plan, load_rig_file
-from storage.files import sha256
+from sliplab.analysis.nets import model_file
+from sliplab.analysis.nets.training import Fitted
+from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.program import Move, Program
+from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.rigs.levels import with_level
+from sliplab.rigs.reacting import ACTING, Reflex
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.storage.files import sha256
 
 POLL_S = 0.005
 """How often the streams are read."""

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from analysis.detect.live import LiveDetector
-from analysis.detect.live_clock import FreshestArrival
-from analysis.detect.live_decision import Decision
-from analysis.nets.metrics import CLASSES, INCIPIENT
-from rigs.capabilities import Clock
-from rigs.reacting import SlipSeen
-from storage.streams import EventChunk, PulseChunk, Unheeded
+from sliplab.analysis.detect.live import LiveDetector
+from sliplab.analysis.detect.live_clock import FreshestArrival
+from sliplab.analysis.detect.live_decision import Decision
+from sliplab.analysis.nets.metrics import CLASSES, INCIPIENT
+from sliplab.rigs.capabilities import Clock
+from sliplab.rigs.reacting import SlipSeen
+from sliplab.storage.streams import EventChunk, PulseChunk, Unheeded
 
 PATIENCE_US = 200_000
 """A window without an event after it is judged so long after its end, by the camera's clock as it

@@ -11,9 +11,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from analysis.nets.metrics import CLASSES, GROSS, INCIPIENT
-from flows.detecting.detect_sink import Timed
-from flows.running import console
+from sliplab.analysis.nets.metrics import CLASSES, GROSS, INCIPIENT
+from sliplab.flows.detecting.detect_sink import Timed
+from sliplab.flows.running import console
 
 EVERY_NS = 150_000_000
 """The picture is drawn no more often: drawing takes milliseconds in which nothing is decided."""

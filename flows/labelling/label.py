@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from analysis.labels import labelling
-from flows.running.campaigns import Collected
-from flows.running.trial_work import TrialWork, run_trials, stale_trials
-from protocols.settings import Labelling
-from storage.derived import make_key
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.labels import labelling
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
+from sliplab.protocols.settings import Labelling
+from sliplab.storage.derived import make_key
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 STEP = "labels"
 

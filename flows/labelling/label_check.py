@@ -12,17 +12,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from analysis.labels import labelling
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.labelling.label_errors import CHECK, rules_compared
-from flows.planning.orders import Order, make_order
-from flows.running.campaigns import collected
-from protocols.yaml_file import mask_secrets, parse_yaml
-from rigs.rig_inheritance import rig_yaml
-from storage.derived import Derived, make_key
-from storage.files import write_text
-from storage.store import Store
+from sliplab.analysis.labels import labelling
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.labelling.label_errors import CHECK, rules_compared
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.running.campaigns import collected
+from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
+from sliplab.rigs.rig_inheritance import rig_yaml
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.files import write_text
+from sliplab.storage.store import Store
 
 VERSION = 1
 TRIALS = 60

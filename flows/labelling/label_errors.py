@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from flows.labelling.label import STEP as LABELS
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.store import Store
+from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.store import Store
 
 KINDS = ("incipient", "gross")
 REFERENCES = ("hold_start", "hold_end")

@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from flows.labelling.label import STEP, label_key
-from flows.running import console
-from flows.running.campaigns import Collected
-from storage.derived import Derived, make_key
-from storage.recording import Recording
-from storage.review import Decision, last
-from storage.store import Store
-from storage.streams import Json
+from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.recording import Recording
+from sliplab.storage.review import Decision, last
+from sliplab.storage.store import Store
+from sliplab.storage.streams import Json
 
 VERSION = 1
 State = Literal["open", "accepted", "adjusted", "rejected", "stale"]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from analysis.nets import dataset, model_file, training
-from flows.running.trial_work import TrialWork, keep_trials, stale_trials
-from protocols.settings import Windows
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.nets import dataset, model_file, training
+from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.protocols.settings import Windows
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 COUNTS = "counts"
 VERSION = 1

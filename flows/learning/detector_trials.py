@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.carried import carried_spikes, trailing_sums
-from analysis.nets import dataset, model_file, training
-from analysis.nets.samples import strided_windows
-from flows.running.trial_work import TrialWork, keep_trials, stale_trials
-from protocols.settings import Windows
-from storage.derived import Derived, make_key
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.detect.carried import carried_spikes, trailing_sums
+from sliplab.analysis.nets import dataset, model_file, training
+from sliplab.analysis.nets.samples import strided_windows
+from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.protocols.settings import Windows
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 HEARD = "heard"
 VERSION = 1

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.detect.detector_comparison import Parts, compare
-from analysis.detect.detectors import Heard, Labelled
-from analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
-from analysis.detect.true_slip import TrueSlip, true_slip
-from flows.labelling.reviewed import Labels
-from flows.learning.detector_trials import Wanted, heard, want
-from flows.running.campaigns import Collected, training_campaigns
-from protocols.settings import AnalysisSettings, Detection
-from storage.recording import Recording
-from storage.store import Store, StoreError
+from sliplab.analysis.detect.detector_comparison import Parts, compare
+from sliplab.analysis.detect.detectors import Heard, Labelled
+from sliplab.analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
+from sliplab.analysis.detect.true_slip import TrueSlip, true_slip
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.detector_trials import Wanted, heard, want
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store, StoreError
 
 
 @dataclass(frozen=True)

@@ -9,31 +9,31 @@ import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis.detect.smoothing_choice import settled
-from analysis.nets.dataset import SampleSet
-from flows.labelling.label_errors import label_errors, rules_compared
-from flows.labelling.reviewed import Labels
-from flows.learning import counting, window_scores
-from flows.learning.counting import COUNTS, count_spikes
-from flows.learning.detector_trials import hear_trials, heard_step
-from flows.learning.detector_work import DetectorWork, detector_work
-from flows.learning.other_networks import judge_beside
-from flows.learning.samples import load_samples
-from flows.learning.train import Model, rules_of, training_settings, wanted_models
-from flows.learning.trial_scores import score_row, summaries
-from flows.learning.window_scores import key_inputs, score_windows
-from flows.running.campaigns import Collected, training_campaigns
-from flows.running.orchestration import Parcel, run
-from flows.running.timing import timed
-from protocols import Trial
-from protocols.settings import Detection
-from storage.derived import Derived, make_key
-from storage.files import read_json
-from storage.recording import Recording
-from storage.store import Store, StoreError
+from sliplab.analysis.detect.smoothing_choice import settled
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.flows.labelling.label_errors import label_errors, rules_compared
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning import counting, window_scores
+from sliplab.flows.learning.counting import COUNTS, count_spikes
+from sliplab.flows.learning.detector_trials import hear_trials, heard_step
+from sliplab.flows.learning.detector_work import DetectorWork, detector_work
+from sliplab.flows.learning.other_networks import judge_beside
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.train import Model, rules_of, training_settings, wanted_models
+from sliplab.flows.learning.trial_scores import score_row, summaries
+from sliplab.flows.learning.window_scores import key_inputs, score_windows
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.timing import timed
+from sliplab.protocols import Trial
+from sliplab.protocols.settings import Detection
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.files import read_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store, StoreError
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 STEP = "evaluation"
 VERSION = 4

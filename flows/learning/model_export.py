@@ -16,24 +16,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets import metrics, training
-from analysis.nets.activity import activity
-from analysis.nets.dataset import SampleSet
-from analysis.nets.model_card import SplitResult, card_markdown, model_card
-from analysis.nets.network import SPIKING, WEIGHTED
-from analysis.nets.quantised import Quantised, chip_run, compare, quantise, quantised_net
-from analysis.nets.speck import speck_fit
-from analysis.nets.speck_page import speck_markdown
-from analysis.nets.training import Fitted
-from flows.labelling.reviewed import Labels
-from flows.learning.model_latency import latencies
-from flows.learning.samples import load_samples
-from flows.learning.train import models_beside, rules_of, training_settings, wanted_models
-from flows.running import console
-from flows.running.campaigns import Collected, collected, training_campaigns
-from protocols.errors import InputError
-from storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
-from storage.store import Store, StoreError
+from sliplab.analysis.nets import metrics, training
+from sliplab.analysis.nets.activity import activity
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.model_card import SplitResult, card_markdown, model_card
+from sliplab.analysis.nets.network import SPIKING, WEIGHTED
+from sliplab.analysis.nets.quantised import Quantised, chip_run, compare, quantise, quantised_net
+from sliplab.analysis.nets.speck import speck_fit
+from sliplab.analysis.nets.speck_page import speck_markdown
+from sliplab.analysis.nets.training import Fitted
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.model_latency import latencies
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.train import models_beside, rules_of, training_settings, wanted_models
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
+from sliplab.storage.store import Store, StoreError
 
 SPLITS = ("train", "validation", "test")
 CHECKED = 256
@@ -178,7 +178,7 @@ def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
 
 def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[bytes, int]:
     """The ONNX file, and on how many windows it was found right."""
-    from analysis.nets.onnx_file import OnnxDiffers, check_onnx, to_onnx
+    from sliplab.analysis.nets.onnx_file import OnnxDiffers, check_onnx, to_onnx
 
     windows = source.fitted.windows
     about = {

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from analysis.detect.detection import detect
-from analysis.detect.latency import score_trial, summarise_latency
-from analysis.detect.true_slip import true_slip
-from analysis.nets import dataset, training
-from analysis.nets.quantised import Quantised, chip_run, quantised_net
-from analysis.nets.training import Fitted
-from flows.labelling.reviewed import Labels
-from flows.learning.train import rules_of
-from flows.running.campaigns import Collected
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.latency import score_trial, summarise_latency
+from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.analysis.nets import dataset, training
+from sliplab.analysis.nets.quantised import Quantised, chip_run, quantised_net
+from sliplab.analysis.nets.training import Fitted
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.train import rules_of
+from sliplab.flows.running.campaigns import Collected
 
 Latency = dict[str, Any]
 """By experiment: ``trials`` with both onsets, and ``latency_ms`` as `summarise_latency` has it."""

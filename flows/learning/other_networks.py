@@ -17,31 +17,31 @@ import numpy as np
 import numpy.typing as npt
 from prefect import flow
 
-from analysis.nets import dataset, metrics, model_file, training, window_groups
-from analysis.nets.external_model import Description, ExternalModel, load_external
-from analysis.nets.network import spike_counts
-from analysis.nets.samples import strided_windows
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from flows.labelling.reviewed import Labels
-from flows.learning import window_scores
-from flows.learning.train import models_beside, rules_of, training_settings
-from flows.learning.trial_scores import score_row, summaries
-from flows.learning.window_scores import intervals_of
-from flows.running import console
-from flows.running.campaigns import Collected, training_campaigns
-from flows.running.orchestration import Parcel, run
-from flows.running.timing import timed
-from flows.running.trial_work import TrialWork, keep_trials, stale_trials
-from protocols.errors import InputError
-from protocols.hashing import hash_data, hash_integer
-from protocols.settings import Detection, Samples, Windows
-from storage.derived import Derived, make_key
-from storage.recording import Recording
-from storage.store import Store, StoreError
+from sliplab.analysis.nets import dataset, metrics, model_file, training, window_groups
+from sliplab.analysis.nets.external_model import Description, ExternalModel, load_external
+from sliplab.analysis.nets.network import spike_counts
+from sliplab.analysis.nets.samples import strided_windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning import window_scores
+from sliplab.flows.learning.train import models_beside, rules_of, training_settings
+from sliplab.flows.learning.trial_scores import score_row, summaries
+from sliplab.flows.learning.window_scores import intervals_of
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.timing import timed
+from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_data, hash_integer
+from sliplab.protocols.settings import Detection, Samples, Windows
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store, StoreError
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 STEP = "other_networks"
 VERSION = 1

@@ -9,19 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from analysis.nets import dataset
-from analysis.nets.dataset import SampleSet
-from flows.labelling.reviewed import Labels
-from flows.running.campaigns import Collected, training_campaigns
-from flows.running.trial_work import TrialWork, each_trial
-from protocols import Trial
-from protocols.hashing import hash_integer
-from protocols.settings import Samples, Windows
-from storage.derived import Derived, make_key
-from storage.recording import Recording
+from sliplab.analysis.nets import dataset
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.running.trial_work import TrialWork, each_trial
+from sliplab.protocols import Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.recording import Recording
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 STEP = "samples"
 _FORMAT = "numbered by place"

@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from analysis.nets import dataset, model_file, training, training_device
-from analysis.nets.dataset import SampleSet
-from flows.labelling.reviewed import Labels
-from flows.learning.samples import load_samples
-from flows.learning.training_progress import progress
-from flows.running import console
-from flows.running.campaigns import Collected, training_campaigns
-from flows.running.orchestration import Parcel, run
-from flows.running.timing import timed
-from protocols.errors import InputError
-from protocols.settings import MARGIN, AnalysisSettings, Detection
-from storage.derived import make_key
-from storage.files import read_json, write_bytes, write_json
-from storage.store import Store, StoreError
+from sliplab.analysis.nets import dataset, model_file, training, training_device
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.training_progress import progress
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.timing import timed
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
+from sliplab.storage.derived import make_key
+from sliplab.storage.files import read_json, write_bytes, write_json
+from sliplab.storage.store import Store, StoreError
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from analysis.nets.epoch_record import EpochRecord
-from analysis.pictures.figures import training_curves
-from flows.running import console, orchestration
-from storage.files import write_text
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.pictures.figures import training_curves
+from sliplab.flows.running import console, orchestration
+from sliplab.storage.files import write_text
 
 if TYPE_CHECKING:
-    from flows.learning.train import Model
+    from sliplab.flows.learning.train import Model
 
 
 @contextmanager

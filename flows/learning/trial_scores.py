@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy.typing as npt
 
-from analysis.detect.detection import detect
-from analysis.detect.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
-from analysis.detect.true_slip import true_slip
-from flows.running.campaigns import Collected
-from protocols import Trial
-from protocols.settings import Detection
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.latency import (
+    TrialLatency,
+    score_trial,
+    summarise_latency,
+    summarise_lead,
+)
+from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols import Trial
+from sliplab.protocols.settings import Detection
 
 Json = dict[str, Any]
 

@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy.typing as npt
 
-from analysis.nets import metrics
-from analysis.nets.baseline_nets import EPOCHS, KINDS, trained_net
-from analysis.nets.baseline_trees import ROUNDS, boosted
-from analysis.nets.baselines import RIDGE, logistic_cells
-from analysis.nets.dataset import SampleSet
-from flows.labelling.reviewed import Labels
-from flows.learning import window_scores
-from flows.learning.samples import STEP as SAMPLES
-from flows.learning.samples import load_samples
-from flows.running import console
-from flows.running.campaigns import Collected
-from flows.running.timing import timed
-from storage.derived import Derived, make_key
-from storage.store import Store
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.baseline_nets import EPOCHS, KINDS, trained_net
+from sliplab.analysis.nets.baseline_trees import ROUNDS, boosted
+from sliplab.analysis.nets.baselines import RIDGE, logistic_cells
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning import window_scores
+from sliplab.flows.learning.samples import STEP as SAMPLES
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.running.timing import timed
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.store import Store
 
 STEP = "baselines"
 EVALUATION = "evaluation"

@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from analysis.nets import metrics, model_file
-from analysis.nets.window_checks import (
+from sliplab.analysis.nets import metrics, model_file
+from sliplab.analysis.nets.window_checks import (
     CheckFailed,
     check_chance,
     check_permutations,
     permuted,
     shuffled_chance,
 )
-from flows.labelling.reviewed import Labels
-from flows.learning.evaluate import choose_model
-from flows.learning.samples import load_samples
-from flows.learning.train import training_settings, wanted_models
-from flows.running import console
-from flows.running.campaigns import Collected
-from storage.store import Store, StoreError
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.evaluate import choose_model
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.train import training_settings, wanted_models
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.store import Store, StoreError
 
 EPOCHS = 3
 """Of each training on shuffled labels: as many as true labels need to be well above chance."""

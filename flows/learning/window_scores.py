@@ -15,19 +15,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets import metrics, model_file, reliability, synaptic, training, window_groups
-from analysis.nets.baselines import evaluate_baselines
-from analysis.nets.dataset import SampleSet, recorded_span
-from flows.learning.samples import TrialRef, load_samples, several, split_trials
-from flows.learning.train import Model, training_settings
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.files import read_json
-from storage.store import Store
+from sliplab.analysis.nets import (
+    metrics,
+    model_file,
+    reliability,
+    synaptic,
+    training,
+    window_groups,
+)
+from sliplab.analysis.nets.baselines import evaluate_baselines
+from sliplab.analysis.nets.dataset import SampleSet, recorded_span
+from sliplab.flows.learning.samples import TrialRef, load_samples, several, split_trials
+from sliplab.flows.learning.train import Model, training_settings
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
 
 if TYPE_CHECKING:
-    from flows.labelling.reviewed import Labels
-    from flows.learning.evaluate import Job
+    from sliplab.flows.labelling.reviewed import Labels
+    from sliplab.flows.learning.evaluate import Job
 
 VERSION = 4
 STEP = "windows"

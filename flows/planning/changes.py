@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from protocols.shown import shown
+from sliplab.protocols.shown import shown
 
 MOST = 12
 _MISSING = object()

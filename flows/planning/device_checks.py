@@ -7,12 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from rigs.capabilities import ArmFault, DeviceHealth, RigError
-from storage.lock import Locked
+from sliplab.rigs.capabilities import ArmFault, DeviceHealth, RigError
+from sliplab.storage.lock import Locked
 
 if TYPE_CHECKING:
-    from flows.planning.orders import Order
-    from rigs.rig import Rig
+    from sliplab.flows.planning.orders import Order
+    from sliplab.rigs.rig import Rig
 
 LISTEN_S = 3.0
 """How long the pulses are listened to, s."""
@@ -29,7 +29,7 @@ class Check:
 
 def check_devices(order: Order) -> list[Check]:
     """Connect every device, hear what it says of itself, and fit the clocks; nothing moves."""
-    from rigs.rig_lock import held
+    from sliplab.rigs.rig_lock import held
 
     try:
         with held(order.rig, order.store):
@@ -42,7 +42,7 @@ def check_devices(order: Order) -> list[Check]:
 
 def _check_held(order: Order) -> list[Check]:
     """As `check_devices`, of a rig that nobody else uses meanwhile."""
-    from rigs.build import build_rig
+    from sliplab.rigs.build import build_rig
 
     found = _check_reach(order)
     if not all(item.passed for item in found):
@@ -75,7 +75,7 @@ def _check_reach(order: Order) -> list[Check]:
     """Devices of a real rig that cannot be reached at all, each by name."""
     if order.rig.simulated or order.rig.devices is None:
         return []
-    from rigs.reach import reach
+    from sliplab.rigs.reach import reach
 
     return [
         Check(name, False, why) for name, why in reach(order.rig.devices).items() if why is not None
@@ -84,9 +84,9 @@ def _check_reach(order: Order) -> list[Check]:
 
 def _check_clocks(order: Order, rig: Rig) -> list[Check]:
     """Every clock that can be heard without frames, fitted as a trial's would be."""
-    from analysis.timeline.synchronise import streams_of, synchronise
-    from storage.hdf5 import StreamReader
-    from storage.writer import DATA, TrialWriter
+    from sliplab.analysis.timeline.synchronise import streams_of, synchronise
+    from sliplab.storage.hdf5 import StreamReader
+    from sliplab.storage.writer import DATA, TrialWriter
 
     rate = order.plan.protocol.collection.recording.sync_rate
     with TemporaryDirectory() as folder:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from protocols import InputError, Move, Plan, Trial
-from rigs.rig_file import RigFile
+from sliplab.protocols import InputError, Move, Plan, Trial
+from sliplab.rigs.rig_file import RigFile
 
 RESERVE = 200_000_000
 """Bytes that must stay free besides the plan's own: the disk is the user's, too."""

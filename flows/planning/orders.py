@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.planning.changes import told
-from flows.planning.estimate import check_space, plan_bytes
-from protocols import InputError, Plan, Trial, load_plan
-from protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
-from rigs.levels import at_level, with_level
-from rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from storage.decisions import skipped
-from storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+from sliplab.flows.planning.changes import told
+from sliplab.flows.planning.estimate import check_space, plan_bytes
+from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
+from sliplab.rigs.levels import at_level, with_level
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
+from sliplab.storage.decisions import skipped
+from sliplab.storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)

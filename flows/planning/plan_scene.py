@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from protocols import Plan
-from rigs.levels import Choice, choose_level, slip_expected
-from rigs.rig_file import RigFile
+from sliplab.protocols import Plan
+from sliplab.rigs.levels import Choice, choose_level, slip_expected
+from sliplab.rigs.rig_file import RigFile
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from flows.running import console
-from protocols import Plan
+from sliplab.flows.running import console
+from sliplab.protocols import Plan
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from flows.planning.plan_scene import Scene
+    from sliplab.flows.planning.plan_scene import Scene
 
 
 def as_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, Any]:

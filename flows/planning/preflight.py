@@ -6,14 +6,20 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from flows.planning.device_checks import Check, check_devices
-from flows.planning.orders import Order, check_disk, make_order, missing_bytes, pending_trials
-from flows.planning.region import check_region
-from flows.running.console import size
-from protocols import InputError
-from rigs.calibration import COMMANDS, find_faults, measured_on
-from rigs.rig_inheritance import read_rig, rig_path
-from storage.store import Store
+from sliplab.flows.planning.device_checks import Check, check_devices
+from sliplab.flows.planning.orders import (
+    Order,
+    check_disk,
+    make_order,
+    missing_bytes,
+    pending_trials,
+)
+from sliplab.flows.planning.region import check_region
+from sliplab.flows.running.console import size
+from sliplab.protocols import InputError
+from sliplab.rigs.calibration import COMMANDS, find_faults, measured_on
+from sliplab.rigs.rig_inheritance import read_rig, rig_path
+from sliplab.storage.store import Store
 
 
 def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from flows.planning.device_checks import Check
-from protocols.program import Move
+from sliplab.flows.planning.device_checks import Check
+from sliplab.protocols.program import Move
 
 if TYPE_CHECKING:
-    from flows.planning.orders import Order
+    from sliplab.flows.planning.orders import Order
 
 
 def check_region(order: Order) -> list[Check]:

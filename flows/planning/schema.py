@@ -16,9 +16,9 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
-from protocols.model import Protocol
-from rigs.rig_file import RigFile
-from rigs.rig_inheritance import KEY
+from sliplab.protocols.model import Protocol
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_inheritance import KEY
 
 Kind = Literal["protocol", "rig"]
 Schema = dict[str, Any]

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from scipy.stats import theilslopes
 
-from analysis.pictures import figures, figures_campaign
-from analysis.pictures.report import Figure, Section, Table, number
-from flows.collecting.reference_watch import hold_rate
-from flows.labelling.label import STEP as LABELS
-from flows.reporting import results
-from flows.running.campaigns import Collected
-from protocols import Trial
-from protocols.factors import Level
-from storage.derived import Derived
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.pictures import figures, figures_campaign
+from sliplab.analysis.pictures.report import Figure, Section, Table, number
+from sliplab.flows.collecting.reference_watch import hold_rate
+from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.flows.reporting import results
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols import Trial
+from sliplab.protocols.factors import Level
+from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.pictures import figures_campaign
-from analysis.pictures.report import Figure, Link, Section, number
-from flows.running.campaigns import Collected
-from flows.syncing.sync_page import PAGE
-from storage.store import Store
+from sliplab.analysis.pictures import figures_campaign
+from sliplab.analysis.pictures.report import Figure, Link, Section, number
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.syncing.sync_page import PAGE
+from sliplab.storage.store import Store
 
 _DEVICES = ("events", "frames", "arm")
 

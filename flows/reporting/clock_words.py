@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.pictures.report import number
-from protocols.timing import WIRED
+from sliplab.analysis.pictures.report import number
+from sliplab.protocols.timing import WIRED
 
 _NO_GRADE = "unknown clocks"
 

@@ -6,9 +6,9 @@ import shlex
 from collections import Counter
 from typing import Any
 
-from analysis.pictures.report import Section, Table, number
-from flows.reporting.report_trials import WORDS
-from storage.store import Store
+from sliplab.analysis.pictures.report import Section, Table, number
+from sliplab.flows.reporting.report_trials import WORDS
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from analysis.pictures.report import Section, Table, number, percent
-from analysis.statistics.intervals import exact_interval
-from flows.reporting.report_extras import FILES, command, odd_shape
-from flows.reporting.report_trials import intervals, told
-from storage.store import Store
+from sliplab.analysis.pictures.report import Section, Table, number, percent
+from sliplab.analysis.statistics.intervals import exact_interval
+from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
+from sliplab.flows.reporting.report_trials import intervals, told
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from analysis.pictures.figures_campaign import label_uncertainty
-from analysis.pictures.report import Figure, Section, Table, number, percent
-from flows.labelling.label import STEP as LABELS
-from flows.labelling.label_errors import KINDS, distances
-from flows.reporting.results import source_text
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.store import Store
+from sliplab.analysis.pictures.figures_campaign import label_uncertainty
+from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent
+from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.flows.labelling.label_errors import KINDS, distances
+from sliplab.flows.reporting.results import source_text
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.store import Store
 
 _ROWS = (
     ("paper", "paper's rule less the true crossing"),

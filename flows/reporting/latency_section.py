@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
-from analysis.pictures.figures_conditions import Panel, by_condition
-from analysis.pictures.published import DISTURBANCE_LEAD_STD_MS, PAPER
-from analysis.pictures.report import Figure, Section, Table, number, percent
-from analysis.statistics.intervals import difference, exact_interval, interval
-from flows.reporting import clock_words
-from flows.reporting.detector_section import choice_note
-from flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values
-from flows.running.campaigns import Collected
+from sliplab.analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.pictures.figures_conditions import Panel, by_condition
+from sliplab.analysis.pictures.published import DISTURBANCE_LEAD_STD_MS, PAPER
+from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent
+from sliplab.analysis.statistics.intervals import difference, exact_interval, interval
+from sliplab.flows.reporting import clock_words
+from sliplab.flows.reporting.detector_section import choice_note
+from sliplab.flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values
+from sliplab.flows.running.campaigns import Collected
 
 Json = dict[str, Any]
 

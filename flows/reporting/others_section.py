@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from analysis.pictures.figures_conditions import Share, shares
-from analysis.pictures.report import Figure, Link, Section, Table, percent
-from flows.reporting import label_tables
-from flows.reporting.report_extras import FILES, command, odd_shape
-from flows.reporting.search_section import search
-from flows.searching import tradeoff_page
-from protocols.quantity import level_order
-from storage.store import Store
+from sliplab.analysis.pictures.figures_conditions import Share, shares
+from sliplab.analysis.pictures.report import Figure, Link, Section, Table, percent
+from sliplab.flows.reporting import label_tables
+from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
+from sliplab.flows.reporting.search_section import search
+from sliplab.flows.searching import tradeoff_page
+from sliplab.protocols.quantity import level_order
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

@@ -12,24 +12,24 @@ from typing import Any
 
 from prefect import flow
 
-from analysis.nets import model_file
-from analysis.pictures import report as page
-from flows.labelling import label_errors
-from flows.learning import evaluate, other_networks
-from flows.learning.train import wanted_models
-from flows.learning.window_baselines import fresh_keys
-from flows.reporting import report_against_page as against_page
-from flows.reporting import sections
-from flows.reporting.report_against import compare, load_other
-from flows.reporting.report_extras import extras
-from flows.reporting.summary import make_summary
-from flows.running import timing
-from flows.running.campaigns import Collected
-from flows.running.orchestration import Parcel, run
-from flows.syncing.sync_page import PAGE as CLOCKS
-from storage.derived import Derived, make_key
-from storage.files import make_folder, read_json, write_json, write_text
-from storage.store import Store, safe_name
+from sliplab.analysis.nets import model_file
+from sliplab.analysis.pictures import report as page
+from sliplab.flows.labelling import label_errors
+from sliplab.flows.learning import evaluate, other_networks
+from sliplab.flows.learning.train import wanted_models
+from sliplab.flows.learning.window_baselines import fresh_keys
+from sliplab.flows.reporting import report_against_page as against_page
+from sliplab.flows.reporting import sections
+from sliplab.flows.reporting.report_against import compare, load_other
+from sliplab.flows.reporting.report_extras import extras
+from sliplab.flows.reporting.summary import make_summary
+from sliplab.flows.running import timing
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.files import make_folder, read_json, write_json, write_text
+from sliplab.storage.store import Store, safe_name
 
 STEP = "report"
 VERSION = 10

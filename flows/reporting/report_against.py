@@ -15,9 +15,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from analysis.statistics.intervals import STATISTICS, between_seeds, difference, share_difference
-from protocols.errors import InputError
-from storage.files import read_json
+from sliplab.analysis.statistics.intervals import (
+    STATISTICS,
+    between_seeds,
+    difference,
+    share_difference,
+)
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import read_json
 
 Json = dict[str, Any]
 Basis = Literal["seeds", "same trials", "trials", "intervals", "none"]

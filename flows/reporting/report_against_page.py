@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from analysis.pictures.figures_conditions import differences
-from analysis.pictures.report import Figure, Number, Section, Table, render_page
-from flows.reporting.report_against import BASES
+from sliplab.analysis.pictures.figures_conditions import differences
+from sliplab.analysis.pictures.report import Figure, Number, Section, Table, render_page
+from sliplab.flows.reporting.report_against import BASES
 
 Json = dict[str, Any]
 

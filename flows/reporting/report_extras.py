@@ -16,9 +16,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from storage.errors import StoreError
-from storage.files import read_json
-from storage.store import Store
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

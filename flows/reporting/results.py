@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.detect.detection import detect
-from analysis.nets import dataset
-from analysis.pictures import figures
-from analysis.pictures.report import Figure, Section, Table, number
-from flows.learning.evaluate import trial_counts
-from flows.reporting import clock_words
-from flows.reporting.detector_section import choice_note
-from flows.running.campaigns import Collected
-from protocols.settings import Detection
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.nets import dataset
+from sliplab.analysis.pictures import figures
+from sliplab.analysis.pictures.report import Figure, Section, Table, number
+from sliplab.flows.learning.evaluate import trial_counts
+from sliplab.flows.reporting import clock_words
+from sliplab.flows.reporting.detector_section import choice_note
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols.settings import Detection
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 
 def seconds(value: int | None, origin: int) -> float | None:

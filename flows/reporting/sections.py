@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from analysis.nets.training import Fitted
-from analysis.pictures.report import Number, Section, number, percent
-from flows.reporting import (
+from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.pictures.report import Number, Section, number, percent
+from sliplab.flows.reporting import (
     campaign_section,
     clock_section,
     clock_words,
@@ -22,9 +22,9 @@ from flows.reporting import (
     results,
     trial_section,
 )
-from flows.reporting.window_section import window_sections
-from flows.running.campaigns import Collected
-from storage.store import Store
+from sliplab.flows.reporting.window_section import window_sections
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 

@@ -6,22 +6,22 @@ from collections import Counter
 from importlib.metadata import version
 from typing import Any
 
-from flows.labelling.label_errors import holds_compared, read_check
-from flows.learning import other_networks
-from flows.learning.train import training_settings
-from flows.learning.window_baselines import EVALUATION, beside
-from flows.learning.window_scores import window_intervals
-from flows.planning.estimate import plan_bytes
-from flows.reporting import holdout_section
-from flows.reporting.campaign_section import reference_rows, wear
-from flows.reporting.report_trials import accounted, intervals, told
-from flows.running import timing
-from flows.running.campaigns import Collected, training_campaigns
-from protocols.phases import Press
-from protocols.presets import PAPER, at
-from rigs.rig_file import load_rig_file
-from storage.derived import Derived
-from storage.store import Store
+from sliplab.flows.labelling.label_errors import holds_compared, read_check
+from sliplab.flows.learning import other_networks
+from sliplab.flows.learning.train import training_settings
+from sliplab.flows.learning.window_baselines import EVALUATION, beside
+from sliplab.flows.learning.window_scores import window_intervals
+from sliplab.flows.planning.estimate import plan_bytes
+from sliplab.flows.reporting import holdout_section
+from sliplab.flows.reporting.campaign_section import reference_rows, wear
+from sliplab.flows.reporting.report_trials import accounted, intervals, told
+from sliplab.flows.running import timing
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.protocols.phases import Press
+from sliplab.protocols.presets import PAPER, at
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.derived import Derived
+from sliplab.storage.store import Store
 
 _PACKAGES = (
     "sliplab",

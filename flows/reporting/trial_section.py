@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets import dataset
-from analysis.nets.windows import first_pixel
-from analysis.pictures import figures
-from analysis.pictures.published import PAPER
-from analysis.pictures.report import Figure, Section
-from flows.labelling.label import STEP as LABELS
-from flows.reporting import results
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.nets import dataset
+from sliplab.analysis.nets.windows import first_pixel
+from sliplab.analysis.pictures import figures
+from sliplab.analysis.pictures.published import PAPER
+from sliplab.analysis.pictures.report import Figure, Section
+from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.flows.reporting import results
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 Json = dict[str, Any]
 F64 = npt.NDArray[np.float64]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from analysis.nets.metrics import CLASSES
-from analysis.nets.training import Fitted
-from analysis.pictures import figures, window_figures
-from analysis.pictures.published import PAPER
-from analysis.pictures.report import Figure, Section, Table, number, percent
-from flows.reporting import others_section, work_section
-from flows.reporting.work_section import METHODS
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.pictures import figures, window_figures
+from sliplab.analysis.pictures.published import PAPER
+from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent
+from sliplab.flows.reporting import others_section, work_section
+from sliplab.flows.reporting.work_section import METHODS
 
 Json = dict[str, Any]
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from flows.reviewing.review_list import TrialList
-from flows.reviewing.review_trial import Shown
-from storage import review
-from storage.review import Decision, Onsets, Verdict
+from sliplab.flows.reviewing.review_list import TrialList
+from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.storage import review
+from sliplab.storage.review import Decision, Onsets, Verdict
 
 
 class LabelChanged(ValueError):

@@ -7,9 +7,9 @@ from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
 from bokeh.palettes import grey
 from bokeh.plotting import figure
 
-from analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
-from flows.reviewing.review_trial import Shown
-from storage.streams import U8
+from sliplab.analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
+from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.storage.streams import U8
 
 _TAIL_FRAMES = 60
 """How many earlier frames a track is drawn through."""

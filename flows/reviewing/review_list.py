@@ -11,15 +11,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from flows.labelling.label import STEP, label_key
-from flows.labelling.reviewed import State, state_of
-from flows.running.campaigns import Collected
-from protocols.errors import InputError
-from storage import review
-from storage.derived import Derived
-from storage.errors import StoreError
-from storage.store import IMPORTED, Store
-from storage.streams import Json
+from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.labelling.reviewed import State, state_of
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols.errors import InputError
+from sliplab.storage import review
+from sliplab.storage.derived import Derived
+from sliplab.storage.errors import StoreError
+from sliplab.storage.store import IMPORTED, Store
+from sliplab.storage.streams import Json
 
 LabelState = Literal["fresh", "stale", "missing"]
 _GRAVE, _ODD, _SLIGHT = 3, 2, 1

@@ -10,18 +10,18 @@ from html import escape
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 
-from flows.reviewing import review_words as words
-from flows.reviewing.review_aside import Aside
-from flows.reviewing.review_decide import LabelChanged, keep
-from flows.reviewing.review_frame import FramePlot
-from flows.reviewing.review_list import Row, TrialList, as_columns, chosen
-from flows.reviewing.review_plots import TimePlots
-from flows.reviewing.review_trial import Shown, load
-from flows.reviewing.review_widgets import ALL, Widgets
-from storage import review
-from storage.errors import StoreError
-from storage.review import Onsets, Verdict
-from storage.streams import U8
+from sliplab.flows.reviewing import review_words as words
+from sliplab.flows.reviewing.review_aside import Aside
+from sliplab.flows.reviewing.review_decide import LabelChanged, keep
+from sliplab.flows.reviewing.review_frame import FramePlot
+from sliplab.flows.reviewing.review_list import Row, TrialList, as_columns, chosen
+from sliplab.flows.reviewing.review_plots import TimePlots
+from sliplab.flows.reviewing.review_trial import Shown, load
+from sliplab.flows.reviewing.review_widgets import ALL, Widgets
+from sliplab.storage import review
+from sliplab.storage.errors import StoreError
+from sliplab.storage.review import Onsets, Verdict
+from sliplab.storage.streams import U8
 
 REFRESH_MS = 2000
 

@@ -9,9 +9,9 @@ import numpy as np
 from bokeh.models import ColumnDataSource, CustomJS, Label, NumeralTickFormatter, Range1d, Span
 from bokeh.plotting import figure
 
-from analysis.pictures.figure_style import BLUE, GREY, ORANGE, RED
-from flows.reviewing.review_trial import Shown
-from storage.review import Onsets
+from sliplab.analysis.pictures.figure_style import BLUE, GREY, ORANGE, RED
+from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.storage.review import Onsets
 
 Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, Kind] = ("incipient", "gross")

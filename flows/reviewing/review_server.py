@@ -23,12 +23,12 @@ from bokeh.server.server import Server
 from tornado.ioloop import IOLoop
 from tornado.web import HTTPError
 
-from flows.reviewing.review_list import TrialList
-from flows.reviewing.review_page import Page
-from flows.running.same_origin import own_hosts, refusal
-from protocols.errors import InputError
-from storage.process import user_name
-from storage.store import Store
+from sliplab.flows.reviewing.review_list import TrialList
+from sliplab.flows.reviewing.review_page import Page
+from sliplab.flows.running.same_origin import own_hosts, refusal
+from sliplab.protocols.errors import InputError
+from sliplab.storage.process import user_name
+from sliplab.storage.store import Store
 
 HOST = "127.0.0.1"
 _KEEP_MS = 60_000

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from analysis.nets.dataset import recorded_span
-from flows.labelling.label import STEP
-from flows.reviewing.review_list import Row
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.recording import Recording
-from storage.review import Onsets
-from storage.store import Store
-from storage.streams import F64, I64, U8, Json
-from storage.video import FrameReader
+from sliplab.analysis.nets.dataset import recorded_span
+from sliplab.flows.labelling.label import STEP
+from sliplab.flows.reviewing.review_list import Row
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
+from sliplab.storage.review import Onsets
+from sliplab.storage.store import Store
+from sliplab.storage.streams import F64, I64, U8, Json
+from sliplab.storage.video import FrameReader
 
 RATE_NS = 10_000_000
 """Width of a bin of the event rate."""

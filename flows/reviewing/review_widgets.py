@@ -19,9 +19,9 @@ from bokeh.models import (
     TextInput,
 )
 
-from flows.labelling.reviewed import STATES
-from flows.reviewing import review_words as words
-from storage.review import Verdict
+from sliplab.flows.labelling.reviewed import STATES
+from sliplab.flows.reviewing import review_words as words
+from sliplab.storage.review import Verdict
 
 ALL = "all"
 VERDICTS: tuple[tuple[Verdict, str, str], ...] = (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from flows.reviewing.review_trial import Shown
-from storage.review import Decision, Onsets
+from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.storage.review import Decision, Onsets
 
 KEYS = (
     ("n, &darr;", "next"), ("p, &uarr;", "previous"), ("&larr; &rarr;", "frame"),

@@ -19,12 +19,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from flows.running import stopping
-from flows.running.campaigns import Collected
-from protocols.errors import InputError
-from storage.errors import StoreError
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.flows.running import stopping
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 TIMELINE = "trial_time"
 APPLICATION = "sliplab"
@@ -92,7 +92,7 @@ def save(subject: Subject, path: Path) -> dict[str, Any]:
         StoreError: Rerun is not installed, or the trial is damaged.
     """
     library = rerun()
-    from flows.reviewing.view_streams import blueprint, send
+    from sliplab.flows.reviewing.view_streams import blueprint, send
 
     library.set_strict_mode(True)  # what cannot be written is an error, not a warning
 

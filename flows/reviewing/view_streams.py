@@ -20,16 +20,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from analysis.nets.dataset import recorded_span
-from analysis.nets.metrics import CLASSES
-from flows.labelling.label import STEP as LABELS
-from flows.labelling.label import label_key
-from flows.labelling.reviewed import state_of
-from flows.reviewing.review_trial import event_rate
-from flows.reviewing.view import TIMELINE, Subject
-from storage import review
-from storage.derived import Derived
-from storage.streams import I64, EventChunk, Json
+from sliplab.analysis.nets.dataset import recorded_span
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.flows.labelling.label import label_key
+from sliplab.flows.labelling.reviewed import state_of
+from sliplab.flows.reviewing.review_trial import event_rate
+from sliplab.flows.reviewing.view import TIMELINE, Subject
+from sliplab.storage import review
+from sliplab.storage.derived import Derived
+from sliplab.storage.streams import I64, EventChunk, Json
 
 BIN_NS = 5_000_000
 MOST_POINTS = 5_000_000

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
-from protocols import InputError, Plan, Trial, load_plan
-from protocols.settings import AnalysisSettings
-from storage.recording import Recording
-from storage.store import IMPORTED, Campaign, Store, StoreError
+from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,12 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from flows.running import stopping
-from protocols.errors import InputError
-from protocols.hashing import hash_text
-from storage.files import sha256
+import sliplab
+from sliplab import analysis, flows, protocols, rigs, storage
+from sliplab.flows.running import stopping
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_text
+from sliplab.storage.files import sha256
 
 CONNECT_S = 15.0
 """How long a scheduler, and a first worker, are waited for."""
@@ -36,7 +38,6 @@ ANSWER_S = 60.0
 REPORT_S = 5.0
 """How long workers may take to send their last reports to Prefect's server."""
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/:\s]+:\d{1,5}")
-_PACKAGES = ("protocols", "storage", "analysis", "rigs", "flows")
 _LIBRARIES = ("numpy", "numba", "scipy", "torch", "h5py", "av", "opencv-contrib-python-headless")
 
 
@@ -165,56 +166,9 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
             "`dask scheduler --host HOST` (docs/scale.md)"
         ) from None
     try:
-        _import_ours_first(client)
         yield Cluster(address, client, _look_at_all(client, address))
     finally:
         client.close(timeout=CONNECT_S)
-
-
-def _import_ours_first(client: Any) -> None:
-    """Have each worker, one that joins later too, import our packages before anything else.
-
-    A worker puts its scratch folder first on its import path, and keeps a folder ``storage`` in it.
-    Where this program is installed with ``pip install -e``, its packages are found by a finder that
-    stands behind Python's own, which takes that folder for our package. So they are imported once
-    while the scratch folder is not on the path. The plugin goes there by value, not by its name in
-    this module, which such a worker cannot import.
-
-    Raises:
-        ClusterError: the workers do not answer.
-    """
-    from distributed.diagnostics.plugin import WorkerPlugin
-
-    packages = _PACKAGES
-
-    class ImportOursFirst(WorkerPlugin):
-        def setup(self, worker: Any) -> None:
-            import importlib
-            import sys
-
-            for name in packages:
-                there = sys.modules.get(name)
-                if there is not None and there.__file__ is None:  # a folder was taken for it
-                    for part in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
-                        del sys.modules[part]
-            before = list(sys.path)
-            sys.path[:] = [place for place in before if place != worker.local_directory]
-            try:
-                for name in packages:
-                    importlib.import_module(name)
-            except ImportError:
-                pass  # not installed: whoever looks at the worker says so
-            finally:
-                sys.path[:] = before
-
-    register = client._register_worker_plugin  # as `client.register_plugin`, which knows no limit
-    try:
-        client.sync(
-            register, plugin=ImportOursFirst(), name="sliplab packages", idempotent=False,
-            callback_timeout=ANSWER_S,
-        )  # fmt: skip
-    except (OSError, TimeoutError) as error:
-        raise ClusterError(f"the Dask workers do not answer ({_short(error)})") from None
 
 
 def _look_at_all(client: Any, address: str) -> int:
@@ -273,11 +227,10 @@ def this_program() -> dict[str, str]:
 @cache
 def _source() -> str:
     """A hash of all packages' code."""
-    parts = []
-    for package in _PACKAGES:
-        root = Path(__import__(package).__path__[0])
-        parts += [f"{path.relative_to(root)} {sha256(path)}" for path in sorted(root.rglob("*.py"))]
-    return hash_text("\n".join(parts))[:12]
+    files = [*Path(sliplab.__path__[0]).glob("*.py")]  # a wheel has the packages below it
+    for package in (protocols, storage, analysis, rigs, flows):
+        files += Path(package.__path__[0]).rglob("*.py")
+    return hash_text("\n".join(sorted(f"{file.name} {sha256(file)}" for file in files)))[:12]
 
 
 def same_program(wanted: dict[str, str]) -> None:

@@ -29,9 +29,9 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from flows.running import stopping
-from protocols.shown import CONTROL, printable
-from storage.secrets import masked
+from sliplab.flows.running import stopping
+from sliplab.protocols.shown import CONTROL, printable
+from sliplab.storage.secrets import masked
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 

@@ -32,8 +32,8 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
-from flows.running import garbage
-from flows.running.same_origin import SameOrigin
+from sliplab.flows.running import garbage
+from sliplab.flows.running.same_origin import SameOrigin
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -91,7 +91,7 @@ class EmbeddedServer:
             handle = fcntl.fcntl(listener, fcntl.F_DUPFD_CLOEXEC, 3)
             self._process = subprocess.Popen(
                 [
-                    *(sys.executable, "-P", "-m", "flows.running.embedded_server"),
+                    *(sys.executable, "-P", "-m", "sliplab.flows.running.embedded_server"),
                     *(str(handle), str(os.getpid()), str(home)),
                 ],
                 stdin=subprocess.DEVNULL,
@@ -231,7 +231,7 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     import uvicorn
     from prefect.server.api.server import create_app
 
-    from flows.running.embedded_database import ready
+    from sliplab.flows.running.embedded_database import ready
 
     ready(home)
     with socket.socket(fileno=handle) as listener:

@@ -10,11 +10,11 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from flows.running import run_records, server_calls
-from flows.running.embedded_server import EmbeddedServer, ServerError
+from sliplab.flows.running import run_records, server_calls
+from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 T = TypeVar("T")
 
@@ -87,7 +87,7 @@ def embedded() -> EmbeddedServer:
     there = _servers.get(home)
     doubtful = server_calls.was_lost(run_records.EMBEDDED)  # one that is slow is left alone
     if there is not None and (not there.alive or (doubtful and not there.answers)):
-        from flows.running import run_events
+        from sliplab.flows.running import run_events
 
         _servers.pop(home).stop()
         run_events.renew()
@@ -122,7 +122,7 @@ def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
         temporary_settings,
     )
 
-    from flows.running import run_events
+    from sliplab.flows.running import run_events
 
     if FlowRunContext.get() is not None:
         return flow.fn(parcel)

@@ -21,7 +21,7 @@ from prefect.events.clients import NullEventsClient
 from prefect.events.schemas.events import Event
 from prefect.events.worker import EventsWorker
 
-from flows.running import server_calls
+from sliplab.flows.running import server_calls
 
 HELD_S = 0.25
 MOST = 100

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-from flows.running import console, run_records, stopping
+from sliplab.flows.running import console, run_records, stopping
 
 BEGIN_S = 15.0
 """How long the begin of a run waits for an answer; no arm moves yet."""

@@ -18,11 +18,11 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.settings import PREFECT_API_URL
 
-from flows.running import stopping
-from flows.running.orchestration import Freight, Parcel
+from sliplab.flows.running import stopping
+from sliplab.flows.running.orchestration import Freight, Parcel
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 CHUNK = 64
 """Most pieces in a task: what a lost worker loses, and what a stop on a cluster waits for."""
@@ -96,7 +96,7 @@ def _local_chunk(
 
 
 def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluster: Cluster) -> None:
-    from flows.running.cluster import this_program
+    from sliplab.flows.running.cluster import this_program
 
     url = PREFECT_API_URL.value()
     if url is not None:
@@ -122,7 +122,7 @@ def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluste
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
 def _remote_chunk(freight: Freight[tuple[Piece, Sequence[Any], dict[str, str]]]) -> list[Any]:
     """Some pieces, one after the other, on a worker that may have joined after the others."""
-    from flows.running.cluster import same_program
+    from sliplab.flows.running.cluster import same_program
 
     piece, jobs, program = freight.content
     same_program(program)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from storage.files import read_json, write_json
-from storage.store import Store
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import Store
 
 
 def _file(store: Store) -> Path:

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 from prefect import flow
 
-from flows.running import console
-from flows.running.orchestration import Parcel, run
-from flows.running.spread import Done, spread
-from flows.running.timing import timed
-from storage.derived import Derived
-from storage.mirror import place_of, reach
-from storage.recording import Recording
-from storage.store import Store, StoreError
-from storage.streams import Json
+from sliplab.flows.running import console
+from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.spread import Done, spread
+from sliplab.flows.running.timing import timed
+from sliplab.storage.derived import Derived
+from sliplab.storage.mirror import place_of, reach
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store, StoreError
+from sliplab.storage.streams import Json
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 START_S = 3.0
 """Work goes on in this process for so long before others are started, which takes as long: what is

@@ -16,20 +16,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from flows.labelling.reviewed import Labels
-from flows.running import console
-from flows.running.campaigns import Collected
-from flows.searching.detector_tradeoff_compare import comparisons
-from flows.searching.detector_tradeoff_data import Ask, Data
-from flows.searching.detector_tradeoff_estimate import estimate
-from flows.searching.detector_tradeoff_grid import Axes, Setting, make_grid
-from flows.searching.detector_tradeoff_page import render
-from flows.searching.detector_tradeoff_rows import OBJECTIVES, make_rows, pair_table
-from flows.searching.detector_tradeoff_runs import Kept, Run, make_run
-from flows.searching.detector_tradeoff_text import flat
-from protocols.errors import InputError
-from storage.files import write_json, write_text
-from storage.store import Store
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.searching.detector_tradeoff_compare import comparisons
+from sliplab.flows.searching.detector_tradeoff_data import Ask, Data
+from sliplab.flows.searching.detector_tradeoff_estimate import estimate
+from sliplab.flows.searching.detector_tradeoff_grid import Axes, Setting, make_grid
+from sliplab.flows.searching.detector_tradeoff_page import render
+from sliplab.flows.searching.detector_tradeoff_rows import OBJECTIVES, make_rows, pair_table
+from sliplab.flows.searching.detector_tradeoff_runs import Kept, Run, make_run
+from sliplab.flows.searching.detector_tradeoff_text import flat
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import write_json, write_text
+from sliplab.storage.store import Store
 
 PAGE, NUMBERS, TABLE = (f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv"))
 

@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from analysis.statistics.paired import paired_difference
-from flows.searching.detector_tradeoff_grid import PAPER
-from flows.searching.detector_tradeoff_rows import RULES, Row
-from flows.searching.detector_tradeoff_runs import PRECISIONS
+from sliplab.analysis.statistics.paired import paired_difference
+from sliplab.flows.searching.detector_tradeoff_grid import PAPER
+from sliplab.flows.searching.detector_tradeoff_rows import RULES, Row
+from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS
 
 FACTORS = {
     "length_ms": "window length (ms)",

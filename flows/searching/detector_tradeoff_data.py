@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.rule_sweep import Trials
-from analysis.detect.true_slip import true_slip
-from analysis.nets import dataset
-from analysis.nets.dataset import SampleSet
-from flows.labelling.reviewed import Labels
-from flows.running.campaigns import Collected, training_campaigns
-from flows.searching.detector_tradeoff_grid import Setting
-from protocols import Trial
-from protocols.hashing import hash_integer
-from protocols.settings import AnalysisSettings, Samples
-from storage.recording import Recording
-from storage.store import StoreError
-from storage.streams import Json
+from sliplab.analysis.detect.rule_sweep import Trials
+from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.analysis.nets import dataset
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.flows.searching.detector_tradeoff_grid import Setting
+from sliplab.protocols import Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.settings import AnalysisSettings, Samples
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import StoreError
+from sliplab.storage.streams import Json
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 
-from analysis.nets import dataset, training
-from flows.searching.detector_tradeoff_data import Data
-from flows.searching.detector_tradeoff_grid import counted_stride
-from flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run
-from protocols.settings import Training
+from sliplab.analysis.nets import dataset, training
+from sliplab.flows.searching.detector_tradeoff_data import Data
+from sliplab.flows.searching.detector_tradeoff_grid import counted_stride
+from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run
+from sliplab.protocols.settings import Training
 
 TRIALS, WINDOWS = 6, 96
 """Training trials and windows of them that a run is tried with."""

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from protocols.errors import InputError
-from protocols.settings import Network, Windows
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.settings import Network, Windows
 
 CHANNELS = ("conv1_channels", "conv2_channels", "hidden")
 

@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from analysis.pictures.detector_tradeoff_figure import Bar, Panel, Point, factor_lines, front_panels
-from analysis.pictures.report import Figure, Section, Table, number, percent, render_page
-from flows.searching.detector_tradeoff_compare import FACTORS
-from flows.searching.detector_tradeoff_rows import (
+from sliplab.analysis.pictures.detector_tradeoff_figure import (
+    Bar,
+    Panel,
+    Point,
+    factor_lines,
+    front_panels,
+)
+from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent, render_page
+from sliplab.flows.searching.detector_tradeoff_compare import FACTORS
+from sliplab.flows.searching.detector_tradeoff_rows import (
     LOOSE,
     MOST_MISSED,
     OBJECTIVES,
@@ -17,7 +23,7 @@ from flows.searching.detector_tradeoff_rows import (
     objective,
     short_list,
 )
-from flows.searching.detector_tradeoff_text import (
+from sliplab.flows.searching.detector_tradeoff_text import (
     COLUMNS,
     cells,
     distinct,

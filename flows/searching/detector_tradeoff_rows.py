@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.rule_sweep import Figures, Trials, choose_pair, sweep, worth
-from analysis.detect.true_slip import NEVER
-from analysis.statistics.pareto import front
-from flows.searching.detector_tradeoff_data import Data, true_onsets
-from flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_stride, strides
-from flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts
+from sliplab.analysis.detect.rule_sweep import Figures, Trials, choose_pair, sweep, worth
+from sliplab.analysis.detect.true_slip import NEVER
+from sliplab.analysis.statistics.pareto import front
+from sliplab.flows.searching.detector_tradeoff_data import Data, true_onsets
+from sliplab.flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_stride, strides
+from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0, 30.0, 40.0)

@@ -18,21 +18,21 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from analysis.nets import dataset, metrics, model_file, training
-from analysis.nets.dataset import SampleSet
-from analysis.nets.epoch_record import EpochRecord
-from analysis.nets.quantised import quantise
-from analysis.nets.quantised_engine import common_net
-from analysis.nets.samples import strided_windows
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from analysis.nets.synaptic import count_net_work
-from analysis.nets.training import Fitted, restore
-from flows.searching.detector_tradeoff_data import Ask, Data, Used
-from flows.searching.detector_tradeoff_grid import Setting, counted_stride
-from protocols.settings import Network, Training, Windows
-from storage.derived import Derived, make_key
-from storage.files import make_folder, write_bytes
+from sliplab.analysis.nets import dataset, metrics, model_file, training
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.nets.quantised import quantise
+from sliplab.analysis.nets.quantised_engine import common_net
+from sliplab.analysis.nets.samples import strided_windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.nets.synaptic import count_net_work
+from sliplab.analysis.nets.training import Fitted, restore
+from sliplab.flows.searching.detector_tradeoff_data import Ask, Data, Used
+from sliplab.flows.searching.detector_tradeoff_grid import Setting, counted_stride
+from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.files import make_folder, write_bytes
 
 STEP = "tradeoff"
 VERSION = 1

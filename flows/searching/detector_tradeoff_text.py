@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.pictures.report import number, percent
-from flows.searching.detector_tradeoff_rows import Row, mean, objective, short_list
+from sliplab.analysis.pictures.report import number, percent
+from sliplab.flows.searching.detector_tradeoff_rows import Row, mean, objective, short_list
 
 COLUMNS = (
     "network", "precision", "stride (ms)", "windows", "margin (spikes)", "strict (%)",

@@ -17,24 +17,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets import dataset, metrics, model_file, training, window_groups
-from analysis.nets.dataset import SampleSet
-from analysis.nets.epoch_record import EpochRecord
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.labelling.reviewed import Labels
-from flows.learning.evaluate import choose_model
-from flows.learning.samples import load_samples, several, split_trials
-from flows.learning.train import training_settings, wanted_models
-from flows.running import console
-from flows.running.campaigns import Collected, collected, training_campaigns
-from flows.searching.other_rig import other_order
-from protocols.errors import InputError
-from protocols.hashing import hash_integer
-from protocols.quantity import level_order
-from storage.derived import make_key
-from storage.files import make_folder, read_json, write_bytes, write_json, write_text
-from storage.store import Store
+from sliplab.analysis.nets import dataset, metrics, model_file, training, window_groups
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.evaluate import choose_model
+from sliplab.flows.learning.samples import load_samples, several, split_trials
+from sliplab.flows.learning.train import training_settings, wanted_models
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
+from sliplab.flows.searching.other_rig import other_order
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.quantity import level_order
+from sliplab.storage.derived import make_key
+from sliplab.storage.files import make_folder, read_json, write_bytes, write_json, write_text
+from sliplab.storage.store import Store
 
 STEP, FILE, TABLE, VERSION = "generalisation", "results.json", "results.md", 1
 VALIDATION = 0.15

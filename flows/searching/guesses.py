@@ -18,28 +18,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.labels import labelling
-from analysis.nets import dataset, model_file, training, window_groups
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.learning import evaluate
-from flows.learning.evaluate import choose_model
-from flows.learning.samples import several, split_trials
-from flows.learning.train import wanted_models
-from flows.learning.trial_scores import summaries
-from flows.planning.orders import Order
-from flows.running import console
-from flows.running.campaigns import Collected, collected, training_campaigns
-from flows.searching.guess_changes import AS_IT_IS, NAMES, figures
-from flows.searching.other_rig import judge, other_order
-from flows.searching.scene_runs import sample_trials
-from flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
-from protocols.errors import InputError
-from protocols.settings import Detection
-from rigs.rig_file import load_rig_file
-from storage.derived import make_key
-from storage.files import read_json, write_json
-from storage.store import Store, StoreError
+from sliplab.analysis.labels import labelling
+from sliplab.analysis.nets import dataset, model_file, training, window_groups
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.learning import evaluate
+from sliplab.flows.learning.evaluate import choose_model
+from sliplab.flows.learning.samples import several, split_trials
+from sliplab.flows.learning.train import wanted_models
+from sliplab.flows.learning.trial_scores import summaries
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
+from sliplab.flows.searching.guess_changes import AS_IT_IS, NAMES, figures
+from sliplab.flows.searching.other_rig import judge, other_order
+from sliplab.flows.searching.scene_runs import sample_trials
+from sliplab.flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.settings import Detection
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.derived import make_key
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import Store, StoreError
 
 STEP, FILE, VERSION = "guesses", "results.json", 1
 TRIALS = 20

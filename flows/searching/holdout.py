@@ -14,23 +14,23 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
-from analysis.labels import labelling
-from analysis.nets import dataset, metrics, model_file, window_groups
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.learning.evaluate import choose_model, evaluation_of
-from flows.learning.samples import several
-from flows.learning.train import wanted_models
-from flows.learning.trial_scores import summaries
-from flows.planning.orders import Order
-from flows.running import console
-from flows.running.campaigns import Collected, collected, training_campaigns
-from flows.searching.other_rig import judge, other_order
-from flows.searching.scene_runs import sample_trials
-from protocols.settings import Detection
-from storage.derived import make_key
-from storage.files import make_folder, read_json, write_json
-from storage.store import Store, StoreError
+from sliplab.analysis.labels import labelling
+from sliplab.analysis.nets import dataset, metrics, model_file, window_groups
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.learning.evaluate import choose_model, evaluation_of
+from sliplab.flows.learning.samples import several
+from sliplab.flows.learning.train import wanted_models
+from sliplab.flows.learning.trial_scores import summaries
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
+from sliplab.flows.searching.other_rig import judge, other_order
+from sliplab.flows.searching.scene_runs import sample_trials
+from sliplab.protocols.settings import Detection
+from sliplab.storage.derived import make_key
+from sliplab.storage.files import make_folder, read_json, write_json
+from sliplab.storage.store import Store, StoreError
 
 STEP, FILE, VERSION = "holdout", "results.json", 1
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.nets import dataset, training
-from analysis.nets.samples import strided_windows
-from flows.labelling.reviewed import Labels
-from flows.learning.samples import load_samples
-from flows.learning.trial_scores import score_row
-from flows.planning.orders import Order, make_order
-from flows.running.campaigns import Collected, training_campaigns
-from protocols.settings import Detection
-from protocols.yaml_file import parse_yaml, read_text
-from rigs.rig_inheritance import rig_yaml
-from storage.files import make_folder, write_text
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.nets import dataset, training
+from sliplab.analysis.nets.samples import strided_windows
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.trial_scores import score_row
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.running.campaigns import Collected, training_campaigns
+from sliplab.protocols.settings import Detection
+from sliplab.protocols.yaml_file import parse_yaml, read_text
+from sliplab.rigs.rig_inheritance import rig_yaml
+from sliplab.storage.files import make_folder, write_text
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 
 
 def other_order(

@@ -15,18 +15,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from analysis.statistics.scene_error import Onsets, Seen
-from protocols import Plan, Trial
-from protocols.hashing import hash_integer
-from protocols.program import Move
-from rigs.build import build_rig
-from rigs.levels import HIGHEST, expected_onsets, slides_of
-from rigs.mock.settings import Clocks
-from rigs.mock.skins import skin_of
-from rigs.rig import Rig, TrialRun
-from rigs.rig_file import RigFile
-from rigs.scene.onsets import retraction_onsets
-from storage.streams import (
+from sliplab.analysis.statistics.scene_error import Onsets, Seen
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.hashing import hash_integer
+from sliplab.protocols.program import Move
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
+from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.rig import Rig, TrialRun
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.scene.onsets import retraction_onsets
+from sliplab.storage.streams import (
     EventChunk,
     Json,
     Unheeded,

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from analysis.statistics.scene_error import Seen
-from analysis.statistics.scene_windows import PHASES, SceneWindows, look, pooled
-from flows.searching.scene_runs import Variant, changed, run, sample_trials, with_true_times
-from protocols import Plan, Trial
-from protocols.program import Move
-from rigs.levels import slides_of, with_level
-from rigs.mock.physics import springs_of
-from rigs.mock.settings import MockSettings
-from rigs.mock.skins import skin_of
-from rigs.rig_file import RigFile
-from rigs.scene.slides import run_slide
+from sliplab.analysis.statistics.scene_error import Seen
+from sliplab.analysis.statistics.scene_windows import PHASES, SceneWindows, look, pooled
+from sliplab.flows.searching.scene_runs import Variant, changed, run, sample_trials, with_true_times
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.program import Move
+from sliplab.rigs.levels import slides_of, with_level
+from sliplab.rigs.mock.physics import springs_of
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.scene.slides import run_slide
 
 CHANGE = 0.2
 EVENT_TRIALS, CONTACT_TRIALS = 2, 12

@@ -13,14 +13,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.statistics.scene_error import SceneError, choose_by_windows, compare, mean_error
-from analysis.statistics.scene_windows import pooled
-from flows.running import console, orchestration
-from flows.running.cluster import connected
-from flows.searching.scene_runs import Variant, closed_form, sample_trials, timed
-from flows.searching.sensitivity import measure_sensitivity, runs_needed
-from flows.searching.tradeoff_page import render, sensitivity_markdown
-from flows.searching.tradeoff_runs import (
+from sliplab.analysis.statistics.scene_error import (
+    SceneError,
+    choose_by_windows,
+    compare,
+    mean_error,
+)
+from sliplab.analysis.statistics.scene_windows import pooled
+from sliplab.flows.running import console, orchestration
+from sliplab.flows.running.cluster import connected
+from sliplab.flows.searching.scene_runs import Variant, closed_form, sample_trials, timed
+from sliplab.flows.searching.sensitivity import measure_sensitivity, runs_needed
+from sliplab.flows.searching.tradeoff_page import render, sensitivity_markdown
+from sliplab.flows.searching.tradeoff_runs import (
     REFERENCE,
     Comparing,
     compare_trial,
@@ -29,15 +34,15 @@ from flows.searching.tradeoff_runs import (
     variant_key,
     wall_seconds,
 )
-from protocols import Plan
-from protocols.errors import InputError
-from protocols.plan import load_plan
-from rigs.levels import HIGHEST, at_level, choose_level
-from rigs.rig_file import RigFile, check_plan, load_rig_file
-from storage.files import make_folder, write_json, write_text
+from sliplab.protocols import Plan
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.levels import HIGHEST, at_level, choose_level
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.storage.files import make_folder, write_json, write_text
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 ROUNDS = 2
 STEPS = (1, 2, 4, 8, 16, 32)

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.nets.metrics import CLASSES
-from analysis.pictures import figures
-from analysis.pictures.report import Figure, Section, Table, number, percent, render_page
-from analysis.statistics.scene_windows import PHASES
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.pictures import figures
+from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent, render_page
+from sliplab.analysis.statistics.scene_windows import PHASES
 
 FAMILIES = {
     "levels": "level of physics",

@@ -11,15 +11,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from analysis.statistics.scene_error import SceneError, Seen, compare
-from analysis.statistics.scene_windows import SceneWindows, look
-from flows.searching.scene_runs import Variant, ideal, run, timed
-from protocols import Plan, Trial
-from rigs.levels import HIGHEST
-from rigs.rig_file import RigFile
+from sliplab.analysis.statistics.scene_error import SceneError, Seen, compare
+from sliplab.analysis.statistics.scene_windows import SceneWindows, look
+from sliplab.flows.searching.scene_runs import Variant, ideal, run, timed
+from sliplab.protocols import Plan, Trial
+from sliplab.rigs.levels import HIGHEST
+from sliplab.rigs.rig_file import RigFile
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 REFERENCE = Variant("1", HIGHEST, 1)
 OTHER_SEED = Variant("another seed", HIGHEST, 1, other_seed=True)
@@ -113,9 +113,9 @@ def everywhere(
     Args:
         done: called in this thread after each.
     """
-    from flows.running.orchestration import Parcel
-    from flows.running.orchestration import run as orchestrate
-    from flows.running.spread import spread_flow
+    from sliplab.flows.running.orchestration import Parcel
+    from sliplab.flows.running.orchestration import run as orchestrate
+    from sliplab.flows.running.spread import spread_flow
 
     found: dict[int, Any] = {}
 

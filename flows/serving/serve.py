@@ -20,17 +20,17 @@ from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, build_opener
 
-from flows.cli.chain import package_file
-from flows.running import console, run_records
-from flows.running.embedded_server import new_password
-from flows.serving.serve_control import answer_page
-from flows.serving.serve_file import Scheduled
-from flows.serving.serve_watch import PageServer, ask_on, watch
-from flows.serving.service import Service
-from protocols import InputError
-from storage.files import write_bytes
-from storage.lock import exclusive
-from storage.store import Store
+from sliplab.flows.cli.chain import package_file
+from sliplab.flows.running import console, run_records
+from sliplab.flows.running.embedded_server import new_password
+from sliplab.flows.serving.serve_control import answer_page
+from sliplab.flows.serving.serve_file import Scheduled
+from sliplab.flows.serving.serve_watch import PageServer, ask_on, watch
+from sliplab.flows.serving.service import Service
+from sliplab.protocols import InputError
+from sliplab.storage.files import write_bytes
+from sliplab.storage.lock import exclusive
+from sliplab.storage.store import Store
 
 LOCK = ".serve.lock"
 PORT = 4200
@@ -182,7 +182,7 @@ async def _serve(
 ) -> None:
     from prefect.runner import Runner
 
-    from flows.serving.serve_flows import CONTROL, ON_RIG
+    from sliplab.flows.serving.serve_flows import CONTROL, ON_RIG
 
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from typing import Any
 from uuid import UUID
 
-from flows.running import console, stopping
+from sliplab.flows.running import console, stopping
 
 MOST_AT_ONCE = 16
 

@@ -15,10 +15,10 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from flows.serving.serve_parameters import SCHEDULED, FlowName, OnRig, Parameters
-from flows.serving.serve_windows import From, Zone, cron_of
-from protocols import InputError
-from protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
+from sliplab.flows.serving.serve_parameters import SCHEDULED, FlowName, OnRig, Parameters
+from sliplab.flows.serving.serve_windows import From, Zone, cron_of
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
 
 Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 _NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
@@ -151,7 +151,7 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
     Raises:
         InputError: there is none, or it or a level to be enabled is wrong.
     """
-    from protocols import load_plan
+    from sliplab.protocols import load_plan
 
     found = (path.parent / name).resolve()
     if not found.is_file():
@@ -166,7 +166,7 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
 
 
 def _check_campaign(path: Path, name: str | None) -> None:
-    from storage.store import StoreError, safe_name
+    from sliplab.storage.store import StoreError, safe_name
 
     try:
         safe_name("any" if name is None else name)

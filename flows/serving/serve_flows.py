@@ -11,15 +11,15 @@ from typing import Any
 
 from prefect import flow
 
-from flows.cli.chain import LABELS_CHECKED, shipped
-from flows.cli.common import STEPS
-from flows.collecting import controlling
-from flows.planning.orders import Bench, Order, check_disk, make_order
-from flows.serving.serve_parameters import Ask, Chain, Collect, Evaluate, OnRig, Step, Study
-from flows.serving.serve_runs import HOOKS, run_of, until_of, when_free
-from flows.serving.service import Service
-from storage import control
-from storage.store import Store
+from sliplab.flows.cli.chain import LABELS_CHECKED, shipped
+from sliplab.flows.cli.common import STEPS
+from sliplab.flows.collecting import controlling
+from sliplab.flows.planning.orders import Bench, Order, check_disk, make_order
+from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, Evaluate, OnRig, Step, Study
+from sliplab.flows.serving.serve_runs import HOOKS, run_of, until_of, when_free
+from sliplab.flows.serving.service import Service
+from sliplab.storage import control
+from sliplab.storage.store import Store
 
 STEP, EVALUATE, STUDY, ASK = Step(), Evaluate(), Study(), Ask()
 served: Callable[..., Any] = partial(flow, persist_result=False, **HOOKS)
@@ -102,7 +102,7 @@ def _order(here: Service, wanted: OnRig, protocol: Path, run: Any, **options: An
 
 
 def _take(wanted: OnRig, order: Order, run: Any) -> str:
-    from flows.collecting.collect import collect as take
+    from sliplab.flows.collecting.collect import collect as take
 
     done = when_free(order, wanted.patience_min * 60, partial(take, order), run)
     simulated = "simulated " if order.rig.simulated else ""
@@ -121,7 +121,7 @@ def _collect(wanted: Collect, here: Service, run: Any) -> str:
 
 
 def _chain(wanted: Chain, here: Service, run: Any) -> str:
-    from flows.collecting.stops import WindowOver
+    from sliplab.flows.collecting.stops import WindowOver
 
     try:
         taken = _collect(wanted, here, run)
@@ -132,7 +132,7 @@ def _chain(wanted: Chain, here: Service, run: Any) -> str:
 
 
 def _study(wanted: Study, here: Service, run: Any) -> str:
-    from flows.study import study as whole
+    from sliplab.flows.study import study as whole
 
     files = shipped(wanted.pilot, wanted.extra)
     orders = [_order(here, wanted, file, run, enable=on) for file, on in files.items()]
@@ -149,7 +149,7 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
 
 
 def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> str:
-    from flows.running.campaigns import collected
+    from sliplab.flows.running.campaigns import collected
 
     store = Store.open(here.folder)
     step = getattr(import_module(STEPS[name]), name)

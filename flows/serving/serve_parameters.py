@@ -11,8 +11,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from flows.serving.serve_windows import Until, Zone
-from protocols.yaml_file import StrictModel
+from sliplab.flows.serving.serve_windows import Until, Zone
+from sliplab.protocols.yaml_file import StrictModel
 
 
 class Parameters(StrictModel):

@@ -13,19 +13,19 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from flows.collecting.stops import CampaignStopped, WindowOver
-from flows.planning.orders import Order
-from flows.running import console, run_records, server_calls, stopping
-from flows.running.embedded_server import die_with
-from flows.serving.serve_parameters import OnRig
-from flows.serving.serve_watch import ask_on
-from flows.serving.serve_windows import window_end
-from flows.serving.service import Service, service
-from protocols import InputError
-from rigs.capabilities import RigError
-from storage.errors import disk_error
-from storage.lock import Locked
-from storage.store import StoreError
+from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.running import console, run_records, server_calls, stopping
+from sliplab.flows.running.embedded_server import die_with
+from sliplab.flows.serving.serve_parameters import OnRig
+from sliplab.flows.serving.serve_watch import ask_on
+from sliplab.flows.serving.serve_windows import window_end
+from sliplab.flows.serving.service import Service, service
+from sliplab.protocols import InputError
+from sliplab.rigs.capabilities import RigError
+from sliplab.storage.errors import disk_error
+from sliplab.storage.lock import Locked
+from sliplab.storage.store import StoreError
 
 LOOK_S = 2.0
 """How often a rig that is in use is asked for again."""
@@ -44,7 +44,7 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
     from prefect.context import FlowRunContext
     from prefect.states import Cancelled, Completed, Failed
 
-    from flows.running import run_events
+    from sliplab.flows.running import run_events
 
     context = FlowRunContext.get()
     if context is None or context.flow_run is None or context.flow is None:

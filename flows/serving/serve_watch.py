@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flows.running import console, run_records
-from flows.running.embedded_server import EmbeddedServer, ServerError
+from sliplab.flows.running import console, run_records
+from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
 
 WATCH_S = 5.0
 """How often the server is asked whether it is well, and how long its answer is waited for."""

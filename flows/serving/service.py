@@ -11,8 +11,8 @@ import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from protocols import InputError
-from protocols.yaml_file import parse_yaml, read_text
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import parse_yaml, read_text
 
 ENVIRONMENT = "SLIPLAB_SERVICE"
 SUFFIXES = (".yaml", ".yml")

@@ -11,21 +11,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.timeline import synchronise
-from flows.running import console
-from flows.running.campaigns import Collected
-from flows.running.trial_work import TrialWork, run_trials, stale_trials
-from flows.syncing.sync_fit import fit_again
-from flows.syncing.sync_numbers import campaign_numbers
-from flows.syncing.sync_page import PAGE, render
-from flows.syncing.sync_trials import TrialClocks, read_trials
-from storage.derived import Derived, make_key
-from storage.files import write_text
-from storage.recording import Recording
-from storage.store import SYNC, Store
+from sliplab.analysis.timeline import synchronise
+from sliplab.flows.running import console
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
+from sliplab.flows.syncing.sync_fit import fit_again
+from sliplab.flows.syncing.sync_numbers import campaign_numbers
+from sliplab.flows.syncing.sync_page import PAGE, render
+from sliplab.flows.syncing.sync_trials import TrialClocks, read_trials
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.files import write_text
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import SYNC, Store
 
 if TYPE_CHECKING:
-    from flows.running.cluster import Cluster
+    from sliplab.flows.running.cluster import Cluster
 
 PAGE_VERSION = 1
 

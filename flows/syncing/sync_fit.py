@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.timeline import synchronise
-from storage.recording import Recording
+from sliplab.analysis.timeline import synchronise
+from sliplab.storage.recording import Recording
 
 POINTS = 200
 """So many residuals are kept of a device in a trial, evenly spread over it."""

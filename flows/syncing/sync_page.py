@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from analysis.pictures.report import Figure, Number, Section, Table, number, render_page
-from analysis.pictures.sync_figures import over_trials, residuals
-from flows.running.campaigns import Collected
-from flows.syncing import sync_tables
-from flows.syncing.sync_series import (
+from sliplab.analysis.pictures.report import Figure, Number, Section, Table, number, render_page
+from sliplab.analysis.pictures.sync_figures import over_trials, residuals
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.syncing import sync_tables
+from sliplab.flows.syncing.sync_series import (
     All,
     device_names,
     drift_panels,
@@ -21,7 +21,7 @@ from flows.syncing.sync_series import (
     residual_panels,
     uncertainty_panel,
 )
-from flows.syncing.sync_trials import TrialClocks
+from sliplab.flows.syncing.sync_trials import TrialClocks
 
 PAGE = "sync.html"
 

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.pictures.sync_figures import Gate, OverTrials, Residuals
-from flows.syncing.sync_fit import DEVICES
-from flows.syncing.sync_trials import DeviceClocks, TrialClocks
+from sliplab.analysis.pictures.sync_figures import Gate, OverTrials, Residuals
+from sliplab.flows.syncing.sync_fit import DEVICES
+from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 
 
 class All:

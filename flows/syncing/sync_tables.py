@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from analysis.pictures.report import Table, number
-from flows.running.campaigns import Collected
-from flows.syncing.sync_fit import DEVICES
-from flows.syncing.sync_numbers import PULSES, campaign_numbers
-from flows.syncing.sync_series import All
-from flows.syncing.sync_trials import TrialClocks
-from storage.files import read_json
-from storage.writer import RECORD
+from sliplab.analysis.pictures.report import Table, number
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.syncing.sync_fit import DEVICES
+from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
+from sliplab.flows.syncing.sync_series import All
+from sliplab.flows.syncing.sync_trials import TrialClocks
+from sliplab.storage.files import read_json
+from sliplab.storage.writer import RECORD
 
 ROWS = 10
 """So many of the worst trials are shown."""

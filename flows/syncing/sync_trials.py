@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flows.running.campaigns import Collected
-from flows.syncing.sync_fit import DEVICES
-from storage.clockmap import ClockMap
-from storage.derived import Derived
-from storage.recording import Recording
-from storage.store import SYNC, Store
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.syncing.sync_fit import DEVICES
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import SYNC, Store
 
 F64 = npt.NDArray[np.float64]
 

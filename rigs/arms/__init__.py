@@ -10,20 +10,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rigs.arms.settings import ArmSettings
-    from rigs.capabilities import Arm
+    from sliplab.rigs.arms.settings import ArmSettings
+    from sliplab.rigs.capabilities import Arm
 
 
 def build_arm(settings: ArmSettings) -> Arm:
     """The arm that `settings` describe, not connected yet."""
     if settings.driver == "ur":
-        from rigs.arms.ur import UrArm
+        from sliplab.rigs.arms.ur import UrArm
 
         return UrArm(settings)
     if settings.driver == "abb":
-        from rigs.arms.abb import AbbArm
+        from sliplab.rigs.arms.abb import AbbArm
 
         return AbbArm(settings)
-    from rigs.arms.abb_socket import AbbSocketArm
+    from sliplab.rigs.arms.abb_socket import AbbSocketArm
 
     return AbbSocketArm(settings)

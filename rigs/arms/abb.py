@@ -14,9 +14,9 @@ import threading
 import time
 from collections.abc import Sequence
 
-from rigs.arms.abb_egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
-from rigs.arms.abb_program import PAUSE_S, motion_program
-from rigs.arms.abb_rws import (
+from sliplab.rigs.arms.abb_egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
+from sliplab.rigs.arms.abb_program import PAUSE_S, motion_program
+from sliplab.rigs.arms.abb_rws import (
     FULL_SPEED_PERCENT,
     REQUEST_S,
     STATUS_REQUESTS,
@@ -25,16 +25,24 @@ from rigs.arms.abb_rws import (
     WebServices,
     WebStatus,
 )
-from rigs.arms.abb_watchdog import Watchdog
-from rigs.arms.guard import Guard
-from rigs.arms.health import abb_health
-from rigs.arms.pose import compose, distance_mm
-from rigs.arms.run import Run
-from rigs.arms.segments import SegmentWatch, has_left, is_at
-from rigs.arms.settings import AbbSettings
-from rigs.arms.stream import PoseStream, Sample
-from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
-from storage.streams import Json, PoseChunk, PulseChunk
+from sliplab.rigs.arms.abb_watchdog import Watchdog
+from sliplab.rigs.arms.guard import Guard
+from sliplab.rigs.arms.health import abb_health
+from sliplab.rigs.arms.pose import compose, distance_mm
+from sliplab.rigs.arms.run import Run
+from sliplab.rigs.arms.segments import SegmentWatch, has_left, is_at
+from sliplab.rigs.arms.settings import AbbSettings
+from sliplab.rigs.arms.stream import PoseStream, Sample
+from sliplab.rigs.capabilities import (
+    ArmFault,
+    ArmState,
+    DeviceHealth,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.storage.streams import Json, PoseChunk, PulseChunk
 
 ENTRY, MODULES = "motion_program_main", "motion_program"
 """Where the task begins that runs motion programs, and what the names of its modules begin with."""

@@ -20,8 +20,8 @@ from typing import Any
 from abb_robot_client.egm import EGM
 from google.protobuf.message import DecodeError
 
-from rigs.arms.pose import from_quaternion
-from rigs.capabilities import Pose
+from sliplab.rigs.arms.pose import from_quaternion
+from sliplab.rigs.capabilities import Pose
 
 _BUFFER_BYTES = 1 << 20
 _SO_TIMESTAMPNS = 35

@@ -15,9 +15,9 @@ from abb_motion_program_exec.commands.rapid_types import (
     tooldata,
 )
 
-from rigs.arms.pose import quaternion
-from rigs.arms.settings import ToolSettings
-from rigs.capabilities import Pose, Segment
+from sliplab.rigs.arms.pose import quaternion
+from sliplab.rigs.arms.settings import ToolSettings
+from sliplab.rigs.capabilities import Pose, Segment
 
 PAUSE_S = 0.05
 """Rest after each segment, so that its end can be seen, s."""

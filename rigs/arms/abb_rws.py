@@ -19,9 +19,9 @@ from abb_motion_program_exec.abb_motion_program_exec_client import (
 from abb_robot_client.rws import RWS, ABBException
 from requests.adapters import HTTPAdapter
 
-from rigs.arms.pose import from_quaternion
-from rigs.arms.settings import AbbSettings
-from rigs.capabilities import ArmState, Pose
+from sliplab.rigs.arms.pose import from_quaternion
+from sliplab.rigs.arms.settings import AbbSettings
+from sliplab.rigs.capabilities import ArmState, Pose
 
 REQUEST_S = 1.0
 """Connecting, and each wait for bytes of an answer, s."""

@@ -17,15 +17,23 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from rigs.arms.guard import Guard
-from rigs.arms.health import socket_health
-from rigs.arms.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
-from rigs.arms.rapid_socket import Command, RapidError, RapidSocket
-from rigs.arms.run import Run
-from rigs.arms.settings import AbbSocketSettings
-from rigs.arms.stream import PoseStream, Sample
-from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
-from storage.streams import PoseChunk, PulseChunk
+from sliplab.rigs.arms.guard import Guard
+from sliplab.rigs.arms.health import socket_health
+from sliplab.rigs.arms.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
+from sliplab.rigs.arms.rapid_socket import Command, RapidError, RapidSocket
+from sliplab.rigs.arms.run import Run
+from sliplab.rigs.arms.settings import AbbSocketSettings
+from sliplab.rigs.arms.stream import PoseStream, Sample
+from sliplab.rigs.capabilities import (
+    ArmFault,
+    ArmState,
+    DeviceHealth,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.storage.streams import PoseChunk, PulseChunk
 
 T = TypeVar("T")
 ANSWER_S = 2.0

@@ -11,8 +11,8 @@ import contextlib
 import threading
 import time
 
-from rigs.arms.abb_rws import WebError, WebRefused, WebServices
-from rigs.arms.settings import AbbSettings
+from sliplab.rigs.arms.abb_rws import WebError, WebRefused, WebServices
+from sliplab.rigs.arms.settings import AbbSettings
 
 BEAT, ECHO, LIMIT = "sliplab_beat", "sliplab_echo", "sliplab_limit"
 """Signals: the beat; the last one that the task saw; after how many seconds it stops the arm, 0

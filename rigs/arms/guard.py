@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from rigs.arms.pose import angle_deg
-from rigs.arms.settings import Limits
-from rigs.capabilities import Pose, RigError, Segment
-from rigs.plate_frame import PlateFrame
+from sliplab.rigs.arms.pose import angle_deg
+from sliplab.rigs.arms.settings import Limits
+from sliplab.rigs.capabilities import Pose, RigError, Segment
+from sliplab.rigs.plate_frame import PlateFrame
 
 _EPS = 1e-6
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from rigs.arms import ur_ports
-from rigs.arms.abb_rws import WebServices
-from rigs.capabilities import DeviceHealth
+from sliplab.rigs.arms import ur_ports
+from sliplab.rigs.arms.abb_rws import WebServices
+from sliplab.rigs.capabilities import DeviceHealth
 
 UNKNOWN = "unknown"
 PORT_S = 1.0

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rigs.capabilities import Pose
+from sliplab.rigs.capabilities import Pose
 
 MM_PER_M = 1000.0
 F64 = npt.NDArray[np.float64]

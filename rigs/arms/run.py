@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from rigs.capabilities import ArmFault, ArmState, Progress, Segment
+from sliplab.rigs.capabilities import ArmFault, ArmState, Progress, Segment
 
 
 @dataclass

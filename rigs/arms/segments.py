@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rigs.arms.pose import angle_deg, distance_mm
-from rigs.capabilities import Pose, Segment
+from sliplab.rigs.arms.pose import angle_deg, distance_mm
+from sliplab.rigs.capabilities import Pose, Segment
 
 LEFT_MM = 0.001
 """A segment has begun once the tool centre point is this far from where it stood."""

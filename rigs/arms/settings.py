@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from protocols.yaml_file import KeyedError, StrictModel
-from rigs.address import BindAddress, Host
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.rigs.address import BindAddress, Host
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0, le=1e6)]

@@ -12,9 +12,9 @@ from threading import Condition
 
 import numpy as np
 
-from rigs.arms.pose import short_rotvec_deg
-from rigs.capabilities import Pose
-from storage.streams import PoseChunk, PulseChunk
+from sliplab.rigs.arms.pose import short_rotvec_deg
+from sliplab.rigs.capabilities import Pose
+from sliplab.storage.streams import PoseChunk, PulseChunk
 
 BACKLOG_SAMPLES = 60_000
 """Poses kept for a reader: two minutes at 500 a second. Older ones are dropped, and counted."""

@@ -19,18 +19,26 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rigs.arms import ur_ports
-from rigs.arms.guard import Guard
-from rigs.arms.health import ur_health
-from rigs.arms.pose import MM_PER_M, distance_mm, to_ur
-from rigs.arms.rtde import Packet, RtdeError, RtdeReader
-from rigs.arms.run import Run
-from rigs.arms.settings import UrSettings
-from rigs.arms.stream import PoseStream, Sample
-from rigs.arms.ur_control import WATCHDOG_HZ, ControlError, ControlProcess
-from rigs.arms.ur_state import OUTPUTS, UrStatus, status_of
-from rigs.capabilities import ArmFault, ArmState, DeviceHealth, Pose, Progress, RigError, Segment
-from storage.streams import Json, PoseChunk, PulseChunk
+from sliplab.rigs.arms import ur_ports
+from sliplab.rigs.arms.guard import Guard
+from sliplab.rigs.arms.health import ur_health
+from sliplab.rigs.arms.pose import MM_PER_M, distance_mm, to_ur
+from sliplab.rigs.arms.rtde import Packet, RtdeError, RtdeReader
+from sliplab.rigs.arms.run import Run
+from sliplab.rigs.arms.settings import UrSettings
+from sliplab.rigs.arms.stream import PoseStream, Sample
+from sliplab.rigs.arms.ur_control import WATCHDOG_HZ, ControlError, ControlProcess
+from sliplab.rigs.arms.ur_state import OUTPUTS, UrStatus, status_of
+from sliplab.rigs.capabilities import (
+    ArmFault,
+    ArmState,
+    DeviceHealth,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.storage.streams import Json, PoseChunk, PulseChunk
 
 ANSWER_S = 3.0
 """Connecting the pose stream, with every answer of its set-up, s."""

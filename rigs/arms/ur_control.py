@@ -18,7 +18,7 @@ import os
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rigs.library_process import LibraryError, LibraryProcess
+from sliplab.rigs.library_process import LibraryError, LibraryProcess
 
 START_S = 10.0
 """How long the child may take to connect, upload the control script and see it run, s."""
@@ -56,7 +56,7 @@ class ControlProcess(LibraryProcess):
     def __init__(self, host: str, frequency_hz: float) -> None:
         super().__init__(
             "control client",
-            "rigs.arms.ur_control:serve",
+            "sliplab.rigs.arms.ur_control:serve",
             (host, frequency_hz, START_S),
             START_S,
             ControlError,

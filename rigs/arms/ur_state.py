@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rigs.capabilities import ArmState
+from sliplab.rigs.capabilities import ArmState
 
 OUTPUTS = (
     "timestamp",

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
-    from rigs.capabilities import EventCamera, FrameCamera
+    from sliplab.rigs.cameras.settings import BaslerSettings, DvxplorerSettings
+    from sliplab.rigs.capabilities import EventCamera, FrameCamera
 
 
 def build_frame_camera(settings: BaslerSettings, device: Any = None) -> FrameCamera:
@@ -20,13 +20,13 @@ def build_frame_camera(settings: BaslerSettings, device: Any = None) -> FrameCam
     Args:
         device: pylon's camera behind the driver; searched for where None.
     """
-    from rigs.cameras.basler import BaslerCamera
+    from sliplab.rigs.cameras.basler import BaslerCamera
 
     return BaslerCamera(settings, device)
 
 
 def build_event_camera(settings: DvxplorerSettings) -> EventCamera:
     """The event camera that `settings` describe, open and not streaming yet. Raises RigError."""
-    from rigs.cameras.dvxplorer import DvxplorerCamera
+    from sliplab.rigs.cameras.dvxplorer import DvxplorerCamera
 
     return DvxplorerCamera(settings)

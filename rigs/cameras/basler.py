@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from rigs.cameras.basler_setup import check_rate, read_back, write_settings
-from rigs.cameras.counts import GrabCounts
-from rigs.cameras.grabbing import Grab, GrabSettings
-from rigs.cameras.health import basler_health
-from rigs.cameras.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
-from rigs.cameras.settings import BaslerSettings
-from rigs.cameras.stamps import Abilities, choose
-from rigs.capabilities import DeviceHealth, RigError
-from storage.streams import ClockReads, FrameChunk, Json
+from sliplab.rigs.cameras.basler_setup import check_rate, read_back, write_settings
+from sliplab.rigs.cameras.counts import GrabCounts
+from sliplab.rigs.cameras.grabbing import Grab, GrabSettings
+from sliplab.rigs.cameras.health import basler_health
+from sliplab.rigs.cameras.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.cameras.stamps import Abilities, choose
+from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 TRIGGER_READY_MS = 1000
 """How long a software trigger waits for the camera to be ready for it, ms."""

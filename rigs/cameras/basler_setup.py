@@ -8,10 +8,10 @@ them, there is nothing to write. What is in force is read back.
 
 from __future__ import annotations
 
-from rigs.cameras.nodes import DEVICE, Nodes
-from rigs.cameras.settings import BaslerSettings
-from rigs.capabilities import RigError
-from storage.streams import Json
+from sliplab.rigs.cameras.nodes import DEVICE, Nodes
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.capabilities import RigError
+from sliplab.storage.streams import Json
 
 LOAD_S = 10.0
 """The longest that a camera takes to load a user set, s."""

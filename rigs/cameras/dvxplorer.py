@@ -16,13 +16,13 @@ from typing import Protocol
 
 import numpy as np
 
-from rigs.cameras.counts import EventCounts
-from rigs.cameras.event_process import EventProcess
-from rigs.cameras.event_source import DEVICE, Look
-from rigs.cameras.patience import Patience
-from rigs.cameras.settings import DvxplorerSettings
-from rigs.capabilities import DeviceHealth, RigError
-from storage.streams import I64, EventChunk, Json, PulseChunk
+from sliplab.rigs.cameras.counts import EventCounts
+from sliplab.rigs.cameras.event_process import EventProcess
+from sliplab.rigs.cameras.event_source import DEVICE, Look
+from sliplab.rigs.cameras.patience import Patience
+from sliplab.rigs.cameras.settings import DvxplorerSettings
+from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001
 """The pause after a look that found nothing, s."""

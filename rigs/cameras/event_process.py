@@ -15,11 +15,11 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rigs.cameras.event_source import DEVICE, Look, open_source
-from rigs.cameras.settings import DvxplorerSettings
-from rigs.capabilities import DeviceHealth, RigError
-from rigs.library_process import LibraryError, LibraryProcess
-from storage.streams import Json
+from sliplab.rigs.cameras.event_source import DEVICE, Look, open_source
+from sliplab.rigs.cameras.settings import DvxplorerSettings
+from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.rigs.library_process import LibraryError, LibraryProcess
+from sliplab.storage.streams import Json
 
 OPEN_S = 20.0
 """The longest that the process may take to begin and to open a camera or streams, s."""
@@ -50,7 +50,7 @@ class EventProcess:
         self._process = _raised(
             lambda: LibraryProcess(
                 "dv-processing",
-                "rigs.cameras.event_process:serve",
+                "sliplab.rigs.cameras.event_process:serve",
                 (settings.model_dump_json(), OPEN_S),
                 OPEN_S,
                 patient=True,

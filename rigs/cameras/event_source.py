@@ -17,9 +17,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
-from rigs.capabilities import DeviceHealth, RigError
-from storage.streams import I64, U8, EventChunk, Json
+from sliplab.rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
+from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.storage.streams import I64, U8, EventChunk, Json
 
 DEVICE = "event camera"
 COMMIT_MS = 2

@@ -14,12 +14,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from rigs.cameras.counts import GrabCounts
-from rigs.cameras.nodes import DEVICE
-from rigs.cameras.patience import Patience
-from rigs.cameras.stamps import Stamping
-from rigs.capabilities import RigError
-from storage.streams import U8
+from sliplab.rigs.cameras.counts import GrabCounts
+from sliplab.rigs.cameras.nodes import DEVICE
+from sliplab.rigs.cameras.patience import Patience
+from sliplab.rigs.cameras.stamps import Stamping
+from sliplab.rigs.capabilities import RigError
+from sliplab.storage.streams import U8
 
 POLL_MS = 100
 """The longest that the thread waits in pylon before it looks round, ms."""

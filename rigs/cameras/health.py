@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from rigs.cameras.nodes import DEVICE as FRAME_CAMERA
-from rigs.cameras.nodes import Nodes
-from rigs.cameras.stamps import Stamping
-from rigs.capabilities import DeviceHealth, RigError
+from sliplab.rigs.cameras.nodes import DEVICE as FRAME_CAMERA
+from sliplab.rigs.cameras.nodes import Nodes
+from sliplab.rigs.cameras.stamps import Stamping
+from sliplab.rigs.capabilities import DeviceHealth, RigError
 
 UNKNOWN = "unknown"
 

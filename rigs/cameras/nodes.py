@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rigs.capabilities import RigError
-from storage.streams import ClockReads
+from sliplab.rigs.capabilities import RigError
+from sliplab.storage.streams import ClockReads
 
 DEVICE = "frame camera"
 _LOOK_S = 0.01

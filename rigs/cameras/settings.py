@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from protocols.yaml_file import KeyedError, StrictModel
-from rigs.address import Host
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.rigs.address import Host
 
 FrameTrigger = Literal["hardware", "software", "free run"]
 Readout = Literal[

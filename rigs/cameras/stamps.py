@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from protocols.timing import FrameGrade
-from rigs.cameras.settings import FrameTrigger
+from sliplab.protocols.timing import FrameGrade
+from sliplab.rigs.cameras.settings import FrameTrigger
 
 Means = Literal["chunk", "grab result", "exposure end event", "host arrival"]
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
-from rigs.mock.clocks import FaultyClock, Lateness, Noise, undisturbed
-from rigs.mock.path import TOOL, Leg
-from rigs.mock.sync import MockSyncBox, SyncInput
-from rigs.mock.world import World
-from storage.streams import PoseChunk, PulseChunk
+from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
+from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, undisturbed
+from sliplab.rigs.mock.path import TOOL, Leg
+from sliplab.rigs.mock.sync import MockSyncBox, SyncInput
+from sliplab.rigs.mock.world import World
+from sliplab.storage.streams import PoseChunk, PulseChunk
 
 BACKLOG_NS = 120_000_000_000
 """Poses older than this are dropped if nobody reads them."""

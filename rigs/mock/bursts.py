@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import EventBurst
-from rigs.mock.world import World
-from rigs.scene.randomness import generator
-from rigs.scene.readout import Scans
+from sliplab.rigs.mock.fault_settings import EventBurst
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.scene.readout import Scans
 
 I64 = npt.NDArray[np.int64]
 U16 = npt.NDArray[np.uint16]

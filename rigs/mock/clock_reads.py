@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigs.mock.world import World
-from rigs.scene.randomness import generator
-from storage.clockmap import ClockMap
-from storage.streams import ClockReads
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.streams import ClockReads
 
 
 class ClockReader:

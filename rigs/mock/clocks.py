@@ -12,11 +12,11 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import ClockDrift, ClockJump, ClockRestart, Device
-from rigs.mock.faults import FaultBook
-from rigs.mock.settings import Clocks
-from rigs.scene.randomness import generator
-from storage.clockmap import ClockMap
+from sliplab.rigs.mock.fault_settings import ClockDrift, ClockJump, ClockRestart, Device
+from sliplab.rigs.mock.faults import FaultBook
+from sliplab.rigs.mock.settings import Clocks
+from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

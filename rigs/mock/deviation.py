@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import ArmOffPath
-from rigs.mock.faults import NEVER, FaultBook
-from rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.fault_settings import ArmOffPath
+from sliplab.rigs.mock.faults import NEVER, FaultBook
+from sliplab.rigs.mock.geometry import ContactPlane
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

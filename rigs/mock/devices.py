@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from protocols.timing import Timing
-from rigs.mock.arm import MockArm
-from rigs.mock.event_camera import MockEventCamera
-from rigs.mock.frame_camera import MockFrameCamera
-from rigs.mock.free_run import ExposureLine, FreeRun
-from rigs.mock.guard import on_cable, on_disk
-from rigs.mock.people import MockPlate, SimulatedOperator, VirtualClock
-from rigs.mock.settings import MockSettings
-from rigs.mock.sync import MockSyncBox
-from rigs.mock.truth import clocks_of, truth_of
-from rigs.mock.world import World
-from storage.streams import Sink
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.mock.arm import MockArm
+from sliplab.rigs.mock.event_camera import MockEventCamera
+from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.free_run import ExposureLine, FreeRun
+from sliplab.rigs.mock.guard import on_cable, on_disk
+from sliplab.rigs.mock.people import MockPlate, SimulatedOperator, VirtualClock
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.sync import MockSyncBox
+from sliplab.rigs.mock.truth import clocks_of, truth_of
+from sliplab.rigs.mock.world import World
+from sliplab.storage.streams import Sink
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigs.mock.bursts import Bursts
-from rigs.mock.clocks import HighestStamp
-from rigs.mock.history import History
-from rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
-from rigs.mock.world import World
-from rigs.scene.events import EventOptics, MarkerSensor
-from storage.streams import EventChunk, PulseChunk
+from sliplab.rigs.mock.bursts import Bursts
+from sliplab.rigs.mock.clocks import HighestStamp
+from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.storage.streams import EventChunk, PulseChunk
 
 _NEVER = 1 << 62
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 
-from protocols.yaml_file import KeyedError, StrictModel, register_tags
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, register_tags
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Count = Annotated[int, Field(ge=1, le=100_000)]

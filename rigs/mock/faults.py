@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import (
+from sliplab.rigs.mock.fault_settings import (
     AnyFault,
     ArmProtectiveStop,
     Device,

@@ -14,20 +14,20 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from protocols.timing import FrameGrade
-from rigs.capabilities import RigError
-from rigs.mock.clock_reads import ClockReader
-from rigs.mock.clocks import Jitter, Lateness
-from rigs.mock.frame_faults import FrameFaults
-from rigs.mock.free_run import FreeRun, Trigger
-from rigs.mock.settings import MockSettings
-from rigs.mock.world import World
-from rigs.scene.board import BoardCamera, BoardPlace, BoardPrint, draw_board
-from rigs.scene.exposure import Exposures, expose
-from rigs.scene.frames import FrameOptics, PlateView
-from rigs.scene.randomness import generator
-from rigs.scene.reflections import Reflections
-from storage.streams import ClockReads, FrameChunk
+from sliplab.protocols.timing import FrameGrade
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.mock.clock_reads import ClockReader
+from sliplab.rigs.mock.clocks import Jitter, Lateness
+from sliplab.rigs.mock.frame_faults import FrameFaults
+from sliplab.rigs.mock.free_run import FreeRun, Trigger
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.board import BoardCamera, BoardPlace, BoardPrint, draw_board
+from sliplab.rigs.scene.exposure import Exposures, expose
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.scene.reflections import Reflections
+from sliplab.storage.streams import ClockReads, FrameChunk
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

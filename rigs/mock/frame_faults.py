@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
-from rigs.mock.free_run import Trigger
-from rigs.mock.world import World
-from rigs.scene.exposure import Exposures, Way
+from sliplab.rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
+from sliplab.rigs.mock.free_run import Trigger
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.exposure import Exposures, Way
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

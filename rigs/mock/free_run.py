@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rigs.mock.clocks import FaultyClock, Jitter, undisturbed
-from rigs.mock.fault_settings import DeviceGone
-from rigs.mock.world import World
-from rigs.scene.randomness import generator
-from storage.clockmap import ClockMap
+from sliplab.rigs.mock.clocks import FaultyClock, Jitter, undisturbed
+from sliplab.rigs.mock.fault_settings import DeviceGone
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.randomness import generator
+from sliplab.storage.clockmap import ClockMap
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]

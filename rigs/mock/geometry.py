@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from rigs.capabilities import Pose
-from rigs.mock.settings import Contact
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.mock.settings import Contact
 
 F64 = npt.NDArray[np.float64]
 

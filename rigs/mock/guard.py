@@ -7,10 +7,10 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from rigs.capabilities import ArmFault, RigError
-from rigs.mock.fault_settings import Device, DeviceGone, DiskFull
-from rigs.mock.world import World
-from storage.streams import Sink
+from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull
+from sliplab.rigs.mock.world import World
+from sliplab.storage.streams import Sink
 
 T = TypeVar("T")
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigs.capabilities import Pose, Segment
-from rigs.mock.geometry import matrix, rotvec_deg
-from rigs.mock.world import World
-from rigs.scene.board import VIEWS
-from rigs.scene.randomness import generator
+from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.mock.geometry import matrix, rotvec_deg
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.scene.board import VIEWS
+from sliplab.rigs.scene.randomness import generator
 
 HAND_MM = 0.02
 """Standard deviation of where a person stops, along each axis."""

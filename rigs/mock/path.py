@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rigs.capabilities import Pose, Segment
-from rigs.mock.deviation import Deviation
-from rigs.mock.geometry import ContactPlane
+from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.mock.deviation import Deviation
+from sliplab.rigs.mock.geometry import ContactPlane
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
-from protocols.program import PlateAction
-from rigs.capabilities import ArmState, RigError
-from rigs.mock.jogging import hold_board, jog
-from rigs.mock.world import World
-from rigs.people import mass_of
+from sliplab.protocols.program import PlateAction
+from sliplab.rigs.capabilities import ArmState, RigError
+from sliplab.rigs.mock.jogging import hold_board, jog
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.people import mass_of
 
 _TRACELESS = {"clean", "warm_up", "rezero"}
 _LONGEST_S = 3600.0

@@ -14,15 +14,15 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from protocols.program import PlateAction
-from rigs.mock.faults import NEVER
-from rigs.mock.history import History
-from rigs.mock.settings import MockSettings
-from rigs.scene.contact import advance
-from rigs.scene.friction import friction_knots
-from rigs.scene.plate import advance_free
-from rigs.scene.skin import Skin
-from rigs.scene.springs import GAP, Springs, Tips, make_springs, new_tips, track_width
+from sliplab.protocols.program import PlateAction
+from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.scene.contact import advance
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.plate import advance_free
+from sliplab.rigs.scene.skin import Skin
+from sliplab.rigs.scene.springs import GAP, Springs, Tips, make_springs, new_tips, track_width
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -6,9 +6,9 @@ where it is wrong.
 
 from __future__ import annotations
 
-from protocols.timing import Delay, Timing
-from protocols.yaml_file import KeyedError
-from rigs.mock.settings import MockSettings
+from sliplab.protocols.timing import Delay, Timing
+from sliplab.protocols.yaml_file import KeyedError
+from sliplab.rigs.mock.settings import MockSettings
 
 
 def check_promises(mock: MockSettings, timing: Timing) -> None:

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from protocols.yaml_file import KeyedError, StrictModel
-from rigs.mock.fault_settings import Fault, check_papillae
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.rigs.mock.fault_settings import Fault, check_papillae
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rigs.mock.settings import MockSettings
-from rigs.scene.skin import Skin, SkinGeometry, make_skin
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.scene.skin import Skin, SkinGeometry, make_skin
 
 
 def skin_of(settings: MockSettings) -> Skin:

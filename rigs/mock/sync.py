@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from protocols.timing import Code
-from rigs.capabilities import RigError
-from rigs.mock.clock_reads import ClockReader
-from rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
-from rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, PulsesLost
-from rigs.mock.faults import NEVER
-from rigs.mock.free_run import ExposureLine
-from rigs.mock.world import World
-from rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
-from storage.clockmap import ClockMap
-from storage.streams import ClockReads, PulseChunk
+from sliplab.protocols.timing import Code
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.mock.clock_reads import ClockReader
+from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
+from sliplab.rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, PulsesLost
+from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.free_run import ExposureLine
+from sliplab.rigs.mock.world import World
+from sliplab.rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.streams import ClockReads, PulseChunk
 
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]

@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from protocols.timing import FrameGrade
-from rigs.capabilities import RigError
-from rigs.mock.faults import NEVER
-from rigs.mock.world import World
-from storage.clockmap import IDENTITY, ClockMap
+from sliplab.protocols.timing import FrameGrade
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.mock.faults import NEVER
+from sliplab.rigs.mock.world import World
+from sliplab.storage.clockmap import IDENTITY, ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -14,21 +14,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from protocols.program import PlateAction
-from rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
-from rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
-from rigs.mock.deviation import Deviation
-from rigs.mock.fault_settings import PlateStuck
-from rigs.mock.faults import FaultBook
-from rigs.mock.geometry import ContactPlane
-from rigs.mock.history import History
-from rigs.mock.path import SENSOR, ArmPath, Leg
-from rigs.mock.physics import Physics
-from rigs.mock.settings import MockSettings
-from rigs.mock.skins import skin_of
-from rigs.scene.board import BoardPlace
-from rigs.scene.skin import Skin
-from rigs.scene.vibration import Vibration
+from sliplab.protocols.program import PlateAction
+from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
+from sliplab.rigs.mock.deviation import Deviation
+from sliplab.rigs.mock.fault_settings import PlateStuck
+from sliplab.rigs.mock.faults import FaultBook
+from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.history import History
+from sliplab.rigs.mock.path import SENSOR, ArmPath, Leg
+from sliplab.rigs.mock.physics import Physics
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.scene.board import BoardPlace
+from sliplab.rigs.scene.skin import Skin
+from sliplab.rigs.scene.vibration import Vibration
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

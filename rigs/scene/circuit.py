@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.crossings import distance_at
-from rigs.scene.edges import CUT, level_at, widen
-from rigs.scene.marker_path import excursion, fit_blocks, stands_still
-from rigs.scene.sorting import larger
-from rigs.scene.watch import near_rim
+from sliplab.rigs.scene.crossings import distance_at
+from sliplab.rigs.scene.edges import CUT, level_at, widen
+from sliplab.rigs.scene.marker_path import excursion, fit_blocks, stands_still
+from sliplab.rigs.scene.sorting import larger
+from sliplab.rigs.scene.watch import near_rim
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import relaxing
-from rigs.scene.lanes import respond, settle
-from rigs.scene.rows import LANES, block_of, gather, spread
-from rigs.scene.springs import (
+from sliplab.rigs.scene.column import relaxing
+from sliplab.rigs.scene.lanes import respond, settle
+from sliplab.rigs.scene.rows import LANES, block_of, gather, spread
+from sliplab.rigs.scene.springs import (
     FORCE_X,
     FORCE_Y,
     NORMAL,

@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.edges import CUT, rim_of
-from rigs.scene.pieces import FINE, K0, K1, NODE
+from sliplab.rigs.scene.edges import CUT, rim_of
+from sliplab.rigs.scene.pieces import FINE, K0, K1, NODE
 
 _DONE_PX = 1e-10
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.circuit import (
+from sliplab.rigs.scene.circuit import (
     RATE_DECADES,
     Circuit,
     new_circuit,
@@ -25,13 +25,13 @@ from rigs.scene.circuit import (
     see_image,
     start_cells,
 )
-from rigs.scene.edges import CUT, dark_pixels, darken, see_discs
-from rigs.scene.marker_path import markers_in_image
-from rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
-from rigs.scene.randomness import generator
-from rigs.scene.readout import NEVER_NS, Scans
-from rigs.scene.trace import trace
-from rigs.scene.watch import REACH_PX
+from sliplab.rigs.scene.edges import CUT, dark_pixels, darken, see_discs
+from sliplab.rigs.scene.marker_path import markers_in_image
+from sliplab.rigs.scene.noise import BIN_NS, Candidates, NoiseRates, candidates, hot_places
+from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.scene.readout import NEVER_NS, Scans
+from sliplab.rigs.scene.trace import trace
+from sliplab.rigs.scene.watch import REACH_PX
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

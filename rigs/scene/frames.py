@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.discs import MARGIN_PX, SHIFTS, add_noise, draw_discs, draw_still
-from rigs.scene.exposure import Way, moved
-from rigs.scene.lens import Lens
-from rigs.scene.plate_marker import PlateMarker, Print
-from rigs.scene.randomness import generator, key
-from rigs.scene.reflections import Reflections, draw_reflections
+from sliplab.rigs.scene.discs import MARGIN_PX, SHIFTS, add_noise, draw_discs, draw_still
+from sliplab.rigs.scene.exposure import Way, moved
+from sliplab.rigs.scene.lens import Lens
+from sliplab.rigs.scene.plate_marker import PlateMarker, Print
+from sliplab.rigs.scene.randomness import generator, key
+from sliplab.rigs.scene.reflections import Reflections, draw_reflections
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.randomness import generator
-from rigs.scene.skin import Skin
+from sliplab.rigs.scene.randomness import generator
+from sliplab.rigs.scene.skin import Skin
 
 F64 = npt.NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import ITERATIONS, bend_step, column, first_bend
-from rigs.scene.friction import grip_between, knot_at
-from rigs.scene.rows import (
+from sliplab.rigs.scene.column import ITERATIONS, bend_step, column, first_bend
+from sliplab.rigs.scene.friction import grip_between, knot_at
+from sliplab.rigs.scene.rows import (
     AFTER,
     ALONE,
     BEFORE,
@@ -48,9 +48,9 @@ from rigs.scene.rows import (
     block_of,
     take_knot,
 )
-from rigs.scene.sliding import is_steady, slows_down
-from rigs.scene.sliding_lanes import slide_on
-from rigs.scene.springs import (
+from sliplab.rigs.scene.sliding import is_steady, slows_down
+from sliplab.rigs.scene.sliding_lanes import slide_on
+from sliplab.rigs.scene.springs import (
     ACROSS,
     ALONG,
     BASE_X,
@@ -81,8 +81,8 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
-from rigs.scene.tip import ROUNDING, tip_step
-from rigs.scene.turning import raised, slides_on
+from sliplab.rigs.scene.tip import ROUNDING, tip_step
+from sliplab.rigs.scene.turning import raised, slides_on
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

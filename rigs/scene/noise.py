@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.edges import CUT, level_at
-from rigs.scene.randomness import generator
+from sliplab.rigs.scene.edges import CUT, level_at
+from sliplab.rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

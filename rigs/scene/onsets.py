@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.skin import SHORTENING, Skin
+from sliplab.rigs.scene.skin import SHORTENING, Skin
 
 F64 = npt.NDArray[np.float64]
 

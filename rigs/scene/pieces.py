@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.marker_path import largest
+from sliplab.rigs.scene.marker_path import largest
 
 K0, K1, BEGIN, END, ZERO, STRAY, NODE, BLOCK = 0, 1, 2, 3, 4, 5, 6, 7
 """First step and the step behind the last one; when the piece begins and ends, ns after its block;

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene import pieces as of
+from sliplab.rigs.scene import pieces as of
 
 LANES = 256
 STRIDE = LANES + 8

@@ -9,14 +9,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene import edges, roots
-from rigs.scene import pieces as of
-from rigs.scene import pixel_lanes as lanes
-from rigs.scene.crossings import events_of_piece
-from rigs.scene.edges import CUT
-from rigs.scene.marker_path import bound_rates
-from rigs.scene.pixel_lanes import COMES, DOUBT, LANES, NOTHING, classify, place_pixels
-from rigs.scene.roots import begin_piece, fetch, finish, guess, move, next_thresholds, refine
+from sliplab.rigs.scene import edges, roots
+from sliplab.rigs.scene import pieces as of
+from sliplab.rigs.scene import pixel_lanes as lanes
+from sliplab.rigs.scene.crossings import events_of_piece
+from sliplab.rigs.scene.edges import CUT
+from sliplab.rigs.scene.marker_path import bound_rates
+from sliplab.rigs.scene.pixel_lanes import COMES, DOUBT, LANES, NOTHING, classify, place_pixels
+from sliplab.rigs.scene.roots import (
+    begin_piece,
+    fetch,
+    finish,
+    guess,
+    move,
+    next_thresholds,
+    refine,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -14,11 +14,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import relaxing
-from rigs.scene.contact import move_tips, record
-from rigs.scene.lanes import respond
-from rigs.scene.rows import END_FORCE_Y, LANES, block_of, gather, spread
-from rigs.scene.springs import ACROSS, FORCE_Y
+from sliplab.rigs.scene.column import relaxing
+from sliplab.rigs.scene.contact import move_tips, record
+from sliplab.rigs.scene.lanes import respond
+from sliplab.rigs.scene.rows import END_FORCE_Y, LANES, block_of, gather, spread
+from sliplab.rigs.scene.springs import ACROSS, FORCE_Y
 
 _ITERATIONS = 200
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.lens import Lens
+from sliplab.rigs.scene.lens import Lens
 
 F64 = npt.NDArray[np.float64]
 U8 = npt.NDArray[np.uint8]

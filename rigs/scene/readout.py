@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from rigs.scene.sorting import sort_packed
+from sliplab.rigs.scene.sorting import sort_packed
 
 NEVER_NS = -(1 << 62)
 _TIME_BITS = 27

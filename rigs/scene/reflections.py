@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.randomness import generator
+from sliplab.rigs.scene.randomness import generator
 
 U8 = npt.NDArray[np.uint8]
 

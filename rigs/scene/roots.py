@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene import pieces as of
-from rigs.scene.crossings import solve
-from rigs.scene.edges import CUT, FAR, TAIL
-from rigs.scene.pixel_lanes import STRIDE
-from rigs.scene.smooth import logarithm
+from sliplab.rigs.scene import pieces as of
+from sliplab.rigs.scene.crossings import solve
+from sliplab.rigs.scene.edges import CUT, FAR, TAIL
+from sliplab.rigs.scene.pixel_lanes import STRIDE
+from sliplab.rigs.scene.smooth import logarithm
 
 X, Y, TARGET, TIME, LOW, HIGH, FINE, HEAD, STEP, GOOD, SINCE, INVERSE = (
     STRIDE * k for k in range(12)

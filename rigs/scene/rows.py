@@ -13,8 +13,8 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
-from rigs.scene.friction import cubic_at, knot_at
-from rigs.scene.springs import FREE, GAP, MODE, PATH
+from sliplab.rigs.scene.friction import cubic_at, knot_at
+from sliplab.rigs.scene.springs import FREE, GAP, MODE, PATH
 
 LANES = 20
 """Nineteen papillae, and one more for whole registers of four."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.contact import advance
-from rigs.scene.springs import Springs, new_tips, track_width
+from sliplab.rigs.scene.contact import advance
+from sliplab.rigs.scene.springs import Springs, new_tips, track_width
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -15,9 +15,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import CLOSE, ITERATIONS, bend_for, column
-from rigs.scene.friction import KNOT_MM, grip_at
-from rigs.scene.smooth import logarithm
+from sliplab.rigs.scene.column import CLOSE, ITERATIONS, bend_for, column
+from sliplab.rigs.scene.friction import KNOT_MM, grip_at
+from sliplab.rigs.scene.smooth import logarithm
 
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.friction import grip_between, knot_at
-from rigs.scene.rows import (
+from sliplab.rigs.scene.friction import grip_between, knot_at
+from sliplab.rigs.scene.rows import (
     AFTER,
     AHEAD,
     ALONE,
@@ -52,7 +52,7 @@ from rigs.scene.rows import (
     WAY,
     take_knot,
 )
-from rigs.scene.sliding import (
+from sliplab.rigs.scene.sliding import (
     PASSES,
     along_slip,
     begun,
@@ -62,7 +62,7 @@ from rigs.scene.sliding import (
     slide_step,
     strengthened,
 )
-from rigs.scene.springs import (
+from sliplab.rigs.scene.springs import (
     ACROSS,
     ALONG,
     BASE_X,
@@ -83,7 +83,7 @@ from rigs.scene.springs import (
     SLIDING,
     SPEED,
 )
-from rigs.scene.turning import chord, dragged, turned
+from sliplab.rigs.scene.turning import chord, dragged, turned
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

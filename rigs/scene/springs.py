@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.friction import friction_field
-from rigs.scene.skin import SHORTENING, Skin
+from sliplab.rigs.scene.friction import friction_field
+from sliplab.rigs.scene.skin import SHORTENING, Skin
 
 F64 = npt.NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.column import ITERATIONS, bend_for, column, relaxing
-from rigs.scene.friction import grip_at
-from rigs.scene.rows import (
+from sliplab.rigs.scene.column import ITERATIONS, bend_for, column, relaxing
+from sliplab.rigs.scene.friction import grip_at
+from sliplab.rigs.scene.rows import (
     DEEP,
     END_BENT,
     END_FORCE_X,
@@ -34,7 +34,7 @@ from rigs.scene.rows import (
     TO_X,
     TO_Y,
 )
-from rigs.scene.sliding import (
+from sliplab.rigs.scene.sliding import (
     PASSES,
     along_slip,
     begun,
@@ -47,7 +47,7 @@ from rigs.scene.sliding import (
     slows_down,
     strengthened,
 )
-from rigs.scene.springs import (
+from sliplab.rigs.scene.springs import (
     ACROSS,
     ALONG,
     BASE_X,
@@ -74,7 +74,7 @@ from rigs.scene.springs import (
     SPEED,
     STUCK,
 )
-from rigs.scene.turning import chord, dragged, leaves_at, raised, slides_on, turned
+from sliplab.rigs.scene.turning import chord, dragged, leaves_at, raised, slides_on, turned
 
 ROUNDING = 1.0 + 1e-13
 """A force this little over its limit is rounding, not slip: a tip at rest stays to the bit."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.circuit import events_of_circuit
-from rigs.scene.edges import CUT, widen
-from rigs.scene.marker_path import (
+from sliplab.rigs.scene.circuit import events_of_circuit
+from sliplab.rigs.scene.edges import CUT, widen
+from sliplab.rigs.scene.marker_path import (
     excursion,
     fit_blocks,
     inner_weights,
@@ -20,14 +20,14 @@ from rigs.scene.marker_path import (
     slope_weights,
     stands_still,
 )
-from rigs.scene.noise import noise_events
-from rigs.scene.pieces import FIELDS, cut_block, farthest
-from rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
-from rigs.scene.pixels import events_of_pixels
-from rigs.scene.readout import read_each, read_scans
-from rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
-from rigs.scene.sorting import larger
-from rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
+from sliplab.rigs.scene.noise import noise_events
+from sliplab.rigs.scene.pieces import FIELDS, cut_block, farthest
+from sliplab.rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
+from sliplab.rigs.scene.pixels import events_of_pixels
+from sliplab.rigs.scene.readout import read_each, read_scans
+from sliplab.rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
+from sliplab.rigs.scene.sorting import larger
+from sliplab.rigs.scene.watch import REACH_PX, make_list, may_fire, near_rim, reaches, renew
 
 SPAN_NS = 96_000_000
 """As long a time is looked at in one go; a packed event has room for 134 ms."""

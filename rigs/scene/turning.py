@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.smooth import decayed, logarithm
+from sliplab.rigs.scene.smooth import decayed, logarithm
 
 _BETWEEN = 1.0 - 1e-9
 

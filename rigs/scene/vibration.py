@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rigs.scene.randomness import generator
+from sliplab.rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rigs.scene.edges import CUT, OFF, ON
+from sliplab.rigs.scene.edges import CUT, OFF, ON
 
 REACH_PX = 1.5
 """How far a marker may move, and grow, before its list is made again."""

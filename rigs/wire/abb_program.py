@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from rigs.arms.pose import from_quaternion
-from rigs.capabilities import Pose
+from sliplab.rigs.arms.pose import from_quaternion
+from sliplab.rigs.capabilities import Pose
 
 FILE_VERSION = 10011
 _MOVE_L, _WAIT = 3, 5

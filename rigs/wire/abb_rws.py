@@ -20,14 +20,14 @@ from urllib.parse import parse_qsl
 
 from abb_robot_client._egm_protobuf import egm_pb2
 
-from rigs.arms.abb_watchdog import BEAT, ECHO, LIMIT
-from rigs.arms.pose import compose, inverse, quaternion
-from rigs.capabilities import Pose
-from rigs.wire.abb_http import HttpServer, Reply
-from rigs.wire.abb_program import MoveL, ProgramError, Wait, read_program
-from rigs.wire.faults import CLOCK_BACK_S, PACKETS_LOST, Fault, Kind, Stage
-from rigs.wire.loop import START_S
-from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
+from sliplab.rigs.arms.abb_watchdog import BEAT, ECHO, LIMIT
+from sliplab.rigs.arms.pose import compose, inverse, quaternion
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.abb_http import HttpServer, Reply
+from sliplab.rigs.wire.abb_program import MoveL, ProgramError, Wait, read_program
+from sliplab.rigs.wire.faults import CLOCK_BACK_S, PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.wire.loop import START_S
+from sliplab.rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
 
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)

@@ -14,12 +14,12 @@ import struct
 import time
 from collections.abc import Sequence
 
-from rigs.arms.pose import distance_mm, from_quaternion, quaternion
-from rigs.arms.rapid_socket import ARGUMENTS, Command
-from rigs.capabilities import Pose
-from rigs.wire.faults import Fault, Kind, Stage
-from rigs.wire.loop import Connections, LoopThread
-from rigs.wire.motion import ControllerClock, CycleClock, StraightMotion
+from sliplab.rigs.arms.pose import distance_mm, from_quaternion, quaternion
+from sliplab.rigs.arms.rapid_socket import ARGUMENTS, Command
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.faults import Fault, Kind, Stage
+from sliplab.rigs.wire.loop import Connections, LoopThread
+from sliplab.rigs.wire.motion import ControllerClock, CycleClock, StraightMotion
 
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)

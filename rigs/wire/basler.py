@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigs.scene.frames import FrameOptics, PlateView
-from storage.streams import U8
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.storage.streams import U8
 
 VARIABLE = "PYLON_CAMEMU"
 EMULATED = "BaslerCamEmu"

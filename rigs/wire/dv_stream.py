@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import struct
 
-from storage.exchange.dv_buffers import events_buffer, header_buffer, triggers_buffer
-from storage.streams import I64, EventChunk
+from sliplab.storage.exchange.dv_buffers import events_buffer, header_buffer, triggers_buffer
+from sliplab.storage.streams import I64, EventChunk
 
 RISING_EDGE = 1
 """`EXTERNAL_SIGNAL_RISING_EDGE` of dv-processing's `TriggerType`."""

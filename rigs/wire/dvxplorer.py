@@ -18,11 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from rigs.cameras.settings import DvxplorerSettings, NetworkStream
-from rigs.scene.events import EventOptics, MarkerSensor
-from rigs.wire.dv_server import DvServer
-from rigs.wire.dv_stream import events_header, events_packet, triggers_header, triggers_packet
-from storage.streams import I64, EventChunk
+from sliplab.rigs.cameras.settings import DvxplorerSettings, NetworkStream
+from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.rigs.wire.dv_server import DvServer
+from sliplab.rigs.wire.dv_stream import (
+    events_header,
+    events_packet,
+    triggers_header,
+    triggers_packet,
+)
+from sliplab.storage.streams import I64, EventChunk
 
 Packet = tuple[EventChunk, I64]
 """Events, and the rising edges that came with them, us of the camera's clock."""

@@ -14,10 +14,10 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from rigs.cameras.basler import find_camera
-from rigs.wire.basler import EMULATED, emulate
-from rigs.wire.basler_nodes import Command, NodeMap, ReadOnly, Selected, Setting
-from storage.streams import U8, FrameChunk
+from sliplab.rigs.cameras.basler import find_camera
+from sliplab.rigs.wire.basler import EMULATED, emulate
+from sliplab.rigs.wire.basler_nodes import Command, NodeMap, ReadOnly, Selected, Setting
+from sliplab.storage.streams import U8, FrameChunk
 
 TRIES = 3
 MISSED_S = 0.2

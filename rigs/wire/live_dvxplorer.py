@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from rigs.wire.dv_server import DvServer
-from rigs.wire.dv_stream import events_header, events_packet, triggers_header, triggers_packet
-from storage.streams import EventChunk, PulseChunk
+from sliplab.rigs.wire.dv_server import DvServer
+from sliplab.rigs.wire.dv_stream import (
+    events_header,
+    events_packet,
+    triggers_header,
+    triggers_packet,
+)
+from sliplab.storage.streams import EventChunk, PulseChunk
 
 NAME = "stand-in"
 

@@ -18,15 +18,15 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
-from protocols.program import PlateAction
-from protocols.timing import Timing
-from rigs.arms.settings import ArmSettings
-from rigs.cameras.settings import NetworkStream
-from rigs.capabilities import RigError
-from rigs.devices import DeviceSettings
-from rigs.mock.settings import MockSettings
-from rigs.sync_settings import SyncBoxSettings
-from storage.streams import FrameChunk, Sink
+from sliplab.protocols.program import PlateAction
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.arms.settings import ArmSettings
+from sliplab.rigs.cameras.settings import NetworkStream
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.sync_settings import SyncBoxSettings
+from sliplab.storage.streams import FrameChunk, Sink
 
 READY_S = 180.0
 """The longest that the stand-ins take to begin: kernels may have to be compiled, s."""
@@ -203,7 +203,7 @@ def _serve(
     arm: ArmSettings,
 ) -> None:
     """The process: it ends with its parent, and never waits for a library to be taken down."""
-    from rigs.wire.theatre import Theatre
+    from sliplab.rigs.wire.theatre import Theatre
 
     sys.setswitchinterval(0.0005)  # the stand-ins' threads answer while the scene computes
     status, theatre = 1, None

@@ -16,8 +16,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rigs.arms.pose import angle_deg, between, distance_mm, way
-from rigs.capabilities import Pose
+from sliplab.rigs.arms.pose import angle_deg, between, distance_mm, way
+from sliplab.rigs.capabilities import Pose
 
 F64 = npt.NDArray[np.float64]
 _OFF_LINE_MM = 0.01

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rigs.capabilities import Pose, RigError, Segment
-from rigs.mock.geometry import ContactPlane
-from rigs.mock.path import EVERY, ArmPath, Leg, stirred
-from rigs.wire.motion import STILL, Line, StraightMotion
-from storage.clockmap import ClockMap
+from sliplab.rigs.capabilities import Pose, RigError, Segment
+from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.path import EVERY, ArmPath, Leg, stirred
+from sliplab.rigs.wire.motion import STILL, Line, StraightMotion
+from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from rigs.arms.settings import ArmSettings, UrSettings
-from rigs.capabilities import Pose
-from rigs.wire.faults import Kind
-from rigs.wire.motion import StraightMotion
+from sliplab.rigs.arms.settings import ArmSettings, UrSettings
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.faults import Kind
+from sliplab.rigs.wire.motion import StraightMotion
 
 REACH_MM = 2_000.0
 """Limits of the stand-in itself; those of the rig file are the driver's to hold."""
@@ -68,7 +68,7 @@ def standing_arm(
     arm: StandingArm
     clock = DrivenClock(now_s)
     if isinstance(settings, UrSettings):
-        from rigs.wire.ur import UrStandIn
+        from sliplab.rigs.wire.ur import UrStandIn
 
         bit = 1 << settings.sync_input
         arm = UrStandIn(
@@ -80,7 +80,7 @@ def standing_arm(
             clock=clock,
         )
     elif settings.driver == "abb":
-        from rigs.wire.abb_rws import AbbStandIn
+        from sliplab.rigs.wire.abb_rws import AbbStandIn
 
         arm = AbbStandIn(
             settings.host,
@@ -91,7 +91,7 @@ def standing_arm(
             clock=clock,
         )
     else:
-        from rigs.wire.abb_socket import RapidStandIn
+        from sliplab.rigs.wire.abb_socket import RapidStandIn
 
         arm = RapidStandIn(settings.host, settings.port, motion=motion, clock=clock)
     arm.start()

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import get_args
 
-from protocols.timing import Code
-from rigs.pulse_code import SEEDS
-from rigs.sync_line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
-from rigs.sync_train import Bits
+from sliplab.protocols.timing import Code
+from sliplab.rigs.pulse_code import SEEDS
+from sliplab.rigs.sync_line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
+from sliplab.rigs.sync_train import Bits
 
 TURN_S = 0.001
 """How often the stand-in looks what is due."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigs.pulse_code import code_bits
-from rigs.wire.sync_box import Train
-from storage.clockmap import ClockMap
+from sliplab.rigs.pulse_code import code_bits
+from sliplab.rigs.wire.sync_box import Train
+from sliplab.storage.clockmap import ClockMap
 
 PULSE_NS = 5_000_000
 """Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""

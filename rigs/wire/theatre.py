@@ -17,28 +17,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from protocols.program import PlateAction
-from protocols.timing import Timing
-from rigs.arms.settings import ArmSettings
-from rigs.capabilities import ArmState, Pose, RigError, Segment
-from rigs.mock.clocks import trial_clocks
-from rigs.mock.devices import build_mock
-from rigs.mock.event_camera import MockEventCamera
-from rigs.mock.frame_camera import MockFrameCamera
-from rigs.mock.geometry import ContactPlane
-from rigs.mock.people import MockPlate, SimulatedOperator
-from rigs.mock.settings import MockSettings
-from rigs.mock.sync import MockSyncBox
-from rigs.mock.truth import truth_of
-from rigs.mock.world import World, start_pose
-from rigs.wire.faults import Kind
-from rigs.wire.live_dvxplorer import LiveDvxplorer
-from rigs.wire.motion_path import MotionPath
-from rigs.wire.standing_arm import StandingArm, standing_arm
-from rigs.wire.sync_box import PtySyncBox, Train
-from rigs.wire.sync_level import SyncLevel
-from storage.clockmap import ClockMap
-from storage.streams import FrameChunk
+from sliplab.protocols.program import PlateAction
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.arms.settings import ArmSettings
+from sliplab.rigs.capabilities import ArmState, Pose, RigError, Segment
+from sliplab.rigs.mock.clocks import trial_clocks
+from sliplab.rigs.mock.devices import build_mock
+from sliplab.rigs.mock.event_camera import MockEventCamera
+from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.people import MockPlate, SimulatedOperator
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.sync import MockSyncBox
+from sliplab.rigs.mock.truth import truth_of
+from sliplab.rigs.mock.world import World, start_pose
+from sliplab.rigs.wire.faults import Kind
+from sliplab.rigs.wire.live_dvxplorer import LiveDvxplorer
+from sliplab.rigs.wire.motion_path import MotionPath
+from sliplab.rigs.wire.standing_arm import StandingArm, standing_arm
+from sliplab.rigs.wire.sync_box import PtySyncBox, Train
+from sliplab.rigs.wire.sync_level import SyncLevel
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.streams import FrameChunk
 
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000

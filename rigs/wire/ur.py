@@ -4,7 +4,7 @@
 a loopback address of its own (127.0.0.2, .3, ...). ur_rtde 1.6.5's control, receive and dashboard
 clients take it for a PolyScope 5.11 (tested). Its clock may run faster than the host's.
 
-As a process of its own: ``python -m rigs.wire.ur 127.0.0.2``.
+As a process of its own: ``python -m sliplab.rigs.wire.ur 127.0.0.2``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from rigs.arms.rtde import (
+from sliplab.rigs.arms.rtde import (
     DATA,
     GET_VERSION,
     HEADER,
@@ -26,13 +26,13 @@ from rigs.arms.rtde import (
     SETUP_OUTPUTS,
     START,
 )
-from rigs.arms.rtde import PORT as RTDE_PORT
-from rigs.capabilities import Pose
-from rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
-from rigs.wire.loop import Connections, LoopThread
-from rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
-from rigs.wire.ur_client import Client, send
-from rigs.wire.ur_program import Safety, UrProgram
+from sliplab.rigs.arms.rtde import PORT as RTDE_PORT
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.wire.loop import Connections, LoopThread
+from sliplab.rigs.wire.motion import ControllerClock, CycleClock, Motion, StraightMotion
+from sliplab.rigs.wire.ur_client import Client, send
+from sliplab.rigs.wire.ur_program import Safety, UrProgram
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 VERSION = (5, 11, 1, 108318)

@@ -10,8 +10,8 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from rigs.arms.rtde import HEADER, TYPES
-from rigs.wire.ur_program import UrProgram
+from sliplab.rigs.arms.rtde import HEADER, TYPES
+from sliplab.rigs.wire.ur_program import UrProgram
 
 _UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
 _INT32 = {"robot_mode", "safety_mode"}

@@ -13,10 +13,10 @@ import re
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 
-from rigs.arms.pose import MM_PER_M, distance_mm, from_ur, to_ur
-from rigs.capabilities import Pose
-from rigs.wire.faults import CLOCK_BACK_S, Fault, Kind, Stage
-from rigs.wire.motion import Motion
+from sliplab.rigs.arms.pose import MM_PER_M, distance_mm, from_ur, to_ur
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.faults import CLOCK_BACK_S, Fault, Kind, Stage
+from sliplab.rigs.wire.motion import Motion
 
 READY, DONE = 1, 2
 RUNNING_BIT = 1 << 15

@@ -21,16 +21,16 @@ import numpy as np
 import pyarrow as pa
 from numba import njit
 
-from storage.exchange.dv_buffers import (
+from sliplab.storage.exchange.dv_buffers import (
     GREY,
     events_buffer,
     frame_buffer,
     header_buffer,
     triggers_buffer,
 )
-from storage.exchange.flatbuffer import Table
-from storage.exchange.foreign import LATEST_US, MOST_PX, Triggers, Wrong, event_chunk
-from storage.streams import U8, EventChunk
+from sliplab.storage.exchange.flatbuffer import Table
+from sliplab.storage.exchange.foreign import LATEST_US, MOST_PX, Triggers, Wrong, event_chunk
+from sliplab.storage.streams import U8, EventChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
 EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"

@@ -12,9 +12,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
-from protocols.errors import InputError
-from storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head
-from storage.streams import EventChunk
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head
+from sliplab.storage.streams import EventChunk
 
 LIBRARY = "faery"
 EVENT_STREAM = b"Event Stream"

@@ -14,7 +14,7 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from storage.exchange.foreign import (
+from sliplab.storage.exchange.foreign import (
     LATEST_US,
     ForeignTrial,
     Triggers,
@@ -22,8 +22,8 @@ from storage.exchange.foreign import (
     event_chunk,
     rounded_us,
 )
-from storage.rows import RowFile, Rows
-from storage.streams import I64, EventChunk
+from sliplab.storage.rows import RowFile, Rows
+from sliplab.storage.streams import I64, EventChunk
 
 PIECE = 1 << 20
 _MOST_PACKED = 2000

@@ -12,7 +12,7 @@ import struct
 import numpy as np
 import numpy.typing as npt
 
-from storage.streams import I64, U8, EventChunk
+from sliplab.storage.streams import I64, U8, EventChunk
 
 EVENT = np.dtype(
     {

@@ -10,14 +10,14 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from protocols.errors import InputError
-from storage.exchange.aedat4 import LINE
-from storage.exchange.by_faery import faery_type, read_by_faery
-from storage.exchange.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
-from storage.exchange.foreign import ForeignTrial, Wrong, read_head
-from storage.exchange.lab_pickles import pairs, read_pair
-from storage.exchange.manifest import as_it_was, read_manifest
-from storage.exchange.read_aedat4 import read_aedat4
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.aedat4 import LINE
+from sliplab.storage.exchange.by_faery import faery_type, read_by_faery
+from sliplab.storage.exchange.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
+from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, read_head
+from sliplab.storage.exchange.lab_pickles import pairs, read_pair
+from sliplab.storage.exchange.manifest import as_it_was, read_manifest
+from sliplab.storage.exchange.read_aedat4 import read_aedat4
 
 Reader = Callable[[Path, str], ForeignTrial]
 READERS: dict[str, tuple[tuple[str, ...], Reader]] = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from storage.exchange.foreign import Wrong
+from sliplab.storage.exchange.foreign import Wrong
 
 
 class Table:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from protocols.errors import InputError
-from storage.streams import I64, U8, EventChunk, FrameChunk, Json
+from sliplab.protocols.errors import InputError
+from sliplab.storage.streams import I64, U8, EventChunk, FrameChunk, Json
 
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14

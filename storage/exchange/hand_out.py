@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
-from storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4Writer, Stream
-from storage.exchange.dsec import write_dsec
-from storage.exchange.foreign import Triggers
-from storage.exchange.manifest import FORMAT, MANIFEST
-from storage.exchange.read_aedat4 import SIMULATED
-from storage.exchange.take_in import RISING
-from storage.files import make_folder, sync_file, sync_folder, write_json
-from storage.recording import Recording
-from storage.streams import I64, EventChunk, Json
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4Writer, Stream
+from sliplab.storage.exchange.dsec import write_dsec
+from sliplab.storage.exchange.foreign import Triggers
+from sliplab.storage.exchange.manifest import FORMAT, MANIFEST
+from sliplab.storage.exchange.read_aedat4 import SIMULATED
+from sliplab.storage.exchange.take_in import RISING
+from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.streams import I64, EventChunk, Json
 
 SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
 """Of the files of each format."""

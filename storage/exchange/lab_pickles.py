@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from protocols.errors import InputError
-from storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head, rounded_us
-from storage.exchange.pickles import parse_pickle, read_bounded
-from storage.streams import EventChunk
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head, rounded_us
+from sliplab.storage.exchange.pickles import parse_pickle, read_bounded
+from sliplab.storage.streams import EventChunk
 
 _FILE = re.compile(
     r"(?P<stem>.+?)(?P<events>_events)?_(?P<polarity>on|off)(?P<ending>\.(?:pickle|pkl|npy))?"

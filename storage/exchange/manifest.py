@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from protocols.errors import InputError
-from storage.errors import StoreError
-from storage.exchange.foreign import ForeignTrial
-from storage.files import read_json
-from storage.store import safe_name
-from storage.streams import Json
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
+from sliplab.storage.exchange.foreign import ForeignTrial
+from sliplab.storage.files import read_json
+from sliplab.storage.store import safe_name
+from sliplab.storage.streams import Json
 
 MANIFEST = "sliplab-export.json"
 FORMAT = 1

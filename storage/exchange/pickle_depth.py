@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from storage.exchange.pickle_numpy import Refused
+from sliplab.storage.exchange.pickle_numpy import Refused
 
 MAX_DEPTH = 32
 PLAIN = (type(None), bool, int, float, str, bytes)

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from storage.exchange.pickle_depth import PLAIN
-from storage.exchange.pickle_numpy import ALLOWED, BUILDERS, Pending, Refused
+from sliplab.storage.exchange.pickle_depth import PLAIN
+from sliplab.storage.exchange.pickle_numpy import ALLOWED, BUILDERS, Pending, Refused
 
 MAX_CONTAINERS = 1_000_000
 """The lab's files have a list a pixel: 307,200."""

@@ -11,10 +11,10 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from protocols.errors import InputError
-from storage.exchange.pickle_depth import check_depth
-from storage.exchange.pickle_machine import Machine
-from storage.exchange.pickle_numpy import Refused
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.pickle_depth import check_depth
+from sliplab.storage.exchange.pickle_machine import Machine
+from sliplab.storage.exchange.pickle_numpy import Refused
 
 MAX_BYTES = 1 << 29
 _KINDS = "numbers, text, plain containers and numpy arrays"

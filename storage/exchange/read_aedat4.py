@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4File
-from storage.exchange.foreign import ForeignTrial, Wrong
-from storage.streams import EventChunk, FrameChunk
+from sliplab.storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4File
+from sliplab.storage.exchange.foreign import ForeignTrial, Wrong
+from sliplab.storage.streams import EventChunk, FrameChunk
 
 SIMULATED = "simulated"
 """Stands in the source's name of a file that was written from simulated data."""

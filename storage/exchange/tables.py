@@ -9,10 +9,10 @@ from typing import Any
 
 import pandas as pd
 
-from protocols.errors import InputError
-from storage.derived import Derived
-from storage.files import write_bytes
-from storage.store import Store
+from sliplab.protocols.errors import InputError
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import write_bytes
+from sliplab.storage.store import Store
 
 LABELS = "labels"
 

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from protocols.errors import InputError
-from storage.clockmap import IDENTITY
-from storage.exchange.foreign import ForeignTrial, Wrong
-from storage.files import json_text
-from storage.process import now
-from storage.recording import RECORD_FORMAT
-from storage.store import IMPORTED, Campaign, Store, safe_name
-from storage.streams import EventChunk, Json, PulseChunk
-from storage.writer import TrialWriter
+from sliplab.protocols.errors import InputError
+from sliplab.storage.clockmap import IDENTITY
+from sliplab.storage.exchange.foreign import ForeignTrial, Wrong
+from sliplab.storage.files import json_text
+from sliplab.storage.process import now
+from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.store import IMPORTED, Campaign, Store, safe_name
+from sliplab.storage.streams import EventChunk, Json, PulseChunk
+from sliplab.storage.writer import TrialWriter
 
 RISING = 1
 """A rising edge of the external input, as AEDAT4 numbers triggers."""

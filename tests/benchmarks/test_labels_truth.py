@@ -6,9 +6,9 @@ import numpy as np
 
 from benchmarks.labels_summary import summary, tables, verdicts
 from benchmarks.labels_truth import GLARE, NUISANCES, ROOT, check
-from flows.searching.scene_runs import sample_trials
-from protocols.plan import load_plan
-from rigs.rig_file import load_rig_file
+from sliplab.flows.searching.scene_runs import sample_trials
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.rig_file import load_rig_file
 
 
 def test_two_slides_against_the_truth() -> None:

@@ -8,11 +8,11 @@ from typing import Any
 
 import yaml
 
-from flows.collecting.stretch import stretch
-from flows.planning.orders import Order, make_order
-from storage.files import read_json
-from storage.store import Store
-from storage.verify import UNFINISHED, verify
+from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
+from sliplab.storage.verify import UNFINISHED, verify
 from tests.conftest import ROOT, SMALL
 
 NAME = "crash"

@@ -8,8 +8,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from flows.__main__ import _explain
-from flows.planning.orders import Order
+from sliplab.flows.__main__ import _explain
+from sliplab.flows.planning.orders import Order
 from tests.crash.campaign import collect, hashes, order, wrong, wrong_at_the_end
 from tests.crash.hooks import Policy
 from tests.crash.policies import Full, ReadOnly

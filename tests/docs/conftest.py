@@ -23,7 +23,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.docs.walk import run
 
     folder = tmp_path_factory.mktemp("checkout")
-    for package in PACKAGES:  # with what is compiled already
+    for package in ("sliplab", *PACKAGES):  # with what is compiled already
         shutil.copytree(ROOT / package, folder / package)
     line = "sliplab collect protocols/pilot.yaml --rig rehearsal --store data --trials 2"
     done = run(line, folder)
@@ -37,4 +37,6 @@ def checkout(prepared: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "checkout"
     shutil.copytree(prepared, folder)
     (folder / "docs").symlink_to(ROOT / "docs")
+    for package in PACKAGES:  # as an editable install of this checkout would find them
+        (folder / "sliplab" / package).symlink_to(folder / package)
     return folder

@@ -15,7 +15,7 @@ import pytest
 import typer
 from typer.exceptions import TyperException
 
-from flows.cli.app import app
+from sliplab.flows.cli.app import app
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES, Command, blocks, commands
 
@@ -39,7 +39,7 @@ def _fault(command: Command) -> str | None:
     name, *rest = command.words
     if name == "make":
         return _make_fault(command.page, rest)
-    if name == "python" and rest[:2] != ["-m", "flows"]:
+    if name == "python" and rest[:2] != ["-m", "sliplab"]:
         return _python_fault(command.page, rest)
     return _sliplab_fault(rest[2:] if name == "python" else rest, command.fenced)
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from protocols.plan import load_plan
-from rigs.rig_file import load_rig_file
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.rig_file import load_rig_file
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES, Command, commands
 from tests.docs.walk import run

@@ -13,12 +13,12 @@ import pytest
 import yaml
 from jsonschema import Draft7Validator
 
-from flows.planning.schema import Kind, file_schema
-from protocols.errors import InputError
-from protocols.model import Protocol
-from protocols.yaml_file import StrictModel, validate
-from rigs.rig_file import RigFile, load_rig_file
-from storage.files import json_text
+from sliplab.flows.planning.schema import Kind, file_schema
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.yaml_file import StrictModel, validate
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.storage.files import json_text
 from tests.conftest import ROOT
 
 FILES: list[tuple[Kind, Path]] = [
@@ -189,7 +189,7 @@ def test_keys_are_explained() -> None:
 def test_the_command_prints_and_writes_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from flows.cli.app import app
+    from sliplab.flows.cli.app import app
 
     out = tmp_path / "rig.json"
     assert not app(["schema", "rig", "--out", str(out)], standalone_mode=False)

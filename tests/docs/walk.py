@@ -15,9 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.running import console
+from sliplab.flows.running import console
 from tests.command_line import here
-from tests.conftest import ROOT
 from tests.docs.blocks import Block, blocks, steps
 
 WIDTH = 100
@@ -40,7 +39,7 @@ def run(line: str, folder: Path) -> Done:
         return _sliplab(words, folder)
     words[0] = sys.executable if words[0] == "python" else words[0]
     ended = subprocess.run(
-        words, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
+        words, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
         text=True, timeout=120,
     )  # fmt: skip
     return Done(ended.returncode, ended.stdout, ended.stderr)

@@ -17,10 +17,10 @@ from tests.conftest import ROOT, SMALL
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
-from flows.collecting.collect import collect  # noqa: E402
-from flows.planning.orders import Order, make_order  # noqa: E402
-from flows.running.orchestration import prepare  # noqa: E402
-from flows.study import Outcome, study  # noqa: E402
+from sliplab.flows.collecting.collect import collect  # noqa: E402
+from sliplab.flows.planning.orders import Order, make_order  # noqa: E402
+from sliplab.flows.running.orchestration import prepare  # noqa: E402
+from sliplab.flows.study import Outcome, study  # noqa: E402
 
 prepare(Path(_HOME))
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import yaml
 
-from flows.collecting.session import Session
-from flows.planning.orders import Order, describe_campaign, make_order, pending_trials
-from rigs.build import loopback_rig
-from rigs.rig_file import RigFile
-from rigs.wire.loopback import Loopback
-from storage.store import Campaign, Store
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import Order, describe_campaign, make_order, pending_trials
+from sliplab.rigs.build import loopback_rig
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.wire.loopback import Loopback
+from sliplab.storage.store import Campaign, Store
 from tests.conftest import ROOT, SMALL
 from tests.flows.conftest import write
 from tests.rigs.loopback import own_address

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from flows.labelling.label import STEP, label_key
-from flows.running.campaigns import Collected
-from storage.derived import Derived
-from storage.files import sha256
-from storage.store import Campaign, Store
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.running.campaigns import Collected
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import sha256
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
 from tests.conftest import ROOT
 
 NAME = "kinematic"

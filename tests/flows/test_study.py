@@ -12,27 +12,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.nets import training
-from analysis.nets.dataset import recorded_span
-from analysis.nets.metrics import CLASSES
-from analysis.nets.window_checks import Chance
-from flows.collecting.collect import collect
-from flows.labelling.label_check import check_labels, folder_of, wanted
-from flows.labelling.label_errors import read_check
-from flows.labelling.reviewed import Labels
-from flows.learning import window_baselines, window_checks
-from flows.learning.evaluate import evaluate
-from flows.learning.samples import load_samples, split_trials
-from flows.learning.train import train
-from flows.planning.orders import Order, make_order
-from flows.reporting.report import read_summary, report
-from flows.running import trial_work
-from flows.running.campaigns import collected, training_campaigns
-from flows.study import Outcome, study
-from protocols.errors import InputError
-from storage.derived import Derived
-from storage.files import write_bytes
-from storage.store import Store, StoreError
+from sliplab.analysis.nets import training
+from sliplab.analysis.nets.dataset import recorded_span
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.nets.window_checks import Chance
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label_check import check_labels, folder_of, wanted
+from sliplab.flows.labelling.label_errors import read_check
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning import window_baselines, window_checks
+from sliplab.flows.learning.evaluate import evaluate
+from sliplab.flows.learning.samples import load_samples, split_trials
+from sliplab.flows.learning.train import train
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.running import trial_work
+from sliplab.flows.running.campaigns import collected, training_campaigns
+from sliplab.flows.study import Outcome, study
+from sliplab.protocols.errors import InputError
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import write_bytes
+from sliplab.storage.store import Store, StoreError
 from tests.flows.conftest import tiny, tiny_gravity, write
 
 
@@ -238,8 +238,8 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
     ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
-    monkeypatch.setattr("flows.learning.train.Model.fresh", False)
-    monkeypatch.setattr("analysis.nets.training_device.devices", lambda: ["cuda", "cuda:0"])
+    monkeypatch.setattr("sliplab.flows.learning.train.Model.fresh", False)
+    monkeypatch.setattr("sliplab.analysis.nets.training_device.devices", lambda: ["cuda", "cuda:0"])
     with pytest.raises(
         InputError,
         match=r"analysis\.training\.device = cpu: there is none here; must be one of cuda, cuda:0",
@@ -369,7 +369,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
         raise _Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("flows.learning.train.write_bytes", write_and_die)
+        patched.setattr("sliplab.flows.learning.train.write_bytes", write_and_die)
         with pytest.raises(_Killed):
             train(store, collected(store))
     assert len(list(models.glob("*.state"))) == 1
@@ -397,9 +397,9 @@ def test_the_model_goes_out_as_what_it_is(
     ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
-    from analysis.nets import onnx_file
-    from flows.detecting.detect_order import load_model
-    from flows.learning.model_export import ExportFailed, export_model
+    from sliplab.analysis.nets import onnx_file
+    from sliplab.flows.detecting.detect_order import load_model
+    from sliplab.flows.learning.model_export import ExportFailed, export_model
 
     store = store_of(ran)
     model = store.folder / "models" / "seed0.pt"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.study_ledger import DONE, RUNNING, STOPPED, TO_DO, Ledger, read
+from sliplab.flows.study_ledger import DONE, RUNNING, STOPPED, TO_DO, Ledger, read
 
 
 class Clock:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from flows import study_searches
-from flows.learning import window_baselines
-from flows.planning.orders import Order
-from flows.reporting.report_extras import extras
-from flows.searching.detector_tradeoff_data import Ask
-from flows.searching.detector_tradeoff_grid import Axes
-from flows.searching.generalisation import measure_generalisation
-from flows.study import Outcome, expected, study
-from flows.study_searches import searches
-from protocols.errors import InputError
-from storage.store import Store
+from sliplab.flows import study_searches
+from sliplab.flows.learning import window_baselines
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report_extras import extras
+from sliplab.flows.searching.detector_tradeoff_data import Ask
+from sliplab.flows.searching.detector_tradeoff_grid import Axes
+from sliplab.flows.searching.generalisation import measure_generalisation
+from sliplab.flows.study import Outcome, expected, study
+from sliplab.flows.study_searches import searches
+from sliplab.protocols.errors import InputError
+from sliplab.storage.store import Store
 
 NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
 

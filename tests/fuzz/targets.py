@@ -52,8 +52,8 @@ def _written(box: Path, name: str, data: bytes) -> Path:
 
 def read_protocol(box: Path, name: str, data: bytes) -> None:
     """A protocol, expanded, with all that `sliplab plan` tells of it."""
-    from flows.planning.plan_view import as_json
-    from protocols.plan import load_plan
+    from sliplab.flows.planning.plan_view import as_json
+    from sliplab.protocols.plan import load_plan
 
     plan = load_plan(_written(box, "protocol.yaml", data))
     json.dumps(as_json(plan, None, None), allow_nan=False)
@@ -62,7 +62,7 @@ def read_protocol(box: Path, name: str, data: bytes) -> None:
 
 def read_rig(box: Path, name: str, data: bytes) -> None:
     """A rig file, with what it extends."""
-    from rigs.rig_file import load_rig_file, same_rig
+    from sliplab.rigs.rig_file import load_rig_file, same_rig
 
     for other in (ROOT / "rigs").glob("*.yaml"):
         if not (box / other.name).exists():
@@ -74,7 +74,7 @@ def read_rig(box: Path, name: str, data: bytes) -> None:
 
 def read_yaml(box: Path, name: str, data: bytes) -> None:
     """Any other YAML: at the least the loader stands."""
-    from protocols.yaml_file import parse_yaml, read_text
+    from sliplab.protocols.yaml_file import parse_yaml, read_text
 
     path = _written(box, "schedule.yaml", data)
     parse_yaml(read_text(path, "schedule"), path)
@@ -85,7 +85,7 @@ def read_store(box: Path, name: str, data: bytes) -> None:
 
     Half of the files get a checksum that fits, so that what is behind the checksums meets them.
     """
-    from storage.whole import sha256
+    from sliplab.storage.whole import sha256
 
     store = box / "store"
     if not store.exists():
@@ -110,13 +110,13 @@ def read_store(box: Path, name: str, data: bytes) -> None:
 
 def look_through(folder: Path, with_trials: bool = True) -> None:
     """Everything that reads a store without devices; one fault does not hide the others."""
-    from protocols.errors import InputError
-    from storage.catalogue import catalogue
-    from storage.control import open_requests, paused
-    from storage.decisions import skipped
-    from storage.errors import StoreError
-    from storage.store import Store
-    from storage.verify import verify
+    from sliplab.protocols.errors import InputError
+    from sliplab.storage.catalogue import catalogue
+    from sliplab.storage.control import open_requests, paused
+    from sliplab.storage.decisions import skipped
+    from sliplab.storage.errors import StoreError
+    from sliplab.storage.store import Store
+    from sliplab.storage.verify import verify
 
     store = Store.open(folder)
     if with_trials:
@@ -165,16 +165,16 @@ def read_recording(recording: Any) -> None:
 
 def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
     """A pickle of the lab's kind."""
-    from storage.exchange.pickles import parse_pickle
+    from sliplab.storage.exchange.pickles import parse_pickle
 
     parse_pickle(data, name)
 
 
 def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
-    from protocols.errors import InputError
-    from storage.exchange.find import kind_of, trials_in
-    from storage.exchange.foreign import Wrong
+    from sliplab.protocols.errors import InputError
+    from sliplab.storage.exchange.find import kind_of, trials_in
+    from sliplab.storage.exchange.foreign import Wrong
 
     folder = box / "foreign"
     shutil.rmtree(folder, ignore_errors=True)
@@ -194,8 +194,8 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
 
 def make_foreign(folder: Path) -> dict[str, bytes]:
     """One small file of each kind, by name."""
-    from storage.exchange.hand_out import hand_out
-    from storage.store import Store
+    from sliplab.storage.exchange.hand_out import hand_out
+    from sliplab.storage.store import Store
     from tests.storage.exchange.files import lab_cells, lab_hdf5
 
     recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
@@ -240,7 +240,7 @@ def pickle_seeds() -> dict[str, bytes]:
 
 def make_small_store(folder: Path) -> None:
     """A store with a bit of everything that may stand in one."""
-    from storage import control, decisions
+    from sliplab.storage import control, decisions
     from tests.storage.trials import campaign, commit
 
     made = campaign(folder)
@@ -253,7 +253,7 @@ def make_small_store(folder: Path) -> None:
     made.quarantine(commit(made, "d,r=1"), "gate sync_uncertainty")
     made.add_bench_record({"operator": "somebody", "temperature": 21.5})
     store_of = made.folder.parents[1]
-    from storage.store import Store
+    from sliplab.storage.store import Store
 
     opened = Store.open(store_of)
     control.answer(opened, control.ask(opened, "pause", who="a"), {"did": "paused"})

@@ -15,8 +15,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from protocols.errors import InputError
-from storage.errors import StoreError
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
 from tests.fuzz.mutate import mutate
 from tests.fuzz.targets import Target, targets
 

@@ -13,8 +13,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols import InputError, Protocol, load_plan, make_plan
-from protocols.yaml_file import parse_yaml, validate
+from sliplab.protocols import InputError, Protocol, load_plan, make_plan
+from sliplab.protocols.yaml_file import parse_yaml, validate
 from tests.conftest import ROOT
 
 Change = Callable[[dict[str, Any]], None]
@@ -379,7 +379,7 @@ def test_ids_that_no_folder_can_have_are_refused(
     path = tmp_path / "long.yaml"
     path.write_text(yaml.safe_dump(small, sort_keys=False))
     load_plan(path)
-    monkeypatch.setattr("protocols.plan.MAX_ID", 30)
+    monkeypatch.setattr("sliplab.protocols.plan.MAX_ID", 30)
     with pytest.raises(InputError, match="30 at most"):
         load_plan(path)
 

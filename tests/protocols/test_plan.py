@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols import Dwell, InputError, Move, Plan, Protocol, load_plan, make_plan
-from protocols.yaml_file import validate
+from sliplab.protocols import Dwell, InputError, Move, Plan, Protocol, load_plan, make_plan
+from sliplab.protocols.yaml_file import validate
 from tests.conftest import ROOT, SMALL
 
 
@@ -97,7 +97,7 @@ def test_an_added_level_moves_nothing(data: dict[str, Any], name: str, place: in
 @pytest.mark.parametrize("hash_seed", ["0", "1", "4242"])
 def test_the_order_is_the_same_in_any_process(hash_seed: str) -> None:
     code = (
-        "import json; from pathlib import Path; from protocols import load_plan;"
+        "import json; from pathlib import Path; from sliplab.protocols import load_plan;"
         "p = load_plan(Path('protocols/kinematic.yaml'));"
         "print(json.dumps([[t.id, t.split, t.seed] for t in p]))"
     )
@@ -242,9 +242,9 @@ def test_people_are_asked_in_outer_blocks_only() -> None:
 
 def test_the_plan_is_read_without_heavy_libraries() -> None:
     code = (
-        "import sys; import flows.cli.app; from pathlib import Path;"
-        "from protocols import load_plan;"
-        "from rigs.rig_file import load_rig_file;"
+        "import sys; import sliplab.flows.cli.app; from pathlib import Path;"
+        "from sliplab.protocols import load_plan;"
+        "from sliplab.rigs.rig_file import load_rig_file;"
         "load_plan(Path('protocols/kinematic.yaml')); load_rig_file(Path('rigs/mock.yaml'));"
         "heavy = {'torch', 'numba', 'cv2', 'prefect', 'pandas', 'scipy', 'h5py', 'samna'};"
         "print(sorted(heavy & set(sys.modules)))"

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
-from protocols import InputError, load_plan
-from protocols.presets import PAPER, at
-from protocols.settings import AnalysisSettings
+from sliplab.protocols import InputError, load_plan
+from sliplab.protocols.presets import PAPER, at
+from sliplab.protocols.settings import AnalysisSettings
 from tests.conftest import ROOT
 
 PUBLISHED: dict[str, Any] = {

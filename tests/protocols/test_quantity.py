@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.quantity import UNITS, canonical, level_order, parse, parse_or_ref, to_decimal
+from sliplab.protocols.quantity import (
+    UNITS,
+    canonical,
+    level_order,
+    parse,
+    parse_or_ref,
+    to_decimal,
+)
 
 decimals = st.decimals(
     min_value=-1000, max_value=1000, places=4, allow_nan=False, allow_infinity=False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protocols.settings import AnalysisSettings
+from sliplab.protocols.settings import AnalysisSettings
 
 
 @pytest.mark.parametrize("outputs", [1, 4, 10])

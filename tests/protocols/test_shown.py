@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from protocols.errors import InputError
-from protocols.model import Protocol
-from protocols.shown import MASK, is_secret, printable, shown, shown_key
-from protocols.yaml_file import mask_secrets, parse_yaml, without_secrets
-from rigs.rig_file import RigFile
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.shown import MASK, is_secret, printable, shown, shown_key
+from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, without_secrets
+from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 
 SECRETS = [

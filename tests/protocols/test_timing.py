@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from protocols.timing import WIRED, Delay, SyncGates, Timing
+from sliplab.protocols.timing import WIRED, Delay, SyncGates, Timing
 
 
 def test_only_a_regular_train_has_a_start_marker() -> None:

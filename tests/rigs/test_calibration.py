@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from protocols import InputError
-from protocols.yaml_file import parse_yaml, validate
-from rigs.build import build_rig
-from rigs.calibration import COMMANDS, Calibration, MaxAge, find_faults, measured_on
-from rigs.rig_file import RigFile, same_rig
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.calibration import COMMANDS, Calibration, MaxAge, find_faults, measured_on
+from sliplab.rigs.rig_file import RigFile, same_rig
 from tests.conftest import ROOT
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()

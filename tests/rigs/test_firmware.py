@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 import serial
 
-from protocols.timing import Code
-from rigs.pulse_code import code_bits
-from rigs.sync_box import SerialSyncBox
-from rigs.sync_line import ALL_TO_HZ, BAUD, MOST_HZ, NAME, LineReader, seal
-from rigs.sync_port import SyncBoxFault
-from rigs.sync_settings import SyncBoxSettings
+from sliplab.protocols.timing import Code
+from sliplab.rigs.pulse_code import code_bits
+from sliplab.rigs.sync_box import SerialSyncBox
+from sliplab.rigs.sync_line import ALL_TO_HZ, BAUD, MOST_HZ, NAME, LineReader, seal
+from sliplab.rigs.sync_port import SyncBoxFault
+from sliplab.rigs.sync_settings import SyncBoxSettings
 from tests.conftest import ROOT
 
 FIRMWARE = ROOT / "rigs" / "firmware"

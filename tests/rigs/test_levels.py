@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import protocols
-from protocols.plan import Plan, load_plan
-from rigs.levels import choose_level, expected_onsets, slides_of, slip_expected, with_level
-from rigs.rig_file import RigFile, load_rig_file
-from rigs.scene.onsets import Material
+from sliplab import protocols
+from sliplab.protocols.plan import Plan, load_plan
+from sliplab.rigs.levels import choose_level, expected_onsets, slides_of, slip_expected, with_level
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.scene.onsets import Material
 
 FOLDER = Path(protocols.__file__).parent
 

@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from rigs.library_process import LibraryError, LibraryProcess
+from sliplab.rigs.library_process import LibraryError, LibraryProcess
 
 HERE = "tests.rigs.test_library_process"
 

@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from rigs.capabilities import Clock, Operator, Plate, RigError
-from rigs.host_clock import HostClock
-from rigs.people import PersonAtPlate, mass_of
+from sliplab.rigs.capabilities import Clock, Operator, Plate, RigError
+from sliplab.rigs.host_clock import HostClock
+from sliplab.rigs.people import PersonAtPlate, mass_of
 
 
 class Person:

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from protocols.program import Position
-from rigs.plate_frame import PlateFrame
+from sliplab.protocols.program import Position
+from sliplab.rigs.plate_frame import PlateFrame
 
 angles = st.floats(-3.0, 3.0)
 lengths = st.floats(-50.0, 50.0)

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.timing import MARKER_TICKS, Code
-from rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
+from sliplab.protocols.timing import MARKER_TICKS, Code
+from sliplab.rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
 
 CODES: tuple[Code, ...] = ("lfsr", "irregular", "regular")
 HOUR = 360_000

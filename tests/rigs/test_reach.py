@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from rigs.devices import DeviceSettings
-from rigs.reach import reach
-from rigs.wire.live_dvxplorer import LiveDvxplorer
+from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.reach import reach
+from sliplab.rigs.wire.live_dvxplorer import LiveDvxplorer
 from tests.rigs.loopback import own_address
 
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}

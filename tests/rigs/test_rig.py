@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocols import Plan, Protocol, make_plan
-from protocols.yaml_file import parse_yaml, validate
-from rigs.build import build_rig
-from rigs.capabilities import ArmFault, ArmState, RigError
-from rigs.plate_frame import PlateFrame
-from rigs.rig import Rig, StopRequested
-from rigs.rig_file import RigFile
-from storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.protocols import Plan, Protocol, make_plan
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
 from tests.conftest import ROOT, SMALL
 
 RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
@@ -266,7 +266,7 @@ def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
 
 
 def test_a_plate_that_is_not_there_cannot_be_moved() -> None:
-    from protocols import load_plan
+    from sliplab.protocols import load_plan
 
     rig = make_rig()
     rig.plate = None

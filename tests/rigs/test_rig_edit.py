@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols import InputError
-from protocols.yaml_file import parse_yaml
-from rigs import rig_edit
-from rigs.rig_edit import edited, writable_target, write_entries
-from rigs.rig_file import load_rig_file
-from rigs.rig_inheritance import shipped_rigs
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.rigs import rig_edit
+from sliplab.rigs.rig_edit import edited, writable_target, write_entries
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_inheritance import shipped_rigs
 from tests.conftest import ROOT
 from tests.rigs.test_calibration import WHOLE
 

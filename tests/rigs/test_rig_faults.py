@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocols import load_plan
-from rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.protocols import load_plan
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
 from tests.conftest import ROOT
 from tests.rigs.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
 

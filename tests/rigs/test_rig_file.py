@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import yaml
 
-from protocols import InputError, load_plan
-from rigs.rig_file import check_plan, load_rig_file
+from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.rig_file import check_plan, load_rig_file
 from tests.conftest import ROOT
 
 Change = Callable[[dict[str, Any]], None]

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 import yaml
 
-from protocols import InputError
-from protocols.plan import load_plan
-from protocols.program import Move
-from rigs.build import _check_grade
-from rigs.cameras.stamps import Stamping
-from rigs.capabilities import RigError
-from rigs.rig_file import load_rig_file
-from rigs.rig_inheritance import read_rig
+from sliplab.protocols import InputError
+from sliplab.protocols.plan import load_plan
+from sliplab.protocols.program import Move
+from sliplab.rigs.build import _check_grade
+from sliplab.rigs.cameras.stamps import Stamping
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT
 from tests.rigs.test_rig_file import Change, _both, _set
 

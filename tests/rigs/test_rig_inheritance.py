@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from protocols import InputError, load_plan
-from rigs.rig_file import load_rig_file, rig_hash
-from rigs.rig_inheritance import read_rig, rig_path, shipped_rigs
+from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.rig_file import load_rig_file, rig_hash
+from sliplab.rigs.rig_inheritance import read_rig, rig_path, shipped_rigs
 from tests.conftest import ROOT
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()

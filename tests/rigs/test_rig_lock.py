@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from rigs.capabilities import RigError
-from rigs.rig_file import RigFile, load_rig_file
-from rigs.rig_lock import ENVIRONMENT, held, lock_names
-from storage.lock import Locked
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig_file import RigFile, load_rig_file
+from sliplab.rigs.rig_lock import ENVIRONMENT, held, lock_names
+from sliplab.storage.lock import Locked
 from tests.conftest import ROOT
 
 HOLDER = """
 import sys
 from pathlib import Path
-from rigs.rig_file import load_rig_file
-from rigs.rig_lock import held
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_lock import held
 with held(load_rig_file(Path("ur5"))[0], Path("/data/study")):
     print("held", flush=True)
     sys.stdin.read()

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import serial
 
-from protocols.timing import Code
-from rigs.capabilities import RigError, SyncBox
-from rigs.pulse_code import code_bits
-from rigs.sync_box import SerialSyncBox
-from rigs.sync_line import LineReader, seal, unseal
-from rigs.sync_port import JOIN_S, TRIES, SyncBoxFault
-from rigs.sync_settings import SyncBoxSettings
-from rigs.sync_train import Train
-from rigs.wire.sync_box import PtySyncBox
+from sliplab.protocols.timing import Code
+from sliplab.rigs.capabilities import RigError, SyncBox
+from sliplab.rigs.pulse_code import code_bits
+from sliplab.rigs.sync_box import SerialSyncBox
+from sliplab.rigs.sync_line import LineReader, seal, unseal
+from sliplab.rigs.sync_port import JOIN_S, TRIES, SyncBoxFault
+from sliplab.rigs.sync_settings import SyncBoxSettings
+from sliplab.rigs.sync_train import Train
+from sliplab.rigs.wire.sync_box import PtySyncBox
 
 pytestmark = pytest.mark.realtime
 
@@ -274,7 +274,7 @@ def test_reports_missing_at_the_end_are_counted(wire: PtySyncBox, box: SerialSyn
 def test_what_nobody_reads_is_counted_and_not_kept(
     wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigs.sync_box.MOST_WAITING", 5)
+    monkeypatch.setattr("sliplab.rigs.sync_box.MOST_WAITING", 5)
     box.start(1000.0, SEED)
     end = time.monotonic() + 5.0
     while box.losses.unread < 10 and time.monotonic() < end:
@@ -289,7 +289,7 @@ def test_what_nobody_reads_is_counted_and_not_kept(
 def test_what_the_box_refuses_is_said(
     wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigs.wire.sync_box.MOST_HZ", 50.0)
+    monkeypatch.setattr("sliplab.rigs.wire.sync_box.MOST_HZ", 50.0)
     with pytest.raises(SyncBoxFault, match="refuses ARM: rate must be"):
         box.start(100.0, SEED)
 
@@ -329,7 +329,7 @@ def test_nobody_answers(wire: PtySyncBox, box: SerialSyncBox) -> None:
 def test_another_device_answers(
     wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigs.wire.sync_box.NAME", "sliplab-sync-box 99")
+    monkeypatch.setattr("sliplab.rigs.wire.sync_box.NAME", "sliplab-sync-box 99")
     with pytest.raises(SyncBoxFault, match="sliplab-sync-box 99"):
         box.connect()
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocols.program import Position
-from rigs.capabilities import ArmFault, ArmState, RigError
-from rigs.plate_frame import PlateFrame
-from rigs.rig import Rig, StopRequested
-from rigs.teaching import Creep, jogged, look, stir, touch
-from rigs.touching import RateTouch
-from storage.streams import FrameChunk
+from sliplab.protocols.program import Position
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.teaching import Creep, jogged, look, stir, touch
+from sliplab.rigs.touching import RateTouch
+from sliplab.storage.streams import FrameChunk
 from tests.rigs.test_rig import after_the_stop, make_rig, watched
 
 QUICK = Creep(clearance_mm=1.5, search_mm=1.0)
@@ -236,7 +236,7 @@ def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
 
 
 def type_segment(rig: Rig, depth_mm: float) -> Any:
-    from rigs.capabilities import Segment
+    from sliplab.rigs.capabilities import Segment
 
     return Segment(rig.frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigs.touching import MarkerTouch, RateTouch, count_central
-from storage.streams import EventChunk
+from sliplab.rigs.touching import MarkerTouch, RateTouch, count_central
+from sliplab.storage.streams import EventChunk
 
 Floats = NDArray[np.float64]
 FRAMES = 400

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.array_file import map_arrays, write_arrays
+from sliplab.storage.array_file import map_arrays, write_arrays
 
 
 def test_arrays_come_back_aligned_and_mapped(tmp_path: Path) -> None:

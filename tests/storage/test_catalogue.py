@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from storage.catalogue import catalogue, query
-from storage.store import Store
+from sliplab.storage.catalogue import catalogue, query
+from sliplab.storage.store import Store
 from tests.storage.trials import campaign, commit
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from storage import catalogue as module
-from storage import catalogue_index
-from storage.catalogue import catalogue
-from storage.files import make_folder, write_json
-from storage.recording import Recording
-from storage.store import Campaign, Store
+from sliplab.storage import catalogue as module
+from sliplab.storage import catalogue_index
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.files import make_folder, write_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign, Store
 from tests.storage.trials import IDENTITY, campaign, commit
 
 INDEX = Path("derived/catalogue/index")

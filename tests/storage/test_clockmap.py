@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.clockmap import BILLION, DRIFT_UNITS, IDENTITY, MAX_DRIFT, ClockMap
+from sliplab.storage.clockmap import BILLION, DRIFT_UNITS, IDENTITY, MAX_DRIFT, ClockMap
 
 DRIFTS = st.integers(-(10**17), 10**17) | st.integers(-(10**8), 10**8).map(lambda d: d * BILLION)
 TIMES = st.integers(-(2**62), 2**62)

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from storage import control, process
-from storage.lock import Locked, exclusive
-from storage.store import Store
+from sliplab.storage import control, process
+from sliplab.storage.lock import Locked, exclusive
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 
 
@@ -59,7 +59,7 @@ def test_what_is_no_request_is_passed_over(tmp_path: Path) -> None:
 HOLDER = """
 import sys
 from pathlib import Path
-from storage.lock import exclusive
+from sliplab.storage.lock import exclusive
 with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
     print("held", flush=True)
     sys.stdin.read()
@@ -105,7 +105,7 @@ def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Pat
 
 
 def test_who_is_done_at_once_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("storage.lock.PATIENCE_S", 0.2)
+    monkeypatch.setattr("sliplab.storage.lock.PATIENCE_S", 0.2)
     path = tmp_path / "lock"
     with (
         exclusive(path, "it", brief=True),
@@ -114,7 +114,7 @@ def test_who_is_done_at_once_is_waited_for(tmp_path: Path, monkeypatch: pytest.M
     ):
         pass
     with ThreadPoolExecutor(1) as pool:
-        monkeypatch.setattr("storage.lock.PATIENCE_S", 60.0)
+        monkeypatch.setattr("sliplab.storage.lock.PATIENCE_S", 60.0)
         with exclusive(path, "it", brief=True):
 
             def second() -> str:

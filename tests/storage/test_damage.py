@@ -8,12 +8,12 @@ from pathlib import Path
 import h5py
 import pytest
 
-from storage.catalogue import catalogue
-from storage.errors import disk_explained
-from storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
-from storage.recording import Recording
-from storage.store import Campaign, Store, StoreError
-from storage.verify import DAMAGED, UNFINISHED, set_aside, verify
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.errors import disk_explained
+from sliplab.storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign, Store, StoreError
+from sliplab.storage.verify import DAMAGED, UNFINISHED, set_aside, verify
 from tests.storage.trials import campaign, commit, fill, record
 
 NOBODY = 2**22 + 1

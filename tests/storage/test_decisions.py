@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from storage.decisions import SKIPPED, again, skip, skipped
-from storage.files import read_json
-from storage.store import Store, StoreError
-from storage.verify import verify
+from sliplab.storage.decisions import SKIPPED, again, skip, skipped
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store, StoreError
+from sliplab.storage.verify import verify
 from tests.storage.trials import campaign, commit, fail
 
 BY = {"who": "anna", "when": "2026-01-02T03:04:05+00:00", "why": "skin was dirty"}

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from storage.derived import Derived, make_key
-from storage.store import Store
+from sliplab.storage.derived import Derived, make_key
+from sliplab.storage.store import Store
 
 
 def test_a_result_is_stale_by_inputs_parameters_and_version(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.files import json_text, read_json, write_json
+from sliplab.storage.files import json_text, read_json, write_json
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 FINITE = LEAVES.filter(lambda value: value not in (float("inf"), float("-inf")))

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.columns import COLUMNS, SMALL_HELD
-from storage.hdf5 import StreamFile, StreamReader
-from storage.streams import EventChunk, PulseChunk
+from sliplab.storage.columns import COLUMNS, SMALL_HELD
+from sliplab.storage.hdf5 import StreamFile, StreamReader
+from sliplab.storage.streams import EventChunk, PulseChunk
 from tests.storage.trials import events
 
 

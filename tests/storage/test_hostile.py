@@ -13,16 +13,16 @@ from typing import Any
 
 import pytest
 
-from storage import control
-from storage.catalogue import catalogue
-from storage.decisions import skipped
-from storage.derived import Derived
-from storage.errors import StoreError
-from storage.files import read_json, sha256
-from storage.recording import Recording
-from storage.store import Campaign, Store
-from storage.verify import verify
-from storage.whole import read_sums
+from sliplab.storage import control
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.decisions import skipped
+from sliplab.storage.derived import Derived
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json, sha256
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.verify import verify
+from sliplab.storage.whole import read_sums
 from tests.storage.trials import campaign, commit
 
 Change = Callable[[dict[str, Any]], Any]

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from rigs.capabilities import RigError
-from rigs.rig_file import load_rig_file
-from rigs.rig_lock import ENVIRONMENT, held
-from storage import lock
-from storage.errors import StoreError
-from storage.lock import STORE_LOCK, Locked, NoLocks, exclusive
-from storage.store import Store
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_lock import ENVIRONMENT, held
+from sliplab.storage import lock
+from sliplab.storage.errors import StoreError
+from sliplab.storage.lock import STORE_LOCK, Locked, NoLocks, exclusive
+from sliplab.storage.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
 

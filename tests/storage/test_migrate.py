@@ -6,12 +6,12 @@ from typing import Any
 import h5py
 import pytest
 
-from storage import migrate as module
-from storage.files import read_json, write_json
-from storage.migrate import STEPS, kept, migrate
-from storage.store import FORMAT, Store, StoreError
-from storage.verify import verify
-from storage.whole import write_sums
+from sliplab.storage import migrate as module
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.migrate import STEPS, kept, migrate
+from sliplab.storage.store import FORMAT, Store, StoreError
+from sliplab.storage.verify import verify
+from sliplab.storage.whole import write_sums
 from tests.storage.trials import campaign, commit
 
 

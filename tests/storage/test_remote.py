@@ -13,20 +13,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.errors import InputError
-from protocols.hashing import hash_data
-from storage.catalogue import catalogue
-from storage.decisions import again
-from storage.files import read_json, write_json
-from storage.manifest import Manifest, manifest_key, objects_folder, of_trial, parse, read_manifests
-from storage.mirror import mirror_folder, open_mirror, place_of, reach
-from storage.pull import ORIGIN, pull
-from storage.push import Wishes, push
-from storage.remote import Remote, RemoteError, RemoteMissing
-from storage.remote_check import verify_remote
-from storage.store import Campaign, Store, StoreError
-from storage.urls import check_url, is_url
-from storage.verify import verify
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.hashing import hash_data
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.decisions import again
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.manifest import (
+    Manifest,
+    manifest_key,
+    objects_folder,
+    of_trial,
+    parse,
+    read_manifests,
+)
+from sliplab.storage.mirror import mirror_folder, open_mirror, place_of, reach
+from sliplab.storage.pull import ORIGIN, pull
+from sliplab.storage.push import Wishes, push
+from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
+from sliplab.storage.remote_check import verify_remote
+from sliplab.storage.store import Campaign, Store, StoreError
+from sliplab.storage.urls import check_url, is_url
+from sliplab.storage.verify import verify
 from tests.storage.remotes import new_bucket, s3_server, tree
 from tests.storage.trials import campaign, commit
 

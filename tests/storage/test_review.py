@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from storage import review
-from storage.process import user_name
-from storage.review import Onsets
-from storage.store import Store, StoreError
+from sliplab.storage import review
+from sliplab.storage.process import user_name
+from sliplab.storage.review import Onsets
+from sliplab.storage.store import Store, StoreError
 
 OLD, NEW = Onsets(100, 200), Onsets(110, 250)
 

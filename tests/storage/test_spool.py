@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import storage.spool
-from storage.spool import Spool
+from sliplab.storage import spool as spooling
+from sliplab.storage.spool import Spool
 
 
 def frames(count: int, begin: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -63,7 +63,7 @@ def test_a_full_disk_is_raised_to_whoever_writes_or_closes(tmp_path: Path) -> No
 def test_a_slow_disk_is_waited_for_only_when_memory_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(storage.spool, "QUEUE_BYTES", 40)
+    monkeypatch.setattr(spooling, "QUEUE_BYTES", 40)
     spool = Spool(tmp_path / "raw")
     disk: Any = Disk(spool._file)
     spool._file = disk
@@ -81,8 +81,8 @@ def test_a_slow_disk_is_waited_for_only_when_memory_is_full(
 def test_a_disk_that_stands_still_is_an_error_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(storage.spool, "QUEUE_BYTES", 10)
-    monkeypatch.setattr(storage.spool, "WAIT_S", 0.05)
+    monkeypatch.setattr(spooling, "QUEUE_BYTES", 10)
+    monkeypatch.setattr(spooling, "WAIT_S", 0.05)
     spool = Spool(tmp_path / "raw")
     disk: Any = Disk(spool._file)
     spool._file = disk

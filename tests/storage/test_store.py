@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from storage.files import read_json, write_json
-from storage.lock import Locked, exclusive
-from storage.recording import Recording
-from storage.store import Store, StoreError
-from storage.verify import verify
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.lock import Locked, exclusive
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store, StoreError
+from sliplab.storage.verify import verify
 from tests.storage.trials import FRAME, campaign, commit, fail, fill, record
 
 

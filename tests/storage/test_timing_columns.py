@@ -7,12 +7,12 @@ import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 import pytest
 
-from storage.columns import TIMING
-from storage.hdf5 import StreamReader
-from storage.store import Store
-from storage.streams import ClockReads, PulseChunk
-from storage.verify import verify
-from storage.writer import TrialWriter
+from sliplab.storage.columns import TIMING
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.store import Store
+from sliplab.storage.streams import ClockReads, PulseChunk
+from sliplab.storage.verify import verify
+from sliplab.storage.writer import TrialWriter
 from tests.storage.trials import FRAME, campaign, fill, record
 
 EMPTY = np.empty(0, np.int64)

@@ -7,12 +7,12 @@ import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 import pytest
 
-from storage.catalogue import catalogue
-from storage.files import read_json, write_json
-from storage.recording import Recording
-from storage.store import Campaign, Store
-from storage.streams import FrameChunk
-from storage.verify import verify
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.streams import FrameChunk
+from sliplab.storage.verify import verify
 from tests.storage.trials import FRAME, campaign, commit, fill, record
 
 
@@ -108,7 +108,7 @@ def test_what_is_not_there_is_said(tmp_path: Path) -> None:
 
 def _damage(folder: Path, name: str, rows: int) -> None:
     """Cut or delete a column, and mend size and checksum."""
-    from storage.files import sha256
+    from sliplab.storage.files import sha256
 
     path = folder / "data.h5"
     with h5py.File(path, "a") as file:

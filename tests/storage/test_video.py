@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from storage.video import FrameReader, VideoWriter, count_frames, read_frame, read_frames
+from sliplab.storage.video import FrameReader, VideoWriter, count_frames, read_frame, read_frames
 from tests.storage.trials import FRAME, frames
 
 
@@ -69,7 +69,9 @@ def test_an_encoder_that_fails_says_so_and_blocks_nobody(
                 raise ValueError("out of ink")
             return av.VideoFrame.from_numpy_buffer(image, format=format)
 
-    monkeypatch.setattr("storage.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken}))
+    monkeypatch.setattr(
+        "sliplab.storage.video.av", SimpleNamespace(**{**vars(av), "VideoFrame": Broken})
+    )
     writer = VideoWriter(tmp_path / "v.mkv", *FRAME, 100)
     # fewer than the queues hold: nothing waits, and closing tells what happened
     writer.write(frames(20).images[:2])

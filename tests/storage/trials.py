@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from storage.store import Campaign, Store
-from storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
-from storage.writer import TrialWriter
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.storage.writer import TrialWriter
 
 IDENTITY = {"device_ns": [0], "reference_ns": [0], "drift": [0]}
 FRAME = (48, 32)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.calibration.charuco import Board, BoardError, Corners, find_corners, fit_lens
-from rigs.scene.board import VIEWS, BoardCamera, BoardPlace, BoardPrint, draw_board
+from sliplab.analysis.calibration.charuco import Board, BoardError, Corners, find_corners, fit_lens
+from sliplab.rigs.scene.board import VIEWS, BoardCamera, BoardPlace, BoardPrint, draw_board
 
 Picture = NDArray[np.uint8]
 BOARD = Board()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.calibration.crop import CropError, find_crop
+from sliplab.analysis.calibration.crop import CropError, find_crop
 
 Counts = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from analysis.calibration.pivot import PivotError, find_tip
+from sliplab.analysis.calibration.pivot import PivotError, find_tip
 
 Floats = NDArray[np.float64]
 lengths = st.floats(-300.0, 300.0)

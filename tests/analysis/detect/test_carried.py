@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.detect.carried import carried_spikes, trailing_sums
-from analysis.nets.network import (
+from sliplab.analysis.detect.carried import carried_spikes, trailing_sums
+from sliplab.analysis.nets.network import (
     build,
     by_class,
     by_parameter,
@@ -16,9 +16,9 @@ from analysis.nets.network import (
     set_weights,
     spike_counts,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.protocols.settings import Network, Windows
 
 WINDOWS = Windows(length_ms=6, crop_px=160)
 NETWORK = Network(conv1_channels=2, conv2_channels=3, hidden=6, weight_scale=(6, 5, 6, 6))

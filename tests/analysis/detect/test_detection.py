@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.detect.detection import detect
-from protocols.settings import Detection
+from sliplab.analysis.detect.detection import detect
+from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 N, I, G, Q = (9, 0, 0), (0, 9, 0), (0, 0, 9), (0, 0, 0)  # noqa: E741

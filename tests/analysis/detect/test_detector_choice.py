@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.detect.detector_choice import (
+from sliplab.analysis.detect.detector_choice import (
     Judged,
     allowed_early,
     merit,
     outcomes,
     set_levels,
 )
-from analysis.detect.detectors import Evidence, Levels
-from analysis.detect.latency import TrialLatency
-from analysis.detect.smoothing_choice import Counted, choose_smoothing, settled
-from analysis.detect.true_slip import TrueSlip
-from protocols.settings import Detection
+from sliplab.analysis.detect.detectors import Evidence, Levels
+from sliplab.analysis.detect.latency import TrialLatency
+from sliplab.analysis.detect.smoothing_choice import Counted, choose_smoothing, settled
+from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 EARLY = 30 * MS

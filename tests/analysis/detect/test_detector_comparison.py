@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from analysis.detect.detector_comparison import Parts, compare, thinned
-from analysis.detect.detectors import Heard, Labelled
-from analysis.detect.true_slip import TrueSlip
-from protocols.settings import Comparison, Detection, Windows
+from sliplab.analysis.detect.detector_comparison import Parts, compare, thinned
+from sliplab.analysis.detect.detectors import Heard, Labelled
+from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.protocols.settings import Comparison, Detection, Windows
 
 MS = 1_000_000
 WINDOWS = Windows()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.detect.detection import detect
-from analysis.detect.detectors import (
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.detectors import (
     Detector,
     Heard,
     Labelled,
@@ -18,8 +18,8 @@ from analysis.detect.detectors import (
     first_above,
     learn,
 )
-from analysis.detect.true_slip import TrueSlip
-from protocols.settings import Detection
+from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 LENGTH = 30 * MS

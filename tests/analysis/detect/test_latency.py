@@ -7,10 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.detect.detection import Detections, detect
-from analysis.detect.latency import TrialLatency, score_trial, summarise_latency, summarise_lead
-from analysis.detect.true_slip import TrueSlip, true_slip
-from protocols.settings import Detection
+from sliplab.analysis.detect.detection import Detections, detect
+from sliplab.analysis.detect.latency import (
+    TrialLatency,
+    score_trial,
+    summarise_latency,
+    summarise_lead,
+)
+from sliplab.analysis.detect.true_slip import TrueSlip, true_slip
+from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 TOLERANCE = 30 * MS

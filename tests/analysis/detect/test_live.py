@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.detect.detection import detect
-from analysis.detect.live import ClockFellBack, LiveDetector
-from analysis.detect.live_clock import SPAN_NS, FreshestArrival
-from analysis.detect.live_decision import Decision
-from analysis.detect.live_rule import StepRule
-from analysis.nets.windows import bin_events
-from protocols.settings import Detection, Windows
-from storage.streams import EventChunk
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.live import ClockFellBack, LiveDetector
+from sliplab.analysis.detect.live_clock import SPAN_NS, FreshestArrival
+from sliplab.analysis.detect.live_decision import Decision
+from sliplab.analysis.detect.live_rule import StepRule
+from sliplab.analysis.nets.windows import bin_events
+from sliplab.protocols.settings import Detection, Windows
+from sliplab.storage.streams import EventChunk
 
 TINY = Windows(length_ms=4, step_ms=1, crop_px=40, pool_px=20, polarity="both")
 SIZE = {"width": 60, "height": 50}

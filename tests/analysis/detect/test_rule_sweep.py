@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.detect.detection import detect
-from analysis.detect.latency import score_trial, summarise_latency, summarise_lead
-from analysis.detect.rule_sweep import Trials, choose_pair, sweep, worth
-from analysis.detect.smoothing_choice import Counted, choose_smoothing
-from analysis.detect.true_slip import NEVER, TrueSlip
-from protocols.settings import Detection
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.latency import score_trial, summarise_latency, summarise_lead
+from sliplab.analysis.detect.rule_sweep import Trials, choose_pair, sweep, worth
+from sliplab.analysis.detect.smoothing_choice import Counted, choose_smoothing
+from sliplab.analysis.detect.true_slip import NEVER, TrueSlip
+from sliplab.protocols.settings import Detection
 
 MS = 1_000_000
 SMOOTHINGS, MARGINS = (1, 2, 5), (0.0, 0.5, 1.0, 3.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.labels.camera_shift import camera_shift
+from sliplab.analysis.labels.camera_shift import camera_shift
 
 
 def slides(n: int = 200, m: int = 19, noise: float = 0.004) -> np.ndarray:

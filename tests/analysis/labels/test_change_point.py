@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.labels.change_point import ChangePoint, change_point, departure
-from analysis.labels.slip_times import slip_times
+from sliplab.analysis.labels.change_point import ChangePoint, change_point, departure
+from sliplab.analysis.labels.slip_times import slip_times
 
 PERIOD = 10_000_000
 START = 40

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.labels.doubts import MAX_UNSEEN_NS, doubts, uncertain
-from analysis.labels.onsets import paper_onsets
-from protocols.settings import Labelling
+from sliplab.analysis.labels.doubts import MAX_UNSEEN_NS, doubts, uncertain
+from sliplab.analysis.labels.onsets import paper_onsets
+from sliplab.protocols.settings import Labelling
 
 FRAME_NS = 10_000_000
 RULE = Labelling(threshold_px=2.0)

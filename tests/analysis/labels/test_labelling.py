@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.labels.labelling import Label, label_places
-from analysis.labels.places import Places
-from analysis.labels.plate import PlateTrack
-from protocols.settings import Labelling
+from sliplab.analysis.labels.labelling import Label, label_places
+from sliplab.analysis.labels.places import Places
+from sliplab.analysis.labels.plate import PlateTrack
+from sliplab.protocols.settings import Labelling
 
 FRAME_NS = 10_000_000
 START = 200

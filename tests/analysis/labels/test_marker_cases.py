@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.labels.markers import MarkerTracks, track
-from analysis.labels.reference_tracks import reference_track
+from sliplab.analysis.labels.markers import MarkerTracks, track
+from sliplab.analysis.labels.reference_tracks import reference_track
 from tests.analysis.labels.test_markers import CENTRE, LAYOUT, RADIUS, SIZE, draw, still, video
 
 GLIDE = np.arange(40)[:, None, None] * np.array([0.31, -0.17])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.labels.blobs import find_blobs, match_layout
-from analysis.labels.markers import MarkerTracker, track
+from sliplab.analysis.labels.blobs import find_blobs, match_layout
+from sliplab.analysis.labels.markers import MarkerTracker, track
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from analysis.labels.onsets import displacements, paper_onsets, rest_time
-from protocols.settings import Labelling
+from sliplab.analysis.labels.onsets import displacements, paper_onsets, rest_time
+from sliplab.protocols.settings import Labelling
 
 MS = 1_000_000
 T0 = 2**62

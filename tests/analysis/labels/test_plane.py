@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.labels.plane import Plane, plane_of
-from rigs.scene.lens import Lens
+from sliplab.analysis.labels.plane import Plane, plane_of
+from sliplab.rigs.scene.lens import Lens
 
 SIDE = 832
 HALF = 3.0 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])

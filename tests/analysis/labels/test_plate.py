@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.labels.blobs import find_blobs
-from analysis.labels.markers import track
-from analysis.labels.plate import UNSEEN, PlatePose, PlateTracker, bridge, track_plate, track_video
+from sliplab.analysis.labels.blobs import find_blobs
+from sliplab.analysis.labels.markers import track
+from sliplab.analysis.labels.plate import (
+    UNSEEN,
+    PlatePose,
+    PlateTracker,
+    bridge,
+    track_plate,
+    track_video,
+)
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]

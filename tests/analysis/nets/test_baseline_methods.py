@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.nets.baseline_nets import KINDS, multiply_adds, trained_net
-from analysis.nets.baseline_trees import boosted
-from analysis.nets.dataset import SampleSet
-from analysis.nets.metrics import accuracy
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.baseline_nets import KINDS, multiply_adds, trained_net
+from sliplab.analysis.nets.baseline_trees import boosted
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.metrics import accuracy
+from sliplab.analysis.nets.sparse import SparseWindows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.nets.baselines import (
+from sliplab.analysis.nets.baselines import (
     RIDGE,
     cell_sums,
     evaluate_baselines,
@@ -17,8 +17,8 @@ from analysis.nets.baselines import (
     logistic_cells,
     step_sums,
 )
-from analysis.nets.metrics import accuracy
-from analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.metrics import accuracy
+from sliplab.analysis.nets.sparse import SparseWindows
 
 
 def samples(totals: list[int]) -> SparseWindows:

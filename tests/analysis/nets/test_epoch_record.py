@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.nets.epoch_record import EpochRecord, epoch_record, layer_warnings
+from sliplab.analysis.nets.epoch_record import EpochRecord, epoch_record, layer_warnings
 
 RATES = {"iaf1": 0.1, "iaf2": 0.2, "iaf3": 0.1, "iaf4": 0.1}
 RECORD = EpochRecord(1, 0.5, 0.9, 0.25, 0.9, 0.8, 0.7, RATES)

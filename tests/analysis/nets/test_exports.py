@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
-from analysis.nets.activity import activity
-from analysis.nets.epoch_record import EpochRecord
-from analysis.nets.model_card import SplitResult, card_markdown, model_card
-from analysis.nets.network import (
+from sliplab.analysis.nets.activity import activity
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.nets.model_card import SplitResult, card_markdown, model_card
+from sliplab.analysis.nets.network import (
     BIASED,
     SPIKING,
     WEIGHTED,
@@ -27,11 +27,11 @@ from analysis.nets.network import (
     spike_counts,
     weights,
 )
-from analysis.nets.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
-from analysis.nets.quantised import LOWEST, chip_run, compare, quantise, quantised_net
-from analysis.nets.speck import CORES, KI, speck_fit
-from analysis.nets.training import Fitted, restore
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
+from sliplab.analysis.nets.quantised import LOWEST, chip_run, compare, quantise, quantised_net
+from sliplab.analysis.nets.speck import CORES, KI, speck_fit
+from sliplab.analysis.nets.training import Fitted, restore
+from sliplab.protocols.settings import Network, Training, Windows
 from tests.analysis.nets.test_spiking import FULL, SMALL, TINY, biased, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")

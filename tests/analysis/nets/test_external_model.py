@@ -15,12 +15,12 @@ from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, Singl
 from sinabs.layers import IAFSqueeze, LIFSqueeze, SumPool2d
 from torch import nn
 
-from analysis.nets.external_model import Description, load_external
-from analysis.nets.network import spike_counts
-from analysis.nets.spiking import Engine
-from protocols import InputError
-from protocols.settings import Windows
-from protocols.yaml_file import parse_yaml, validate
+from sliplab.analysis.nets.external_model import Description, load_external
+from sliplab.analysis.nets.network import spike_counts
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.protocols import InputError
+from sliplab.protocols.settings import Windows
+from sliplab.protocols.yaml_file import parse_yaml, validate
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numba import njit
 
-from analysis.nets.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
+from sliplab.analysis.nets.lanes import BLOCK, LANES, add, add_times, fires, fires_kept, lowest
 
 F32 = npt.NDArray[np.float32]
 ROOM = 96

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.nets.learning_rate import learning_rate
-from protocols.settings import Training
+from sliplab.analysis.nets.learning_rate import learning_rate
+from sliplab.protocols.settings import Training
 
 
 def test_the_rate_falls_along_half_a_cosine() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.nets.metrics import (
+from sliplab.analysis.nets.metrics import (
     CLASSES,
     accuracy,
     class_balance,

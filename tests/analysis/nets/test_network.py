@@ -8,7 +8,7 @@ import pytest
 import torch
 from sinabs.utils import validate_memory_mapping_speck
 
-from analysis.nets.network import (
+from sliplab.analysis.nets.network import (
     BIASED,
     FIRST_BIAS,
     FIRST_DRIVE,
@@ -21,7 +21,7 @@ from analysis.nets.network import (
     spike_counts,
     weights,
 )
-from protocols.settings import Network, Windows
+from sliplab.protocols.settings import Network, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -190,10 +190,10 @@ def test_the_chip_vendors_package_is_never_imported() -> None:
     """It would try to install things when it is imported."""
     code = (
         "import sys\n"
-        "import analysis.detect.live, analysis.nets.onnx_file\n"
-        "import analysis.nets.quantised, analysis.nets.training\n"
-        "from analysis.nets.network import build\n"
-        "from protocols.settings import Network, Windows\n"
+        "import sliplab.analysis.detect.live, sliplab.analysis.nets.onnx_file\n"
+        "import sliplab.analysis.nets.quantised, sliplab.analysis.nets.training\n"
+        "from sliplab.analysis.nets.network import build\n"
+        "from sliplab.protocols.settings import Network, Windows\n"
         "build(Network(), Windows(), 0)\n"
         "bad = [m for m in sys.modules if m.split('.')[0] == 'samna' or 'dynapcnn' in m]\n"
         "assert not bad, bad\n"

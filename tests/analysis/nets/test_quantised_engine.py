@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.nets.network import SPIKING, build, weights
-from analysis.nets.quantised import chip_run, quantise, quantised_net
-from analysis.nets.quantised_engine import common_net, common_threshold
-from analysis.nets.spiking import Engine
-from analysis.nets.training import Fitted
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets.network import SPIKING, build, weights
+from sliplab.analysis.nets.quantised import chip_run, quantise, quantised_net
+from sliplab.analysis.nets.quantised_engine import common_net, common_threshold
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.nets.training import Fitted
+from sliplab.protocols.settings import Network, Training, Windows
 
 WINDOWS = Windows(length_ms=12, crop_px=140)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from analysis.nets.reliability import (
+from sliplab.analysis.nets.reliability import (
     by_lead,
     calibration,
     cross_entropy,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.nets.samples import (
+from sliplab.analysis.nets.samples import (
     GROSS,
     INCIPIENT,
     NO_SLIP,

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from analysis.nets.dataset import SampleSet
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.windows import bin_events, list_events
-from protocols.settings import Windows
+from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.windows import bin_events, list_events
+from sliplab.protocols.settings import Windows
 
 dense = hnp.arrays(
     np.uint8,

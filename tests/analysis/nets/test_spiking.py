@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from sinabs.activation import MembraneReset, MembraneSubtract, MultiSpike, PeriodicExponential
 from torch import nn
 
-from analysis.nets.network import (
+from sliplab.analysis.nets.network import (
     GRID,
     SPIKING,
     build,
@@ -23,9 +23,9 @@ from analysis.nets.network import (
     set_matrices,
     spike_counts,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.protocols.settings import Network, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

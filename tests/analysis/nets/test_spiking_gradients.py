@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.nets.network import (
+from sliplab.analysis.nets.network import (
     BIASED,
     SPIKING,
     WEIGHTED,
@@ -18,10 +18,10 @@ from analysis.nets.network import (
     parameters,
     reset_states,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Job, Trainer, WindowLoss
-from analysis.nets.spiking_gradients import _through
-from protocols.settings import Network, Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Job, Trainer, WindowLoss
+from sliplab.analysis.nets.spiking_gradients import _through
+from sliplab.protocols.settings import Network, Windows
 from tests.analysis.nets.test_spiking import FULL, SMALL, TINY, gridded, on_own_grid, put, sparse
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.nets.network import (
+from sliplab.analysis.nets.network import (
     SPIKING,
     WEIGHTED,
     build,
@@ -16,10 +16,10 @@ from analysis.nets.network import (
     set_weights,
     weights,
 )
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.synaptic import count_work, reached
-from analysis.nets.training import Fitted
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.synaptic import count_work, reached
+from sliplab.analysis.nets.training import Fitted
+from sliplab.protocols.settings import Network, Training, Windows
 
 WINDOWS = Windows(length_ms=8, crop_px=140, polarity="both")  # (8, 2, 7, 7): an odd side
 

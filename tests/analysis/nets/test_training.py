@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 import torch
 
-from analysis.nets import metrics
-from analysis.nets.model_file import FORMAT, load, save
-from analysis.nets.network import GRID, WEIGHTED, build, exact, matrices, spike_counts, weights
-from analysis.nets.training import (
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.model_file import FORMAT, load, save
+from sliplab.analysis.nets.network import (
+    GRID,
+    WEIGHTED,
+    build,
+    exact,
+    matrices,
+    spike_counts,
+    weights,
+)
+from sliplab.analysis.nets.training import (
     EpochRecord,
     Fitted,
     fit,
     predict_counts,
     restore,
 )
-from protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import Network, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -161,7 +169,7 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
     """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
     one_step = {"epochs": 1, "batch": 150}
     parts = run(**one_step)
-    monkeypatch.setattr("analysis.nets.training_work.MICRO_BATCH", 150)
+    monkeypatch.setattr("sliplab.analysis.nets.training_work.MICRO_BATCH", 150)
     whole = run(**one_step)
     assert parts.history[0].loss == pytest.approx(whole.history[0].loss, rel=1e-6)
     start = weights(build(NETWORK, WINDOWS, 0))
@@ -227,8 +235,8 @@ def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
 def test_silent_layers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     network = NETWORK.model_copy(update={"weight_scale": (1e-3, 1.0, 1.0, 1.0)})
     settings = Training(epochs=1, batch=64, learning_rate=1e-9)
-    monkeypatch.setattr("analysis.nets.network.FIRST_BIAS", (0.0, 0.0))
-    monkeypatch.setattr("analysis.nets.network.FIRST_DRIVE", 0.0)
+    monkeypatch.setattr("sliplab.analysis.nets.network.FIRST_BIAS", (0.0, 0.0))
+    monkeypatch.setattr("sliplab.analysis.nets.network.FIRST_DRIVE", 0.0)
     found = fit(*TRAIN, *VAL, network, WINDOWS, settings, 0)
     assert [w.split()[1] for w in found.warnings] == ["iaf1", "iaf2", "iaf3", "iaf4"]
     assert "silent" in found.warnings[0]
@@ -268,7 +276,7 @@ def test_a_failed_save_leaves_the_old_file_and_no_litter(
     def fail(*_: object) -> None:
         raise OSError("no space left")
 
-    monkeypatch.setattr("storage.files.os.replace", fail)
+    monkeypatch.setattr("sliplab.storage.files.os.replace", fail)
     with pytest.raises(OSError, match="no space"):
         save(path, fitted)
     assert [p.name for p in tmp_path.iterdir()] == ["model.pt"]

@@ -13,16 +13,16 @@ import pytest
 import torch
 from torch import nn
 
-from analysis.nets.compiled_neuron import ExactConvolution, exact_net
-from analysis.nets.metrics import IntArray
-from analysis.nets.network import build, by_parameter, matrices, on_grid, set_weights
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.spiking import Engine
-from analysis.nets.training import Fitted, fit
-from analysis.nets.training_batch import Batch
-from analysis.nets.training_device import OnDevice, devices, on_device
-from analysis.nets.training_work import EventDriven, work_on
-from protocols.settings import Network, Training, Windows
+from sliplab.analysis.nets.compiled_neuron import ExactConvolution, exact_net
+from sliplab.analysis.nets.metrics import IntArray
+from sliplab.analysis.nets.network import build, by_parameter, matrices, on_grid, set_weights
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.nets.training import Fitted, fit
+from sliplab.analysis.nets.training_batch import Batch
+from sliplab.analysis.nets.training_device import OnDevice, devices, on_device
+from sliplab.analysis.nets.training_work import EventDriven, work_on
+from sliplab.protocols.settings import Network, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -104,7 +104,7 @@ def test_a_training_on_a_device_goes_the_same_way(
 
     ours = trained()
     monkeypatch.setattr(
-        "analysis.nets.training_run.work_on",
+        "sliplab.analysis.nets.training_run.work_on",
         lambda _device, net, _cells, gain: OnDevice(net, gain, *way),
     )
     theirs = trained()
@@ -139,7 +139,7 @@ def test_where_nothing_compiles_sinabs_computes_and_it_is_said(
     def broken(*_: object) -> None:
         raise RuntimeError("Cannot find a working triton installation.\nmore")
 
-    monkeypatch.setattr("analysis.nets.compiled_neuron._compiled", lambda: (broken, broken))
+    monkeypatch.setattr("sliplab.analysis.nets.compiled_neuron._compiled", lambda: (broken, broken))
     net = build(NETWORK, WINDOWS, 0)
     with pytest.warns(UserWarning, match="for cpu, Sinabs' layers compute: Cannot find a working"):
         work = on_device(net, GAIN, "cpu")

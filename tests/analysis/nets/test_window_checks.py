@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from analysis.nets import metrics
-from analysis.nets.metrics import CLASSES, Scores, score
-from analysis.nets.sparse import SparseWindows
-from analysis.nets.training import Fitted, fit
-from analysis.nets.window_checks import (
+from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.metrics import CLASSES, Scores, score
+from sliplab.analysis.nets.sparse import SparseWindows
+from sliplab.analysis.nets.training import Fitted, fit
+from sliplab.analysis.nets.window_checks import (
     Chance,
     CheckFailed,
     Part,
@@ -17,7 +17,7 @@ from analysis.nets.window_checks import (
     permuted,
     shuffled_chance,
 )
-from protocols.settings import Network, Training, Windows
+from sliplab.protocols.settings import Network, Training, Windows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from analysis.nets.metrics import accuracy
-from analysis.nets.window_groups import (
+from sliplab.analysis.nets.metrics import accuracy
+from sliplab.analysis.nets.window_groups import (
     by_factor,
     by_tenth,
     by_trial,
@@ -15,7 +15,7 @@ from analysis.nets.window_groups import (
     share,
     strict_hits,
 )
-from analysis.statistics.intervals import share_interval
+from sliplab.analysis.statistics.intervals import share_interval
 
 COUNTS = np.array([[5, 0, 0], [3, 3, 0], [0, 0, 0], [0, 2, 1], [0, 0, 4], [9, 0, 0]])
 LABELS = np.array([0, 1, 2, 1, 2, 2])

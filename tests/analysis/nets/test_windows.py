@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from analysis.nets.windows import bin_events, first_pixel, window_totals
-from protocols.settings import Windows
+from sliplab.analysis.nets.windows import bin_events, first_pixel, window_totals
+from sliplab.protocols.settings import Windows
 
 PAPER = Windows()
 

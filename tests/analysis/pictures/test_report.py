@@ -9,10 +9,16 @@ from xml.etree import ElementTree
 
 import pytest
 
-from analysis.pictures import figures_campaign as campaign
-from analysis.pictures.figures_conditions import Panel, Share, by_condition, differences, shares
-from analysis.pictures.figures_front import Point, cost_and_error
-from analysis.pictures.report import Figure, Section, Table, csv_text, render
+from sliplab.analysis.pictures import figures_campaign as campaign
+from sliplab.analysis.pictures.figures_conditions import (
+    Panel,
+    Share,
+    by_condition,
+    differences,
+    shares,
+)
+from sliplab.analysis.pictures.figures_front import Point, cost_and_error
+from sliplab.analysis.pictures.report import Figure, Section, Table, csv_text, render
 
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
 ROWS = ["0.165 kg, 0.3 mm/s", "0.205 kg, 0.3 mm/s"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.pictures.sync_figures import OverTrials, over_trials
+from sliplab.analysis.pictures.sync_figures import OverTrials, over_trials
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])

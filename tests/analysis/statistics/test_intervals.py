@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from analysis.statistics.intervals import (
+from sliplab.analysis.statistics.intervals import (
     STATISTICS,
     between_seeds,
     difference,

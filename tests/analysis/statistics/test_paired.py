@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from analysis.statistics.paired import Difference, paired_difference
+from sliplab.analysis.statistics.paired import Difference, paired_difference
 
 
 def test_the_interval_is_that_of_the_paired_test() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.statistics.pareto import front
+from sliplab.analysis.statistics.pareto import front
 
 COST = st.one_of(st.integers(0, 3).map(float), st.just(float("inf")), st.floats(-1, 1))
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.statistics.scene_error import (
+from sliplab.analysis.statistics.scene_error import (
     Onsets,
     SceneError,
     Seen,
@@ -21,9 +21,9 @@ from analysis.statistics.scene_error import (
     mean_error,
     tensor_l1,
 )
-from analysis.statistics.scene_windows import look, pooled
-from protocols.settings import Samples, Windows
-from storage.streams import EventChunk
+from sliplab.analysis.statistics.scene_windows import look, pooled
+from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.streams import EventChunk
 
 WINDOWS = Windows()
 SIZE = (640, 480)

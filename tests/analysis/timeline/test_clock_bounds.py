@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.timeline.clock_bounds import BoundsContradictError, fit_bounds
+from sliplab.analysis.timeline.clock_bounds import BoundsContradictError, fit_bounds
 
 
 @given(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
-from analysis.timeline.pulse_runs import stray_stretch
+from sliplab.analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
+from sliplab.analysis.timeline.pulse_runs import stray_stretch
 from tests.analysis.timeline.test_clocks import TICK_NS, code
 
 Ints = NDArray[np.int64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.timeline.clocks import ClockRefused, fit_clock
 from benchmarks.clock_kinds import HOPELESS, KINDS, faulty_train, tally
+from sliplab.analysis.timeline.clocks import ClockRefused, fit_clock
 from tests.analysis.timeline.test_clock_faults import fitted
 from tests.analysis.timeline.test_clocks import TICK_NS, code
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.timeline.clock_line import _with_places
-from analysis.timeline.pulse_kernels import normal_equations, places_of
+from sliplab.analysis.timeline.clock_line import _with_places
+from sliplab.analysis.timeline.pulse_kernels import normal_equations, places_of
 
 
 @pytest.mark.parametrize("places", [[], [1], [1, 3]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock, fit_numbered
+from sliplab.analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock, fit_numbered
 from tests.analysis.timeline.test_clocks import DAY_NS, TICK_NS, code, trains, worst_error
 
 Ints = NDArray[np.int64]

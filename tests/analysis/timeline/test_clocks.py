@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
+from sliplab.analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
 
 TICK_NS = 10_000_000
 DAY_NS = 86_400 * 10**9

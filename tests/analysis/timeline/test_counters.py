@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.timeline.counters import split_at_restarts, unwrap
+from sliplab.analysis.timeline.counters import split_at_restarts, unwrap
 
 TICKS_NS = [1_000, 8]
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from analysis.timeline.pulse_kernels import (
+from sliplab.analysis.timeline.pulse_kernels import (
     changes,
     fullest,
     largest_sizes,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.timeline.clocks import ClockRefused, fit_clock
+from sliplab.analysis.timeline.clocks import ClockRefused, fit_clock
 from tests.analysis.timeline.test_clocks import TICK_NS, code
 
 CYCLE_NS = 2_000_000

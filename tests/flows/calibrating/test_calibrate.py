@@ -14,19 +14,19 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.calibration.charuco import Board, find_corners
-from flows import __main__ as entry
-from flows.calibrating import calibrate, measuring, teach
-from flows.calibrating.board_print import PNG_PX_PER_MM, print_board
-from flows.running import console, stopping
-from protocols import InputError
-from protocols.program import Position
-from rigs.build import build_rig
-from rigs.capabilities import ArmState, Pose, RigError
-from rigs.plate_frame import PlateFrame
-from rigs.rig import Rig, StopRequested
-from rigs.rig_file import load_rig_file
-from rigs.teaching import Creep
+from sliplab.analysis.calibration.charuco import Board, find_corners
+from sliplab.flows import __main__ as entry
+from sliplab.flows.calibrating import calibrate, measuring, teach
+from sliplab.flows.calibrating.board_print import PNG_PX_PER_MM, print_board
+from sliplab.flows.running import console, stopping
+from sliplab.protocols import InputError
+from sliplab.protocols.program import Position
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import ArmState, Pose, RigError
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.teaching import Creep
 from tests.command_line import sliplab
 from tests.conftest import ROOT
 
@@ -317,7 +317,7 @@ def test_a_dry_run_says_where_and_connects_to_nothing(
     def never(*_: object) -> None:
         raise AssertionError("a dry run builds no rig")
 
-    monkeypatch.setattr("rigs.build.build_rig", never)
+    monkeypatch.setattr("sliplab.rigs.build.build_rig", never)
     assert run("teach", what, "--rig", "mock", "--dry-run", "--json") == 0
     data = json.loads(capsys.readouterr().out)
     assert data["dry_run"] is True
@@ -354,7 +354,7 @@ def test_a_stop_in_the_middle_is_130_with_the_arm_at_rest(
         rigs.append(build_rig(file))
         return rigs[-1]
 
-    monkeypatch.setattr("rigs.build.build_rig", built)
+    monkeypatch.setattr("sliplab.rigs.build.build_rig", built)
     monkeypatch.setattr(stopping, "requested", lambda: next(asked, True))
     assert run("teach", "plane", "--rig", path, "--yes") == console.INTERRUPTED
     said = capsys.readouterr().err

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from storage.files import read_json
-from storage.store import Store
-from storage.verify import verify
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
 from tests.command_line import SECRET, SLIPLAB, here, sliplab, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write

@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 
-from flows.collecting import controlling
-from storage import control
-from storage.lock import exclusive
-from storage.process import this_process
-from storage.store import Store
-from storage.verify import verify
+from sliplab.flows.collecting import controlling
+from sliplab.storage import control
+from sliplab.storage.lock import exclusive
+from sliplab.storage.process import this_process
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
 from tests.command_line import SLIPLAB, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -162,8 +162,8 @@ SLEEPER = "import sys; print('up', flush=True); sys.stdin.read()"
 HOLDER = """
 import json, sys
 from pathlib import Path
-from storage.lock import exclusive
-from storage.process import this_process
+from sliplab.storage.lock import exclusive
+from sliplab.storage.process import this_process
 with exclusive(Path(sys.argv[1]), "the store"):
     print(json.dumps(this_process()), flush=True)
     sys.stdin.read()

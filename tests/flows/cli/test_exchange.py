@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flows.__main__ import _run
-from flows.planning.orders import make_order
-from flows.running.campaigns import collected
-from protocols import InputError
-from storage.exchange.aedat4 import Aedat4Writer, Stream
-from storage.store import Store, StoreError
-from storage.streams import EventChunk
+from sliplab.flows.__main__ import _run
+from sliplab.flows.planning.orders import make_order
+from sliplab.flows.running.campaigns import collected
+from sliplab.protocols import InputError
+from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.store import Store, StoreError
+from sliplab.storage.streams import EventChunk
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.exchange.files import lab_hdf5

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 import typer
 
-from flows.cli.app import app
-from flows.running import stopping
-from flows.running.cluster import ClusterError
-from rigs.capabilities import ArmFault
-from storage.errors import StoreError
-from storage.store import Store
+from sliplab.flows.cli.app import app
+from sliplab.flows.running import stopping
+from sliplab.flows.running.cluster import ClusterError
+from sliplab.rigs.capabilities import ArmFault
+from sliplab.storage.errors import StoreError
+from sliplab.storage.store import Store
 from tests.command_line import SECRET, here
 from tests.conftest import ROOT
 
@@ -152,7 +152,7 @@ def test_one_object_after_a_result_was_printed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Review prints its address first; what ends it later must not be a second object."""
-    from flows.reviewing import review_server
+    from sliplab.flows.reviewing import review_server
 
     def serve(*arguments: Any) -> None:
         *_, ready = arguments
@@ -167,7 +167,7 @@ def test_one_object_after_a_result_was_printed(
 
 
 def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    from flows.reviewing import view
+    from sliplab.flows.reviewing import view
 
     monkeypatch.setattr(view, "find", lambda *_: None)
     monkeypatch.setattr(view, "show", lambda _: None)
@@ -194,7 +194,7 @@ def test_whatever_ends_a_command_is_an_object(
         raise raised
 
     monkeypatch.setenv("PREFECT_API_KEY", SECRET)
-    monkeypatch.setattr("protocols.plan.load_plan", fail)
+    monkeypatch.setattr("sliplab.protocols.plan.load_plan", fail)
     done = here("plan", ROOT / "protocols" / "pilot.yaml", "--json")
     error = json.loads(done.stdout)["error"]
     assert (done.returncode, error["exit_code"]) == (code, code)
@@ -214,7 +214,7 @@ def test_an_arm_that_does_not_stop_is_said_to_whoever_pressed_ctrl_c(
             stopping.stop()
         raise ArmFault("arm", "does not stop: press its emergency stop")
 
-    monkeypatch.setattr("protocols.plan.load_plan", interrupted)
+    monkeypatch.setattr("sliplab.protocols.plan.load_plan", interrupted)
     done = here("plan", ROOT / "protocols" / "pilot.yaml", "--json")
     assert done.returncode == 1
     assert "press its emergency stop" in done.stderr

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from flows.running.limits import exhausted, too_few_threads
-from storage.errors import StoreError
-from storage.store import Store
-from storage.verify import verify
+from sliplab.flows.running.limits import exhausted, too_few_threads
+from sliplab.storage.errors import StoreError
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
 
@@ -26,7 +26,7 @@ PLAN = (ROOT / "protocols" / "pilot.yaml",)
 
 STARTED = """
 import resource, sys
-from flows.__main__ import main
+from sliplab.flows.__main__ import main
 which, limit = getattr(resource, sys.argv.pop(1)), int(sys.argv.pop(1))
 resource.setrlimit(which, (limit, limit))
 main()
@@ -85,7 +85,7 @@ def test_what_has_run_out_is_said(
         except Exception as error:
             raise StoreError(f"s/store.json: {error}; it is damaged") from None
 
-    monkeypatch.setattr("protocols.plan.load_plan", fail)
+    monkeypatch.setattr("sliplab.protocols.plan.load_plan", fail)
     done = here("plan", *PLAN, "--json")
     assert done.returncode == 1
     if not hidden or exhausted(raised):
@@ -99,8 +99,8 @@ def test_without_processes_a_collection_ends_in_one_line(
     def fork(*_: object, **__: object) -> None:
         raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
-    monkeypatch.setattr("flows.running.orchestration._servers", {})
-    monkeypatch.setattr("flows.running.embedded_server.subprocess.Popen", fork)
+    monkeypatch.setattr("sliplab.flows.running.orchestration._servers", {})
+    monkeypatch.setattr("sliplab.flows.running.embedded_server.subprocess.Popen", fork)
     words = (*PLAN, "--rig", "rehearsal", "--store", tmp_path / "s", "--trials", 1)
     done = here("collect", *words, "--json")
     error = json.loads(done.stdout)["error"]
@@ -120,9 +120,9 @@ def store(tmp_path: Path) -> Store:
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
-@pytest.mark.parametrize("place", ["storage.whole.read_json", "storage.whole.sha256"])
+@pytest.mark.parametrize("function", ["read_json", "sha256"])
 def test_a_trial_that_cannot_be_read_now_is_not_damaged(
-    number: int, place: str, store: Store, monkeypatch: pytest.MonkeyPatch
+    number: int, function: str, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sweeping and quarantine would move a whole trial away."""
     (campaign,) = store.campaigns()
@@ -132,10 +132,10 @@ def test_a_trial_that_cannot_be_read_now_is_not_damaged(
         raise OSError(number, os.strerror(number), str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr(place, fail)
+        patch.setattr(f"sliplab.storage.whole.{function}", fail)
         with pytest.raises(OSError, match=os.strerror(number)):
             verify(store)
-        if place.endswith("read_json"):
+        if function == "read_json":
             with pytest.raises(OSError, match=os.strerror(number)):
                 campaign.sweep()
         done = here("verify", store.folder, "--quarantine", "--json")
@@ -149,7 +149,7 @@ def test_a_trial_that_cannot_be_read_now_is_not_damaged(
 FULL = """
 import resource, sys
 from pathlib import Path
-from storage.hdf5 import StreamFile
+from sliplab.storage.hdf5 import StreamFile
 from tests.storage.trials import events
 path = Path(sys.argv[1])
 file = StreamFile(path)
@@ -180,11 +180,11 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
 
 CRASH = """
 import os, signal, sys, time
-from flows.running import limits
+from sliplab.flows.running import limits
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))
-from flows import __main__ as program
+from sliplab.flows import __main__ as program
 def run():
     print(os.getpid(), flush=True)
     if sys.argv[1] == "crash":

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from flows import __main__ as program
-from flows.cli import remote as cli_remote
-from flows.running import stopping
-from storage.lock import STORE_LOCK, exclusive
-from storage.store import Store
-from storage.verify import verify
+from sliplab.flows import __main__ as program
+from sliplab.flows.cli import remote as cli_remote
+from sliplab.flows.running import stopping
+from sliplab.storage.lock import STORE_LOCK, exclusive
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
 from tests.storage.remotes import tree
 from tests.storage.trials import campaign, commit
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from flows.__main__ import main
-from flows.collecting.stretch import stretch
-from flows.planning.orders import campaign_counts, make_order, pending_trials
-from storage.files import read_json, write_json
-from storage.lock import Locked, exclusive
-from storage.store import FORMAT, Store, StoreError
+from sliplab.flows.__main__ import main
+from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.planning.orders import campaign_counts, make_order, pending_trials
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.lock import Locked, exclusive
+from sliplab.storage.store import FORMAT, Store, StoreError
 from tests.flows.collecting.test_faults import TRACKS, slides
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import write

@@ -10,8 +10,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import pytest
 import typer
 
-from flows.cli.app import app
-from protocols.shown import MASK
+from sliplab.flows.cli.app import app
+from sliplab.protocols.shown import MASK
 from tests.command_line import here
 from tests.conftest import ROOT
 

@@ -8,18 +8,18 @@ from typing import Any
 
 import pytest
 
-from flows.collecting import boundary as boundary_module
-from flows.collecting.boundary import Boundary, carry_out, refuse_paused
-from flows.collecting.session import Session
-from flows.collecting.stops import CampaignStopped
-from flows.collecting.stretch import stretch
-from flows.planning.orders import make_order, pending_trials, set_aside
-from flows.running import stopping
-from protocols import Trial
-from storage import control
-from storage.decisions import skipped
-from storage.store import Campaign, Store
-from storage.verify import verify
+from sliplab.flows.collecting import boundary as boundary_module
+from sliplab.flows.collecting.boundary import Boundary, carry_out, refuse_paused
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.stops import CampaignStopped
+from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.planning.orders import make_order, pending_trials, set_aside
+from sliplab.flows.running import stopping
+from sliplab.protocols import Trial
+from sliplab.storage import control
+from sliplab.storage.decisions import skipped
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.verify import verify
 from tests.flows.collecting.test_session import checksums, session, short
 
 

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.labels.labelling import label_recording
-from flows.planning.orders import campaign_counts, make_order, pending_trials
-from protocols.settings import Labelling
-from rigs.capabilities import ArmFault, ArmState, RigError
-from rigs.mock.fault_settings import KINDS
-from rigs.rig import Rig
-from storage.errors import StoreError
-from storage.store import Campaign, Store
-from storage.verify import verify
+from sliplab.analysis.labels.labelling import label_recording
+from sliplab.flows.planning.orders import campaign_counts, make_order, pending_trials
+from sliplab.protocols.settings import Labelling
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.mock.fault_settings import KINDS
+from sliplab.rigs.rig import Rig
+from sliplab.storage.errors import StoreError
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import checksums, session, short
 from tests.flows.conftest import tiny_gravity

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.collecting.session import Session
-from rigs.capabilities import ArmFault, RigError
-from storage.files import disk_full, read_json, write_json
-from storage.store import Campaign, Store, StoreError
-from storage.verify import verify
+from sliplab.flows.collecting.session import Session
+from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.storage.files import disk_full, read_json, write_json
+from sliplab.storage.store import Campaign, Store, StoreError
+from sliplab.storage.verify import verify
 from tests.command_line import sliplab
 from tests.flows.collecting.test_session import checksums, session, short, take_all
 
@@ -70,7 +70,7 @@ def test_a_disk_too_full_for_the_cause_is_a_full_disk(
     def no_room(path: Path, data: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr("storage.store.write_json", no_room)
+    monkeypatch.setattr("sliplab.storage.store.write_json", no_room)
     with pytest.raises(StoreError, match="its disk is full"):
         take_all(work)
     monkeypatch.undo()
@@ -90,7 +90,7 @@ def test_a_disk_that_fills_up_at_the_commit(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         write_json(path, data)
 
-    monkeypatch.setattr("storage.writer.write_json_aside", no_room)
+    monkeypatch.setattr("sliplab.storage.writer.write_json_aside", no_room)
     with pytest.raises(StoreError, match="its disk is full"):
         take_all(work)
     monkeypatch.undo()

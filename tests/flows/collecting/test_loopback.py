@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from analysis.labels.labelling import label_recording
-from flows.collecting.session import Session
-from flows.planning.orders import describe_campaign
-from rigs.arms.settings import AbbSettings, AbbSocketSettings
-from rigs.build import build_rig
-from rigs.rig_file import RigFile
-from storage.recording import Recording
-from storage.store import Store
-from storage.verify import verify
+from sliplab.analysis.labels.labelling import label_recording
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import describe_campaign
+from sliplab.rigs.arms.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
 from tests.flows.live import (
     at_work,
     free_udp_port,

@@ -16,16 +16,16 @@ from typing import Any, cast
 
 import pytest
 
-from flows.collecting.session import Session
-from flows.planning.orders import Order, pending_trials
-from rigs.arms.ur import SILENCE_S, UrArm
-from rigs.arms.ur_control import WATCHDOG_HZ
-from rigs.build import calibrated_arm
-from rigs.capabilities import ArmFault, ArmState, RigError
-from rigs.wire.loopback import Loopback
-from storage.files import read_json
-from storage.store import Campaign, Store
-from storage.verify import verify
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import Order, pending_trials
+from sliplab.rigs.arms.ur import SILENCE_S, UrArm
+from sliplab.rigs.arms.ur_control import WATCHDOG_HZ
+from sliplab.rigs.build import calibrated_arm
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.wire.loopback import Loopback
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.verify import verify
 from tests.flows.collecting.test_session import checksums
 from tests.flows.live import at_work, order_in, quick, rig_yaml, stage_of
 from tests.rigs.loopback import until

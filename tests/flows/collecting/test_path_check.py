@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
-from rigs.rig import Way
-from storage.streams import F64, I64
+from sliplab.flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
+from sliplab.rigs.rig import Way
+from sliplab.storage.streams import F64, I64
 
 LIMIT_PERCENT = 10.0
 """The gate's default."""

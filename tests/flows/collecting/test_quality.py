@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.labels.labelling import label_recording
-from flows.collecting.quality import BURST_US, _event_burst
-from protocols.settings import Labelling
-from storage.recording import Recording
+from sliplab.analysis.labels.labelling import label_recording
+from sliplab.flows.collecting.quality import BURST_US, _event_burst
+from sliplab.protocols.settings import Labelling
+from sliplab.storage.recording import Recording
 from tests.flows.collecting.test_session import session
 from tests.flows.conftest import tiny_gravity
 

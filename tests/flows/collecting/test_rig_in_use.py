@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from flows.calibrating.measuring import Bench, Finding, Measurement
-from flows.cli.rigs import _about
-from flows.collecting.stretch import stretch
-from flows.planning.device_checks import check_devices
-from flows.planning.orders import Order
-from protocols import load_plan
-from rigs.rig_file import load_rig_file
-from rigs.rig_lock import ENVIRONMENT, lock_names
-from storage.lock import Locked, exclusive
+from sliplab.flows.calibrating.measuring import Bench, Finding, Measurement
+from sliplab.flows.cli.rigs import _about
+from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.planning.device_checks import check_devices
+from sliplab.flows.planning.orders import Order
+from sliplab.protocols import load_plan
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.rigs.rig_lock import ENVIRONMENT, lock_names
+from sliplab.storage.lock import Locked, exclusive
 from tests.conftest import ROOT
 
 UR5 = ROOT / "rigs" / "ur5.yaml"
@@ -33,10 +33,10 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a device was opened")
 
     for place in (
-        "flows.collecting.stretch.build_rig", "rigs.build.build_rig", "flows.cli.rigs.reach",
-        "rigs.reach.reach",
+        "sliplab.flows.collecting.stretch.build_rig", "sliplab.rigs.build.build_rig", "sliplab.flows.cli.rigs.reach",
+        "sliplab.rigs.reach.reach",
     ):  # fmt: skip
-        monkeypatch.setattr(place, opened)
+        monkeypatch.setattr(f"sliplab.{place}", opened)
     name = next(iter(lock_names(load_rig_file(UR5)[0])))
     with exclusive(folder / name, "the arm", about={"store": "/data/other"}):
         yield

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from flows.collecting.stretch import owned
-from flows.planning.orders import describe_campaign, make_order
-from flows.running import console
-from protocols import InputError
-from rigs.rig_file import load_rig_file, rig_hash
-from storage.files import read_json
-from storage.process import this_process
-from storage.secrets import MASK, masked
-from storage.store import Store, StoreError
+from sliplab.flows.collecting.stretch import owned
+from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.flows.running import console
+from sliplab.protocols import InputError
+from sliplab.rigs.rig_file import load_rig_file, rig_hash
+from sliplab.storage.files import read_json
+from sliplab.storage.process import this_process
+from sliplab.storage.secrets import MASK, masked
+from sliplab.storage.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.storage.trials import campaign, commit
 

@@ -9,13 +9,18 @@ from typing import Any
 
 import pytest
 
-from flows.collecting.session import Session
-from flows.planning.orders import campaign_counts, describe_campaign, make_order, pending_trials
-from protocols.yaml_file import parse_yaml
-from rigs.build import build_rig
-from rigs.capabilities import ArmFault, RigError
-from storage.store import Campaign, Store, StoreError
-from storage.verify import verify
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import (
+    campaign_counts,
+    describe_campaign,
+    make_order,
+    pending_trials,
+)
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.storage.store import Campaign, Store, StoreError
+from sliplab.storage.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, tiny_gravity, write
 

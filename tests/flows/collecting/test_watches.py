@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 
-from flows.collecting.boundary import Boundary, carry_out
-from flows.collecting.disk_watch import DiskWatch
-from flows.collecting.reference_watch import ReferenceWatch, hold_rate
-from flows.collecting.remaining import Remaining
-from flows.collecting.session import Session
-from flows.collecting.stops import CampaignStopped
-from flows.planning.estimate import RESERVE, trial_bytes
-from flows.planning.orders import Order, make_order, pending_trials
-from protocols import InputError, load_plan
-from storage import control
-from storage.store import Campaign, Store
-from storage.verify import verify
+from sliplab.flows.collecting.boundary import Boundary, carry_out
+from sliplab.flows.collecting.disk_watch import DiskWatch
+from sliplab.flows.collecting.reference_watch import ReferenceWatch, hold_rate
+from sliplab.flows.collecting.remaining import Remaining
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.stops import CampaignStopped
+from sliplab.flows.planning.estimate import RESERVE, trial_bytes
+from sliplab.flows.planning.orders import Order, make_order, pending_trials
+from sliplab.protocols import InputError, load_plan
+from sliplab.storage import control
+from sliplab.storage.store import Campaign, Store
+from sliplab.storage.verify import verify
 from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import tiny, write
 
@@ -89,7 +89,8 @@ def test_references_that_drift_apart_stop_the_campaign(
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
     monkeypatch.setattr(
-        "flows.collecting.reference_watch.hold_rate", lambda recording: rates[recording.trial_id]
+        "sliplab.flows.collecting.reference_watch.hold_rate",
+        lambda recording: rates[recording.trial_id],
     )
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
@@ -138,7 +139,7 @@ def test_without_the_gate_nothing_is_compared(
     def never(recording: object) -> float:
         raise AssertionError("read")
 
-    monkeypatch.setattr("flows.collecting.reference_watch.hold_rate", never)
+    monkeypatch.setattr("sliplab.flows.collecting.reference_watch.hold_rate", never)
     work.boundary = Boundary(order, Store.open(order.store), campaign)
     work.take(pending_trials(work.plan, campaign)[:3])
     ReferenceWatch(order, campaign).begin()

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from flows.collecting.boundary import Boundary
-from flows.collecting.stops import WindowOver
-from flows.collecting.stretch import stretch
-from flows.planning.orders import Order, describe_campaign
-from rigs.rig_file import load_rig_file
-from storage import control
-from storage.store import Store
+from sliplab.flows.collecting.boundary import Boundary
+from sliplab.flows.collecting.stops import WindowOver
+from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.planning.orders import Order, describe_campaign
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage import control
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 

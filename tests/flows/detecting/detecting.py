@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.detect.live import Counting
-from analysis.nets import model_file
-from analysis.nets.epoch_record import EpochRecord
-from analysis.nets.network import SPIKING, build, weights
-from analysis.nets.training import Fitted
-from flows.detecting.detect_order import DetectOrder, make_detect_order
-from protocols.settings import Network, Training, Windows
-from rigs.build import build_rig
-from rigs.rig import Rig
-from rigs.rig_file import RigFile
+from sliplab.analysis.detect.live import Counting
+from sliplab.analysis.nets import model_file
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.nets.network import SPIKING, build, weights
+from sliplab.analysis.nets.training import Fitted
+from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
+from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.rig import Rig
+from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 from tests.flows.live import quick
 

@@ -10,23 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.detect.detection import detect as detect_trial
-from analysis.detect.live import LiveDetector, counting_of
-from analysis.nets.dataset import trial_windows
-from analysis.nets.training import predict_counts
-from analysis.nets.windows import bin_events
-from flows.collecting.session import Session
-from flows.detecting.detect import detect
-from flows.detecting.detect_order import make_detect_order
-from flows.planning.orders import describe_campaign
-from protocols import InputError
-from protocols.settings import Detection
-from rigs.build import build_rig
-from rigs.capabilities import RigError
-from rigs.rig import Rig
-from rigs.rig_file import RigFile
-from storage.recording import Recording
-from storage.store import Store
+from sliplab.analysis.detect.detection import detect as detect_trial
+from sliplab.analysis.detect.live import LiveDetector, counting_of
+from sliplab.analysis.nets.dataset import trial_windows
+from sliplab.analysis.nets.training import predict_counts
+from sliplab.analysis.nets.windows import bin_events
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.detecting.detect import detect
+from sliplab.flows.detecting.detect_order import make_detect_order
+from sliplab.flows.planning.orders import describe_campaign
+from sliplab.protocols import InputError
+from sliplab.protocols.settings import Detection
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig import Rig
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detecting.detecting import (

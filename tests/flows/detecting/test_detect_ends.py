@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.detecting.detect import detect
-from flows.detecting.detect_order import choose_trial, make_detect_order
-from protocols import InputError, load_plan
-from rigs.capabilities import RigError
-from rigs.rig import Rig, StopRequested
-from rigs.rig_file import RigFile
+from sliplab.flows.detecting.detect import detect
+from sliplab.flows.detecting.detect_order import choose_trial, make_detect_order
+from sliplab.protocols import InputError, load_plan
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.rig_file import RigFile
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
@@ -43,7 +43,7 @@ def test_a_stop_request_stops_the_arm(
         return np.array([[9, 0, 0]])
 
     # as the handler of Ctrl-C does, in the middle of the slide
-    monkeypatch.setattr("flows.running.stopping.requested", lambda: len(asked) > 25)
+    monkeypatch.setattr("sliplab.flows.running.stopping.requested", lambda: len(asked) > 25)
     with pytest.raises(StopRequested):
         detect(ordered(model, protocol), counting=counting, build=keeping(rigs))
     assert stands_clear(rigs[0])
@@ -96,7 +96,7 @@ def test_listening_ends_when_somebody_asks(model: Path, monkeypatch: pytest.Monk
         asked.append(1)
         return np.array([[9, 0, 0]])
 
-    monkeypatch.setattr("flows.running.stopping.requested", lambda: len(asked) > 5)
+    monkeypatch.setattr("sliplab.flows.running.stopping.requested", lambda: len(asked) > 5)
     result = detect(make_detect_order(RIG, model, seconds=60), counting=counting)
     assert result["interrupted"] is True
     assert result["windows"] < 10
@@ -107,7 +107,7 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
 ) -> None:
     shown = io.StringIO()
     terminal = Console(file=shown, force_terminal=True, width=100, height=30)
-    monkeypatch.setattr("flows.running.console.messages", terminal)
+    monkeypatch.setattr("sliplab.flows.running.console.messages", terminal)
     detect(make_detect_order(RIG, model, seconds=0.6), counting=slip_when_busy())
     text = shown.getvalue()
     for part in ("simulated listening", "no slip", "9.00", "events/s", "gross"):

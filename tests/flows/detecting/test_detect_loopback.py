@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from flows.detecting.detect import detect
-from flows.detecting.detect_order import make_detect_order
-from rigs.build import loopback_rig
-from rigs.rig import Rig
-from rigs.rig_file import RigFile
+from sliplab.flows.detecting.detect import detect
+from sliplab.flows.detecting.detect_order import make_detect_order
+from sliplab.rigs.build import loopback_rig
+from sliplab.rigs.rig import Rig
+from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
 from tests.flows.detecting.detecting import model_in, short_slide, slip_when_busy
 from tests.flows.live import rig_yaml, stage_of

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from flows.labelling.label import STEP
-from flows.labelling.label_errors import distances, holds_compared
-from storage.derived import Derived
-from storage.recording import Recording
+from sliplab.flows.labelling.label import STEP
+from sliplab.flows.labelling.label_errors import distances, holds_compared
+from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
 from tests.flows.reviewable import NAME, Reviewable, label
 
 MS = 1_000_000

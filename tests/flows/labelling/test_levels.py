@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
-from analysis.labels.labelling import Label, label_recording
-from flows.collecting.session import Session
-from flows.planning.orders import describe_campaign, make_order, pending_trials
-from rigs.build import build_rig
-from storage.recording import Recording
-from storage.store import Store
-from storage.verify import verify
-from storage.whole import write_sums
+from sliplab.analysis.labels.labelling import Label, label_recording
+from sliplab.flows.collecting.session import Session
+from sliplab.flows.planning.orders import describe_campaign, make_order, pending_trials
+from sliplab.rigs.build import build_rig
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
+from sliplab.storage.verify import verify
+from sliplab.storage.whole import write_sums
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, tiny_gravity, write
 
@@ -60,7 +60,7 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
 
 def label(recording: Recording, data: dict[str, Any]) -> Label:
     """Its label by the rule of its protocol."""
-    from protocols.settings import Labelling
+    from sliplab.protocols.settings import Labelling
 
     return label_recording(recording, Labelling.model_validate(data["analysis"]["labelling"]))
 

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from flows.labelling.label import STEP
-from flows.labelling.reviewed import Labels
-from flows.learning import evaluate, train
-from flows.reviewing.review_list import TrialList, chosen, doubts_of
-from flows.reviewing.review_trial import load
-from protocols.errors import InputError
-from storage import review
-from storage.derived import Derived
-from storage.errors import StoreError
-from storage.exchange.find import trials_in
-from storage.exchange.take_in import take_in
-from storage.recording import Recording
-from storage.review import Onsets, Verdict
+from sliplab.flows.labelling.label import STEP
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning import evaluate, train
+from sliplab.flows.reviewing.review_list import TrialList, chosen, doubts_of
+from sliplab.flows.reviewing.review_trial import load
+from sliplab.protocols.errors import InputError
+from sliplab.storage import review
+from sliplab.storage.derived import Derived
+from sliplab.storage.errors import StoreError
+from sliplab.storage.exchange.find import trials_in
+from sliplab.storage.exchange.take_in import take_in
+from sliplab.storage.recording import Recording
+from sliplab.storage.review import Onsets, Verdict
 from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
 from tests.storage.exchange.files import lab_hdf5
 
@@ -194,7 +194,7 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
 
 
 def test_a_port_that_is_taken_and_a_campaign_that_is_not_there(made: Reviewable) -> None:
-    from flows.cli.app import app
+    from sliplab.flows.cli.app import app
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])

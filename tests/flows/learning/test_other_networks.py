@@ -12,23 +12,23 @@ import pytest
 import torch
 import yaml
 
-from analysis.nets import metrics, model_file
-from analysis.nets.dataset import trial_windows
-from analysis.nets.network import spike_counts
-from analysis.nets.training import restore
-from flows.labelling.reviewed import Labels
-from flows.learning.evaluate import evaluate, evaluation_of
-from flows.learning.other_networks import STEP, judge_model
-from flows.learning.samples import load_samples
-from flows.learning.train import train
-from flows.planning.orders import Order
-from flows.reporting.report import read_summary, report
-from flows.running.campaigns import collected
-from flows.study import Outcome
-from protocols import InputError
-from protocols.settings import Windows
-from storage.derived import Derived
-from storage.store import Store
+from sliplab.analysis.nets import metrics, model_file
+from sliplab.analysis.nets.dataset import trial_windows
+from sliplab.analysis.nets.network import spike_counts
+from sliplab.analysis.nets.training import restore
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.evaluate import evaluate, evaluation_of
+from sliplab.flows.learning.other_networks import STEP, judge_model
+from sliplab.flows.learning.samples import load_samples
+from sliplab.flows.learning.train import train
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.study import Outcome
+from sliplab.protocols import InputError
+from sliplab.protocols.settings import Windows
+from sliplab.storage.derived import Derived
+from sliplab.storage.store import Store
 from tests.analysis.nets.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.nets import metrics
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.labelling.reviewed import Labels
-from flows.learning.evaluate import evaluate, evaluation_of
-from flows.learning.samples import load_samples, split_trials
-from flows.learning.train import train
-from flows.learning.window_scores import kept_counts
-from flows.planning.orders import make_order
-from flows.running.campaigns import collected
-from storage.review import Onsets, decide
-from storage.store import Store
+from sliplab.analysis.nets import metrics
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.learning.evaluate import evaluate, evaluation_of
+from sliplab.flows.learning.samples import load_samples, split_trials
+from sliplab.flows.learning.train import train
+from sliplab.flows.learning.window_scores import kept_counts
+from sliplab.flows.planning.orders import make_order
+from sliplab.flows.running.campaigns import collected
+from sliplab.storage.review import Onsets, decide
+from sliplab.storage.store import Store
 from tests.flows.conftest import tiny, write
 
 

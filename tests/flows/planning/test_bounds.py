@@ -13,13 +13,13 @@ from annotated_types import Interval, Le, Lt
 from pydantic import BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 
-from flows.serving.serve_file import _MODELS
-from flows.serving.serve_parameters import Ask
-from protocols.errors import InputError
-from protocols.model import Protocol
-from protocols.yaml_file import validate
-from rigs.rig_file import RigFile
-from rigs.rig_inheritance import read_rig
+from sliplab.flows.serving.serve_file import _MODELS
+from sliplab.flows.serving.serve_parameters import Ask
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.model import Protocol
+from sliplab.protocols.yaml_file import validate
+from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_inheritance import read_rig
 from tests.conftest import ROOT
 
 FILES: tuple[type[BaseModel], ...] = (Protocol, RigFile, *_MODELS.values(), Ask)

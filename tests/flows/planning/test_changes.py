@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.planning.changes import MOST, differences, told
-from flows.planning.orders import describe_campaign, make_order
-from protocols import load_plan
-from rigs.rig_file import load_rig_file
-from storage.store import Store, StoreError
+from sliplab.flows.planning.changes import MOST, differences, told
+from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.protocols import load_plan
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.storage.trials import commit

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from flows.cli.app import app
-from flows.planning.device_checks import check_devices
-from flows.planning.orders import Order, make_order
-from flows.planning.region import check_region
-from protocols.errors import InputError
-from protocols.yaml_file import parse_yaml
+from sliplab.flows.cli.app import app
+from sliplab.flows.planning.device_checks import check_devices
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.planning.region import check_region
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import parse_yaml
 from tests.conftest import ROOT
 
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from flows.reporting.label_tables import speed, truth
+from sliplab.flows.reporting.label_tables import speed, truth
 from tests.conftest import ROOT
 
 

@@ -13,22 +13,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.nets.metrics import CLASSES
-from analysis.statistics.scene_windows import PHASES
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.planning.orders import Order, make_order
-from flows.reporting import campaign_section, others_section
-from flows.reporting.report import read_summary, report, write_figures
-from flows.reporting.report_against import compare
-from flows.reporting.report_extras import FILES
-from flows.reporting.report_trials import OUTCOMES, Conditions, accounted, intervals, told
-from flows.running.campaigns import collected
-from flows.searching.tradeoff_page import ERRORS
-from flows.study import Outcome
-from storage.derived import Derived
-from storage.files import read_json, write_json
-from storage.store import Store, StoreError
+from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.statistics.scene_windows import PHASES
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.reporting import campaign_section, others_section
+from sliplab.flows.reporting.report import read_summary, report, write_figures
+from sliplab.flows.reporting.report_against import compare
+from sliplab.flows.reporting.report_extras import FILES
+from sliplab.flows.reporting.report_trials import OUTCOMES, Conditions, accounted, intervals, told
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching.tradeoff_page import ERRORS
+from sliplab.flows.study import Outcome
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write
@@ -178,7 +178,7 @@ def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
 
 
 def test_failures_have_a_command_that_shows_them(store: Store) -> None:
-    from flows.reporting.failures_section import MOST, section
+    from sliplab.flows.reporting.failures_section import MOST, section
 
     summary = read_summary(store)
     row = {**summary["trials"][0], "trial": "a=1,r=1", "outcome": "late", "gross": "missed"}

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from flows.planning.orders import Order
-from flows.reporting.report import against, report_folder
-from flows.study import Outcome
-from storage.store import Store
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report import against, report_folder
+from sliplab.flows.study import Outcome
+from sliplab.storage.store import Store
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser
 
 pytestmark = needs_browser

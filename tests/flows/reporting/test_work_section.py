@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flows.reporting.work_section import section
+from sliplab.flows.reporting.work_section import section
 
 Json = dict[str, Any]
 

@@ -18,7 +18,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from storage import review
+from sliplab.storage import review
 from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 from tests.flows.reviewable import DOUBTFUL, NAME, Reviewable, label
@@ -43,7 +43,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Ends with Ctrl-C, which must end it in good order."""
     made = Reviewable(tmp_path_factory.mktemp("review") / "store")
     process = subprocess.Popen(
-        [sys.executable, "-m", "flows", "review", str(made.store.folder), "--json", "--who=anna"],
+        [sys.executable, "-m", "sliplab", "review", str(made.store.folder), "--json", "--who=anna"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
         env={**os.environ, "PYTHONWARNINGS": "default"},
     )  # fmt: skip

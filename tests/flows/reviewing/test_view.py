@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
-from flows.reviewing import view, view_streams
-from flows.running.campaigns import Collected
-from protocols.errors import InputError
-from storage import review
-from storage.derived import Derived
-from storage.errors import StoreError
-from storage.review import Onsets
+from sliplab.flows.reviewing import view, view_streams
+from sliplab.flows.running.campaigns import Collected
+from sliplab.protocols.errors import InputError
+from sliplab.storage import review
+from sliplab.storage.derived import Derived
+from sliplab.storage.errors import StoreError
+from sliplab.storage.review import Onsets
 from tests.flows.listening import listening
 from tests.flows.reviewable import (
     EVENTS,

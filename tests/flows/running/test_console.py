@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from flows.running import console
+from sliplab.flows.running import console
 
 
 class Clock:
@@ -27,7 +27,7 @@ def lines(monkeypatch: pytest.MonkeyPatch, *, terminal: bool, left: str | None) 
     out, clock = io.StringIO(), Clock()
     to = Console(file=out, force_terminal=terminal, soft_wrap=True, highlight=False)
     monkeypatch.setattr(console, "messages", to)
-    monkeypatch.setattr("flows.running.console.time", SimpleNamespace(monotonic=clock))
+    monkeypatch.setattr("sliplab.flows.running.console.time", SimpleNamespace(monotonic=clock))
     with console.bar("grid", 6, left) as bar:
         for k in range(6):
             clock.s += 25.0

@@ -18,19 +18,19 @@ from pathlib import Path
 import distributed
 import pytest
 
-from flows.labelling.label import label
-from flows.learning.evaluate import evaluate
-from flows.learning.train import train
-from flows.running import cluster as clusters
-from flows.running import stopping, trial_work
-from flows.running.campaigns import collected
-from flows.running.cluster import Cluster, ClusterError, connected
-from flows.searching.tradeoff_runs import everywhere
-from protocols.errors import InputError
-from storage.mirror import open_mirror
-from storage.push import push
-from storage.remote import Remote
-from storage.store import Store
+from sliplab.flows.labelling.label import label
+from sliplab.flows.learning.evaluate import evaluate
+from sliplab.flows.learning.train import train
+from sliplab.flows.running import cluster as clusters
+from sliplab.flows.running import stopping, trial_work
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.running.cluster import Cluster, ClusterError, connected
+from sliplab.flows.searching.tradeoff_runs import everywhere
+from sliplab.protocols.errors import InputError
+from sliplab.storage.mirror import open_mirror
+from sliplab.storage.push import push
+from sliplab.storage.remote import Remote
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.listening import listening

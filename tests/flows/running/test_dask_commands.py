@@ -22,24 +22,6 @@ from tests.flows.serving.serving import until
 from tests.storage.remotes import tree
 
 PORT = "8786"
-FINDER = f'''
-"""As `pip install -e` has it: packages are found by a finder that stands after Python's own."""
-
-import sys
-from importlib.machinery import PathFinder
-
-sys.path[:] = [place for place in sys.path if place not in ("", {str(ROOT)!r})]
-
-
-class Finder:
-    @classmethod
-    def find_spec(cls, name, path=None, target=None):
-        if name in {{"protocols", "storage", "analysis", "rigs", "flows"}}:
-            return PathFinder.find_spec(name, [{str(ROOT)!r}])
-
-
-sys.meta_path.append(Finder)
-'''
 
 
 def documented() -> list[list[str]]:
@@ -77,12 +59,7 @@ def taken(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Path:
     return six_trials(tmp_path_factory.mktemp("dask"), rig_path)
 
 
-@pytest.mark.parametrize(
-    "installed", [pytest.param("by a path", marks=pytest.mark.long), "by a finder"]
-)
-def test_the_documented_commands_make_the_same_bytes(
-    taken: Path, tmp_path: Path, installed: str
-) -> None:
+def test_the_documented_commands_make_the_same_bytes(taken: Path, tmp_path: Path) -> None:
     scheduler, worker, step = documented()
     assert [scheduler[:2], worker[:2], step[:2]] == [
         ["dask", "scheduler"], ["dask", "worker"], ["sliplab", "label"]
@@ -101,10 +78,6 @@ def test_the_documented_commands_make_the_same_bytes(
 
     environment = {**os.environ}
     environment.pop("PREFECT_HOME", None)
-    if installed == "by a finder":
-        (tmp_path / "site").mkdir()
-        (tmp_path / "site" / "sitecustomize.py").write_text(FINDER)
-        environment["PYTHONPATH"] = str(tmp_path / "site")
     store, alone = tmp_path / "store", tmp_path / "alone"
     shutil.copytree(taken, store)
     shutil.copytree(taken, alone)

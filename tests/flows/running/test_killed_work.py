@@ -16,12 +16,12 @@ from random import Random
 
 import pytest
 
-from flows.labelling.label import label
-from flows.running import trial_work
-from flows.running.campaigns import collected
-from flows.running.spread import WorkerKilled
-from storage.files import read_json
-from storage.store import Store
+from sliplab.flows.labelling.label import label
+from sliplab.flows.running import trial_work
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.running.spread import WorkerKilled
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until
@@ -62,7 +62,7 @@ def test_every_step_goes_on_after_it_was_killed(seed: int, taken: Path, tmp_path
         return found
 
     for step in STEPS:
-        command = [sys.executable, "-m", "flows", step, str(folder), "--json"]
+        command = [sys.executable, "-m", "sliplab", step, str(folder), "--json"]
         runs_before, results_before = begun(), results()
         wanted = random.randrange(FILES[step])
         process = subprocess.Popen(

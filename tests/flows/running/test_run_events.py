@@ -15,8 +15,8 @@ from prefect.runtime import flow_run
 from prefect.settings import temporary_settings
 
 from benchmarks.orchestration import _drained
-from flows.running import embedded_database
-from flows.running.orchestration import Parcel, embedded, run
+from sliplab.flows.running import embedded_database
+from sliplab.flows.running.orchestration import Parcel, embedded, run
 
 COUNT = 120
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from flows.running.embedded_server import EmbeddedServer
+from sliplab.flows.running.embedded_server import EmbeddedServer
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.flows.serving.serving import until
@@ -45,7 +45,7 @@ class Collection:
         with self.log.open("w") as messages:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "flows", "collect", str(protocol)),
+                    *(sys.executable, "-m", "sliplab", "collect", str(protocol)),
                     *("--rig", "rehearsal", "--store", str(self.store), "--json"),
                 ],
                 cwd=ROOT, env=self._environment, start_new_session=True,
@@ -88,7 +88,7 @@ class Collection:
     def label(self) -> str:
         """Run the next command; returns its messages."""
         done = subprocess.run(
-            [sys.executable, "-m", "flows", "label", str(self.store)],
+            [sys.executable, "-m", "sliplab", "label", str(self.store)],
             cwd=ROOT, env=self._environment, text=True, capture_output=True, timeout=120,
             check=True,
         )  # fmt: skip

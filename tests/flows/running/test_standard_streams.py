@@ -13,8 +13,8 @@ from typing import TextIO
 
 import pytest
 
-from flows.running import standard_streams
-from flows.running.standard_streams import OutputLost
+from sliplab.flows.running import standard_streams
+from sliplab.flows.running.standard_streams import OutputLost
 from tests.conftest import ROOT
 
 PIPE_BYTES = 4096
@@ -57,7 +57,7 @@ def test_each_stream_may_be_closed_or_full(line: str, code: int, said: str) -> N
 def test_a_closed_stream_is_no_file_of_ours() -> None:
     """The next file that is opened has a number of its own, so nothing can be printed into it."""
     line = (
-        "import os; from flows.running.standard_streams import guarded\n"
+        "import os; from sliplab.flows.running.standard_streams import guarded\n"
         "with guarded(): assert os.open('/dev/null', os.O_RDONLY) > 2"
     )
     done = shell(f'{sys.executable} -c "{line}" <&- >&- 2>&-')
@@ -133,7 +133,7 @@ def test_streams_of_a_test_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_a_file_name_that_is_no_text_can_be_printed() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "flows", "plan", b"no\xffname.yaml", "--json"],
+        [sys.executable, "-m", "sliplab", "plan", b"no\xffname.yaml", "--json"],
         cwd=ROOT, capture_output=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 2

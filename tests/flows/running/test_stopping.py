@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.running import console, stopping
+from sliplab.flows.running import console, stopping
 
 
 def test_a_signal_interrupts_and_is_remembered() -> None:
@@ -87,7 +87,7 @@ import os
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from flows.running import stopping
+from sliplab.flows.running import stopping
 
 if __name__ == "__main__":
     with ProcessPoolExecutor(

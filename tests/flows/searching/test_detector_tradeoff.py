@@ -11,16 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.detect.detection import detect
-from analysis.detect.latency import score_trial, summarise_latency
-from analysis.detect.true_slip import true_slip
-from analysis.nets import dataset, training
-from flows.labelling.label import STEP, label_key
-from flows.running import stopping
-from flows.running.campaigns import Collected, collected
-from flows.searching.detector_tradeoff import NUMBERS, PAGE, TABLE, Search, detector_tradeoff
-from flows.searching.detector_tradeoff_data import Ask
-from flows.searching.detector_tradeoff_grid import (
+from sliplab.analysis.detect.detection import detect
+from sliplab.analysis.detect.latency import score_trial, summarise_latency
+from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.analysis.nets import dataset, training
+from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.running import stopping
+from sliplab.flows.running.campaigns import Collected, collected
+from sliplab.flows.searching.detector_tradeoff import (
+    NUMBERS,
+    PAGE,
+    TABLE,
+    Search,
+    detector_tradeoff,
+)
+from sliplab.flows.searching.detector_tradeoff_data import Ask
+from sliplab.flows.searching.detector_tradeoff_grid import (
     PAPER,
     Axes,
     Setting,
@@ -28,13 +34,19 @@ from flows.searching.detector_tradeoff_grid import (
     make_grid,
     strides,
 )
-from flows.searching.detector_tradeoff_rows import OBJECTIVES, RULES, mean, objective, short_list
-from flows.searching.detector_tradeoff_runs import PRECISIONS, trial_counts
-from protocols.errors import InputError
-from protocols.settings import Detection, Network, Windows
-from storage.derived import Derived
-from storage.errors import StoreError
-from storage.store import Store
+from sliplab.flows.searching.detector_tradeoff_rows import (
+    OBJECTIVES,
+    RULES,
+    mean,
+    objective,
+    short_list,
+)
+from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, trial_counts
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.settings import Detection, Network, Windows
+from sliplab.storage.derived import Derived
+from sliplab.storage.errors import StoreError
+from sliplab.storage.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.reviewable import Reviewable, label

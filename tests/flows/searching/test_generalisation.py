@@ -9,14 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.planning.orders import Order
-from flows.reporting.report_extras import extras
-from flows.running.campaigns import collected
-from flows.searching import generalisation
-from flows.searching.generalisation import Generalisation, Result, measure_generalisation, table
-from flows.study import Outcome
-from protocols.errors import InputError
-from storage.store import Store, StoreError
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting.report_extras import extras
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching import generalisation
+from sliplab.flows.searching.generalisation import (
+    Generalisation,
+    Result,
+    measure_generalisation,
+    table,
+)
+from sliplab.flows.study import Outcome
+from sliplab.protocols.errors import InputError
+from sliplab.storage.store import Store, StoreError
 from tests.command_line import here
 
 

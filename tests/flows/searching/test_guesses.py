@@ -9,17 +9,17 @@ from typing import Any
 
 import pytest
 
-from flows.planning.orders import Order
-from flows.reporting import guesses_section
-from flows.reporting.report import report
-from flows.running.campaigns import collected
-from flows.searching import guesses
-from flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
-from flows.searching.guesses import Guesses, Setting, measure_guesses
-from flows.study import Outcome
-from storage.derived import Derived
-from storage.files import read_json, write_json
-from storage.store import Store, StoreError
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting import guesses_section
+from sliplab.flows.reporting.report import report
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching import guesses
+from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
+from sliplab.flows.searching.guesses import Guesses, Setting, measure_guesses
+from sliplab.flows.study import Outcome
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import Store, StoreError
 from tests.command_line import here
 
 Json = dict[str, Any]

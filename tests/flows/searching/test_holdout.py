@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from flows.labelling.label import label
-from flows.learning.evaluate import evaluation_of
-from flows.planning.orders import Order
-from flows.reporting import holdout_section
-from flows.reporting.report import read_summary, report
-from flows.running.campaigns import collected
-from flows.searching import generalisation, holdout
-from flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
-from flows.study import Outcome
-from storage.files import read_json, write_json
-from storage.store import Store, StoreError
+from sliplab.flows.labelling.label import label
+from sliplab.flows.learning.evaluate import evaluation_of
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.reporting import holdout_section
+from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching import generalisation, holdout
+from sliplab.flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
+from sliplab.flows.study import Outcome
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.store import Store, StoreError
 from tests.conftest import ROOT
 
 SEEDS = (5, 6)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flows.planning.orders import Order
-from flows.running.campaigns import collected
-from flows.searching.other_rig import other_order
-from flows.study import Outcome
-from storage.store import Store
+from sliplab.flows.planning.orders import Order
+from sliplab.flows.running.campaigns import collected
+from sliplab.flows.searching.other_rig import other_order
+from sliplab.flows.study import Outcome
+from sliplab.storage.store import Store
 
 
 def test_only_what_is_asked_for_differs(ran: tuple[list[Order], Outcome], tmp_path: Path) -> None:

@@ -10,13 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.running import stopping
-from flows.searching import sensitivity, tradeoff
-from flows.searching.scene_runs import Variant, changed, closed_form, ideal, run, sample_trials
-from flows.searching.tradeoff_page import render, sensitivity_markdown
-from protocols.errors import InputError
-from protocols.plan import load_plan
-from rigs.rig_file import load_rig_file
+from sliplab.flows.running import stopping
+from sliplab.flows.searching import sensitivity, tradeoff
+from sliplab.flows.searching.scene_runs import (
+    Variant,
+    changed,
+    closed_form,
+    ideal,
+    run,
+    sample_trials,
+)
+from sliplab.flows.searching.tradeoff_page import render, sensitivity_markdown
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.rig_file import load_rig_file
 from tests.flows.conftest import tiny, tiny_gravity, write
 
 

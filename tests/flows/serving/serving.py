@@ -111,7 +111,7 @@ def serving(
     Args:
         server: address and password of a Prefect server; None for the service's own.
     """
-    command = [sys.executable, "-m", "flows", "serve", "--store", str(store), "--rig", str(rig)]
+    command = [sys.executable, "-m", "sliplab", "serve", "--store", str(store), "--rig", str(rig)]
     command += [] if schedules is None else [str(schedules)]
     environment = {key: value for key, value in os.environ.items() if key != "PREFECT_HOME"}
     if server is None:

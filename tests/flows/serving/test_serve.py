@@ -16,21 +16,21 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.collecting import showing
-from flows.collecting.stops import WindowOver
-from flows.planning.orders import make_order
-from flows.running import orchestration, run_records
-from flows.running.embedded_server import EmbeddedServer
-from flows.serving import serve, serve_runs
-from flows.serving.serve_file import Scheduled
-from flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
-from flows.serving.serve_runs import until_of
-from flows.serving.service import Service
-from protocols import InputError
-from storage.derived import Derived
-from storage.files import read_json, write_json
-from storage.lock import Locked, exclusive
-from storage.store import Store
+from sliplab.flows.collecting import showing
+from sliplab.flows.collecting.stops import WindowOver
+from sliplab.flows.planning.orders import make_order
+from sliplab.flows.running import orchestration, run_records
+from sliplab.flows.running.embedded_server import EmbeddedServer
+from sliplab.flows.serving import serve, serve_runs
+from sliplab.flows.serving.serve_file import Scheduled
+from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
+from sliplab.flows.serving.serve_runs import until_of
+from sliplab.flows.serving.service import Service
+from sliplab.protocols import InputError
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import read_json, write_json
+from sliplab.storage.lock import Locked, exclusive
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.serving.serving import Page
@@ -77,7 +77,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
 ) -> None:
     from prefect.client.orchestration import get_client
 
-    from flows.serving.serve_flows import collect
+    from sliplab.flows.serving.serve_flows import collect
 
     with get_client(sync_client=True) as client:
         showing.sign_rig(client, "rehearsal", True)  # as a killed program left it
@@ -98,7 +98,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
 
 
 def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> None:
-    from flows.serving.serve_flows import chain, collect, pause, resume
+    from sliplab.flows.serving.serve_flows import chain, collect, pause, resume
 
     state = collect(Collect(protocol=protocol.with_name("none.yaml")), return_state=True)
     assert state.type.value == "FAILED"
@@ -159,7 +159,7 @@ def test_nothing_is_quoted_of_what_is_no_protocol(
 
 
 def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protocol: Path) -> None:
-    from flows.serving.serve_flows import collect
+    from sliplab.flows.serving.serve_flows import collect
 
     with ExitStack() as stack:
         stack.enter_context(exclusive(service.folder / ".lock", "the store"))
@@ -208,7 +208,7 @@ def test_runs_of_killed_processes_are_closed_at_the_next_start(
     from prefect.client.orchestration import get_client
     from prefect.states import Completed, Running
 
-    from flows.serving.serve_flows import label
+    from sliplab.flows.serving.serve_flows import label
 
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -244,7 +244,7 @@ def test_a_servers_name_has_no_secrets() -> None:
 def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     service: Service, server: EmbeddedServer, tmp_path: Path
 ) -> None:
-    from flows.serving.serve_flows import collect
+    from sliplab.flows.serving.serve_flows import collect
 
     when = serve._prefects(
         [
@@ -296,7 +296,7 @@ def test_what_a_killed_service_had_taken_is_closed(
     from prefect.client.orchestration import get_client
     from prefect.states import Pending
 
-    from flows.serving.serve_flows import label
+    from sliplab.flows.serving.serve_flows import label
 
     async def register() -> None:
         await (await label.ato_deployment("stranded")).aapply()

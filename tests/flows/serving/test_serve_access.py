@@ -18,9 +18,9 @@ from urllib.request import urlopen
 
 import pytest
 
-from flows.serving import serve
-from protocols import InputError
-from storage.store import Store
+from sliplab.flows.serving import serve
+from sliplab.protocols import InputError
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.flows.serving.serving import Page, serving, until
 

@@ -13,9 +13,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.serving.serve_file import load_schedules
-from flows.serving.serve_windows import DAYS, window_end
-from protocols import InputError
+from sliplab.flows.serving.serve_file import load_schedules
+from sliplab.flows.serving.serve_windows import DAYS, window_end
+from sliplab.protocols import InputError
 from tests.conftest import ROOT
 
 ROME = "Europe/Rome"

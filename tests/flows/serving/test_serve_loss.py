@@ -23,7 +23,7 @@ def server_of(home: Path) -> int:
             words = path.read_text().split("\0")
         except OSError:  # it has ended meanwhile
             continue
-        if "flows.running.embedded_server" in words and str(home) in words:
+        if "sliplab.flows.running.embedded_server" in words and str(home) in words:
             return int(path.parent.name)
     raise AssertionError("there is no server")
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flows.running.embedded_server import EmbeddedServer
-from storage import control
-from storage.files import read_json
-from storage.store import Store
+from sliplab.flows.running.embedded_server import EmbeddedServer
+from sliplab.storage import control
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.serving.serving import LIMIT_S, Page, serving, until

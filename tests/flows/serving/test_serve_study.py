@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from flows.cli.chain import LABELS_CHECKED, shipped
-from flows.planning.orders import make_order
-from flows.serving import serve_flows
-from flows.serving.serve_parameters import Study
-from flows.study import Outcome
+from sliplab.flows.cli.chain import LABELS_CHECKED, shipped
+from sliplab.flows.planning.orders import make_order
+from sliplab.flows.serving import serve_flows
+from sliplab.flows.serving.serve_parameters import Study
+from sliplab.flows.study import Outcome
 from tests.conftest import ROOT
 
 
@@ -35,7 +35,7 @@ def test_a_served_study_asks_for_the_same_trials(
         asked.extend([orders, check])
         return Outcome([{"taken": 3}], [{"step": "report", "done": 1}])
 
-    monkeypatch.setattr("flows.study.study", study)
+    monkeypatch.setattr("sliplab.flows.study.study", study)
     monkeypatch.setattr(serve_flows, "when_free", lambda _order, _patience, work, _run: work())
     here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
     said = serve_flows._study(Study(extra=extra), here, None)

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.timeline import synchronise
-from flows.__main__ import main
-from flows.collecting.collect import collect
-from flows.labelling.label import label
-from flows.planning.orders import make_order
-from flows.reporting.summary import _sync as sync_summary
-from flows.running.campaigns import Collected, collected
-from flows.syncing.sync import sync
-from flows.syncing.sync_fit import fit_again, same_clocks
-from storage.catalogue import catalogue
-from storage.derived import Derived
-from storage.files import read_json, sha256, write_json
-from storage.recording import Recording
-from storage.store import Store
-from storage.writer import CHECKSUMS, RECORD
+from sliplab.analysis.timeline import synchronise
+from sliplab.flows.__main__ import main
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.planning.orders import make_order
+from sliplab.flows.reporting.summary import _sync as sync_summary
+from sliplab.flows.running.campaigns import Collected, collected
+from sliplab.flows.syncing.sync import sync
+from sliplab.flows.syncing.sync_fit import fit_again, same_clocks
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import read_json, sha256, write_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
+from sliplab.storage.writer import CHECKSUMS, RECORD
 from tests.flows.conftest import tiny, write
 
 SHIFT_NS = 3_000_000

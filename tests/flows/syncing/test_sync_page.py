@@ -10,15 +10,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from analysis.pictures.sync_figures import pooled
-from flows.reporting import clock_words
-from flows.running.campaigns import Collected
-from flows.syncing.sync_page import render
-from flows.syncing.sync_trials import DeviceClocks, TrialClocks
-from storage.derived import Derived
-from storage.files import write_json
-from storage.store import Campaign
-from storage.writer import RECORD
+from sliplab.analysis.pictures.sync_figures import pooled
+from sliplab.flows.reporting import clock_words
+from sliplab.flows.running.campaigns import Collected
+from sliplab.flows.syncing.sync_page import render
+from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
+from sliplab.storage.derived import Derived
+from sliplab.storage.files import write_json
+from sliplab.storage.store import Campaign
+from sliplab.storage.writer import RECORD
 
 
 @dataclass(frozen=True)

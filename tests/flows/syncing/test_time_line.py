@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.labels.labelling import label_recording
-from analysis.timeline.synchronise import synchronise_recording
-from protocols.settings import Labelling
-from storage.clockmap import ClockMap
-from storage.recording import Recording
+from sliplab.analysis.labels.labelling import label_recording
+from sliplab.analysis.timeline.synchronise import synchronise_recording
+from sliplab.protocols.settings import Labelling
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.recording import Recording
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import tiny
 

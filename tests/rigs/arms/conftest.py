@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
-from rigs.arms.abb import AbbArm
-from rigs.arms.pose import distance_mm, quaternion
-from rigs.arms.settings import AbbSettings, UrSettings
-from rigs.arms.ur import UrArm
-from rigs.capabilities import Arm, ArmFault, Pose
-from rigs.wire.abb_rws import AbbStandIn
-from rigs.wire.ur import UrStandIn
+from sliplab.rigs.arms.abb import AbbArm
+from sliplab.rigs.arms.pose import distance_mm, quaternion
+from sliplab.rigs.arms.settings import AbbSettings, UrSettings
+from sliplab.rigs.arms.ur import UrArm
+from sliplab.rigs.capabilities import Arm, ArmFault, Pose
+from sliplab.rigs.wire.abb_rws import AbbStandIn
+from sliplab.rigs.wire.ur import UrStandIn
 from tests.rigs.loopback import own_address, until
 
 MakeRobot = Callable[..., UrStandIn]

@@ -9,15 +9,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rigs.arms import abb as driver
-from rigs.arms import build_arm
-from rigs.arms.abb import AbbArm
-from rigs.arms.abb_rws import REQUEST_S, START_REQUESTS
-from rigs.arms.guard import WorkspaceError
-from rigs.arms.pose import distance_mm
-from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from rigs.wire.abb_rws import HOME
-from rigs.wire.faults import Fault, Kind, Stage
+from sliplab.rigs.arms import abb as driver
+from sliplab.rigs.arms import build_arm
+from sliplab.rigs.arms.abb import AbbArm
+from sliplab.rigs.arms.abb_rws import REQUEST_S, START_REQUESTS
+from sliplab.rigs.arms.guard import WorkspaceError
+from sliplab.rigs.arms.pose import distance_mm
+from sliplab.rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.wire.abb_rws import HOME
+from sliplab.rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.arms.conftest import EGM_PORT, MakeAbb, abb_settings
 from tests.rigs.loopback import own_address, until
 

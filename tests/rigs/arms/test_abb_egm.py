@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
-from rigs.arms.abb_egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
-from rigs.capabilities import Pose
+from sliplab.rigs.arms.abb_egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
+from sliplab.rigs.capabilities import Pose
 from tests.rigs.arms.conftest import egm_message
 from tests.rigs.loopback import own_address
 

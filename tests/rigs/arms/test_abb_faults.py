@@ -10,13 +10,13 @@ from collections.abc import Callable
 import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
-from rigs.arms import abb as driver
-from rigs.arms.abb import AbbArm
-from rigs.arms.abb_rws import REQUEST_S, WebRefused, WebServices
-from rigs.arms.pose import distance_mm
-from rigs.capabilities import ArmFault, ArmState, Pose, Segment
-from rigs.wire.abb_rws import HOME, AbbStandIn
-from rigs.wire.faults import PACKETS_LOST, Kind
+from sliplab.rigs.arms import abb as driver
+from sliplab.rigs.arms.abb import AbbArm
+from sliplab.rigs.arms.abb_rws import REQUEST_S, WebRefused, WebServices
+from sliplab.rigs.arms.pose import distance_mm
+from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, Segment
+from sliplab.rigs.wire.abb_rws import HOME, AbbStandIn
+from sliplab.rigs.wire.faults import PACKETS_LOST, Kind
 from tests.rigs.arms.conftest import EGM_PORT, MakeAbb, abb_settings, egm_message, mm_after_kill
 from tests.rigs.loopback import own_address, until
 
@@ -128,9 +128,9 @@ def test_poses_alone_can_show_that_the_controller_has_stopped_it(abb_pair: MakeA
 
 KILLED = """
 import sys, threading
-from rigs.arms.abb import AbbArm
-from rigs.arms.settings import AbbSettings
-from rigs.capabilities import Pose, Segment
+from sliplab.rigs.arms.abb import AbbArm
+from sliplab.rigs.arms.settings import AbbSettings
+from sliplab.rigs.capabilities import Pose, Segment
 arm = AbbArm(AbbSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 90.0, 300.0), (180.0, 0.0, 0.0)), 40.0)])

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.arms import abb_socket as driver
-from rigs.arms import build_arm
-from rigs.arms.abb_socket import AbbSocketArm
-from rigs.arms.guard import SpeedError
-from rigs.arms.pose import distance_mm
-from rigs.arms.rapid_socket import Command, RapidError, RapidSocket
-from rigs.arms.settings import AbbSocketSettings
-from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from rigs.wire.abb_socket import HOME, RapidStandIn
-from rigs.wire.faults import Fault, Kind, Stage
+from sliplab.rigs.arms import abb_socket as driver
+from sliplab.rigs.arms import build_arm
+from sliplab.rigs.arms.abb_socket import AbbSocketArm
+from sliplab.rigs.arms.guard import SpeedError
+from sliplab.rigs.arms.pose import distance_mm
+from sliplab.rigs.arms.rapid_socket import Command, RapidError, RapidSocket
+from sliplab.rigs.arms.settings import AbbSocketSettings
+from sliplab.rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.wire.abb_socket import HOME, RapidStandIn
+from sliplab.rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.arms.conftest import closed, mm_after_kill
 from tests.rigs.loopback import own_address, until
 
@@ -191,9 +191,9 @@ def test_a_stop_that_nobody_can_confirm_is_a_fault(
 
 KILLED = """
 import sys, threading
-from rigs.arms.abb_socket import AbbSocketArm
-from rigs.arms.settings import AbbSocketSettings
-from rigs.capabilities import Pose, Segment
+from sliplab.rigs.arms.abb_socket import AbbSocketArm
+from sliplab.rigs.arms.settings import AbbSocketSettings
+from sliplab.rigs.capabilities import Pose, Segment
 arm = AbbSocketArm(AbbSocketSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 90.0, 300.0), (180.0, 0.0, 0.0)), 40.0)])

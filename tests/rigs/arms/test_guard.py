@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from rigs.arms.guard import (
+from sliplab.rigs.arms.guard import (
     DepthError,
     Guard,
     GuardError,
@@ -16,8 +16,8 @@ from rigs.arms.guard import (
     TiltError,
     WorkspaceError,
 )
-from rigs.arms.settings import Limits
-from rigs.capabilities import Pose, RigError, Segment
+from sliplab.rigs.arms.settings import Limits
+from sliplab.rigs.capabilities import Pose, RigError, Segment
 
 DOWN = (180.0, 0.0, 0.0)
 BEGIN = Pose((400.0, 0.0, 300.0), DOWN)

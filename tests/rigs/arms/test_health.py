@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from rigs.arms.abb import AbbArm
-from rigs.arms.abb_socket import AbbSocketArm
-from rigs.arms.settings import AbbSettings, AbbSocketSettings
-from rigs.capabilities import ArmFault, DeviceHealth
-from rigs.wire.abb_rws import AbbStandIn
-from rigs.wire.abb_socket import INFO, RapidStandIn
-from rigs.wire.faults import Kind
-from rigs.wire.ur import VERSION
+from sliplab.rigs.arms.abb import AbbArm
+from sliplab.rigs.arms.abb_socket import AbbSocketArm
+from sliplab.rigs.arms.settings import AbbSettings, AbbSocketSettings
+from sliplab.rigs.capabilities import ArmFault, DeviceHealth
+from sliplab.rigs.wire.abb_rws import AbbStandIn
+from sliplab.rigs.wire.abb_socket import INFO, RapidStandIn
+from sliplab.rigs.wire.faults import Kind
+from sliplab.rigs.wire.ur import VERSION
 from tests.rigs.arms.conftest import MakeArm, MakeRobot
 from tests.rigs.loopback import own_address
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigs.arms.pose import (
+from sliplab.rigs.arms.pose import (
     angle_deg,
     between,
     distance_mm,
@@ -19,7 +19,7 @@ from rigs.arms.pose import (
     short_rotvec_deg,
     to_ur,
 )
-from rigs.capabilities import Pose
+from sliplab.rigs.capabilities import Pose
 
 COORDINATE = st.floats(-2000, 2000)
 TURN = st.floats(-100, 100)

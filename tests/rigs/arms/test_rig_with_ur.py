@@ -9,10 +9,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rigs.capabilities import ArmFault, ArmState, EventCamera, FrameCamera, Operator, SyncBox
-from rigs.plate_frame import PlateFrame
-from rigs.rig import Rig
-from rigs.wire.faults import Fault, Kind, Stage
+from sliplab.rigs.capabilities import (
+    ArmFault,
+    ArmState,
+    EventCamera,
+    FrameCamera,
+    Operator,
+    SyncBox,
+)
+from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.rig import Rig
+from sliplab.rigs.wire.faults import Fault, Kind, Stage
 from tests.rigs.arms.conftest import MakeArm, MakeRobot
 from tests.rigs.loopback import until
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from rigs.arms.rtde import (
+from sliplab.rigs.arms.rtde import (
     DATA,
     GET_VERSION,
     HEADER,

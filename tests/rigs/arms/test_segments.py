@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rigs.arms.segments import SegmentWatch
-from rigs.capabilities import Pose, Segment
-from rigs.wire.motion import StraightMotion
+from sliplab.rigs.arms.segments import SegmentWatch
+from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.wire.motion import StraightMotion
 
 A = Pose((0.0, 0.0, 0.0), (180.0, 0.0, 0.0))
 PERIOD_S = 0.004

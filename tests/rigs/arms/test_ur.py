@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rigs.arms import build_arm
-from rigs.arms.guard import SingularityError, SpeedError, WorkspaceError
-from rigs.arms.ur import UrArm
-from rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from rigs.wire.faults import Fault, Kind, Stage
-from rigs.wire.ur import HOME
-from storage.streams import PoseChunk
+from sliplab.rigs.arms import build_arm
+from sliplab.rigs.arms.guard import SingularityError, SpeedError, WorkspaceError
+from sliplab.rigs.arms.ur import UrArm
+from sliplab.rigs.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.wire.faults import Fault, Kind, Stage
+from sliplab.rigs.wire.ur import HOME
+from sliplab.storage.streams import PoseChunk
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import own_address, until
 

@@ -18,16 +18,16 @@ from collections.abc import Callable
 
 import pytest
 
-from rigs.arms import ur as driver
-from rigs.arms import ur_control, ur_ports
-from rigs.arms.pose import distance_mm
-from rigs.arms.rtde import HEADER, SETUP_INPUTS
-from rigs.arms.rtde import PORT as RTDE_PORT
-from rigs.arms.ur import UrArm
-from rigs.arms.ur_control import ControlError, ControlProcess
-from rigs.capabilities import ArmFault, ArmState, Pose, Segment
-from rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
-from rigs.wire.ur import HOME
+from sliplab.rigs.arms import ur as driver
+from sliplab.rigs.arms import ur_control, ur_ports
+from sliplab.rigs.arms.pose import distance_mm
+from sliplab.rigs.arms.rtde import HEADER, SETUP_INPUTS
+from sliplab.rigs.arms.rtde import PORT as RTDE_PORT
+from sliplab.rigs.arms.ur import UrArm
+from sliplab.rigs.arms.ur_control import ControlError, ControlProcess
+from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, Segment
+from sliplab.rigs.wire.faults import PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.wire.ur import HOME
 from tests.rigs.arms.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.loopback import own_address, until
 
@@ -399,9 +399,9 @@ def _flood(door: socket.socket) -> None:
 
 DRIVES = """
 import sys
-from rigs.arms.settings import UrSettings
-from rigs.arms.ur import UrArm
-from rigs.capabilities import Pose, Segment
+from sliplab.rigs.arms.settings import UrSettings
+from sliplab.rigs.arms.ur import UrArm
+from sliplab.rigs.capabilities import Pose, Segment
 arm = UrArm(UrSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 95.0, 300.0), (180.0, 0.0, 0.0)), 20.0)])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rigs.wire.basler import emulate
+from sliplab.rigs.wire.basler import emulate
 
 LIMIT_S, LOOK_S = 60.0, 0.002
 

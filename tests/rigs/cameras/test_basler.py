@@ -10,11 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.cameras.basler import BaslerCamera, find_camera
-from rigs.cameras.settings import BaslerSettings
-from rigs.capabilities import FrameCamera, RigError
-from rigs.wire.basler import LossyDevice, fail_buffers, scene_frames, show, unplug, write_frames
-from storage.streams import FrameChunk
+from sliplab.rigs.cameras.basler import BaslerCamera, find_camera
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.capabilities import FrameCamera, RigError
+from sliplab.rigs.wire.basler import (
+    LossyDevice,
+    fail_buffers,
+    scene_frames,
+    show,
+    unplug,
+    write_frames,
+)
+from sliplab.storage.streams import FrameChunk
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]

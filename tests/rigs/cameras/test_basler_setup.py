@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from rigs.cameras.basler import BaslerCamera, find_camera
-from rigs.cameras.nodes import Nodes
-from rigs.cameras.settings import BaslerSettings
-from rigs.capabilities import RigError
-from rigs.wire.live_basler import LiveBasler
+from sliplab.rigs.cameras.basler import BaslerCamera, find_camera
+from sliplab.rigs.cameras.nodes import Nodes
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.wire.live_basler import LiveBasler
 from tests.rigs.wire.test_live_basler import FakeScene
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
@@ -222,8 +222,8 @@ def test_a_value_that_a_setting_does_not_have_is_named_with_those_that_it_has() 
 
 def test_of_several_cameras_one_must_be_named() -> None:
     code = (
-        "from rigs.wire.basler import emulate; emulate(2); "
-        "from rigs.cameras.basler import look_for_camera; "
+        "from sliplab.rigs.wire.basler import emulate; emulate(2); "
+        "from sliplab.rigs.cameras.basler import look_for_camera; "
         "print(look_for_camera('0815-0001').GetSerialNumber()); look_for_camera(None)"
     )
     done = subprocess.run(

@@ -13,12 +13,12 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
-from rigs.cameras.dvxplorer import DvxplorerCamera
-from rigs.cameras.event_source import EventSource, check_taken, configure, in_force
-from rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
-from rigs.capabilities import EventCamera, RigError
-from rigs.wire.dvxplorer import DvxplorerServer, Sent, arrays, scene
-from storage.streams import I64, EventChunk
+from sliplab.rigs.cameras.dvxplorer import DvxplorerCamera
+from sliplab.rigs.cameras.event_source import EventSource, check_taken, configure, in_force
+from sliplab.rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
+from sliplab.rigs.capabilities import EventCamera, RigError
+from sliplab.rigs.wire.dvxplorer import DvxplorerServer, Sent, arrays, scene
+from sliplab.storage.streams import I64, EventChunk
 
 pytestmark = pytest.mark.realtime
 

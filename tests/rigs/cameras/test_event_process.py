@@ -18,13 +18,13 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
-from rigs.cameras import event_process
-from rigs.cameras.dvxplorer import DvxplorerCamera
-from rigs.cameras.event_source import find_camera
-from rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
-from rigs.capabilities import RigError
-from rigs.wire.dv_stream import events_header, events_packet, triggers_header
-from storage.streams import EventChunk
+from sliplab.rigs.cameras import event_process
+from sliplab.rigs.cameras.dvxplorer import DvxplorerCamera
+from sliplab.rigs.cameras.event_source import find_camera
+from sliplab.rigs.cameras.settings import DvxplorerSettings, NetworkStream, UsbCamera
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.wire.dv_stream import events_header, events_packet, triggers_header
+from sliplab.storage.streams import EventChunk
 
 pytestmark = pytest.mark.realtime
 Until = Callable[[Callable[[], bool]], None]
@@ -115,8 +115,8 @@ def test_a_library_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_ctrl_c_ends_an_opening_at_once() -> None:
     code = (
-        "import signal, sys; from rigs.cameras.dvxplorer import DvxplorerCamera; "
-        "from rigs.cameras.settings import DvxplorerSettings; "
+        "import signal, sys; from sliplab.rigs.cameras.dvxplorer import DvxplorerCamera; "
+        "from sliplab.rigs.cameras.settings import DvxplorerSettings; "
         # a shell's background job ignores it
         "signal.signal(signal.SIGINT, signal.default_int_handler); print('opening', flush=True); "
         "DvxplorerCamera(DvxplorerSettings.model_validate_json(sys.argv[1]))"

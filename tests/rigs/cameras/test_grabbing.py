@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.cameras.grabbing import NO_ID, Grab, GrabSettings
-from rigs.cameras.stamps import Stamping
-from rigs.capabilities import RigError
+from sliplab.rigs.cameras.grabbing import NO_ID, Grab, GrabSettings
+from sliplab.rigs.cameras.stamps import Stamping
+from sliplab.rigs.capabilities import RigError
 
 pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
 Until = Callable[[Callable[[], bool]], None]
@@ -171,7 +171,7 @@ def test_a_full_queue_waits_for_its_reader_and_loses_nothing(until: Until) -> No
 
 
 def test_a_pylon_that_hangs_is_an_error(until: Until, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rigs.cameras.grabbing.HANG_S", 0.3)
+    monkeypatch.setattr("sliplab.rigs.cameras.grabbing.HANG_S", 0.3)
     go = threading.Event()
     device = Device()
     monkeypatch.setattr(device, "RetrieveResult", lambda *_: go.wait(60.0) and None)

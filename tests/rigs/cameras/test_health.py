@@ -12,13 +12,13 @@ import dv_processing as dv
 import numpy as np
 import pytest
 
-from rigs.cameras import build_event_camera, build_frame_camera
-from rigs.cameras.event_source import EventSource
-from rigs.cameras.settings import BaslerSettings, DvxplorerSettings
-from rigs.capabilities import DeviceHealth, EventCamera, FrameCamera, RigError
-from rigs.wire.basler import unplug
-from rigs.wire.dvxplorer import DvxplorerServer, arrays
-from storage.streams import EventChunk
+from sliplab.rigs.cameras import build_event_camera, build_frame_camera
+from sliplab.rigs.cameras.event_source import EventSource
+from sliplab.rigs.cameras.settings import BaslerSettings, DvxplorerSettings
+from sliplab.rigs.capabilities import DeviceHealth, EventCamera, FrameCamera, RigError
+from sliplab.rigs.wire.basler import unplug
+from sliplab.rigs.wire.dvxplorer import DvxplorerServer, arrays
+from sliplab.storage.streams import EventChunk
 
 pytestmark = pytest.mark.realtime
 FREE = BaslerSettings(px_per_mm=20.0, trigger="free run", exposure_line="Line2")
@@ -118,7 +118,7 @@ def test_a_thermometer_is_read_where_there_is_one(monkeypatch: pytest.MonkeyPatc
 
 def test_neither_library_is_loaded_before_a_camera_is_opened() -> None:
     code = (
-        "import sys, rigs.cameras, rigs.cameras.settings, rigs.cameras.health; "
+        "import sys, sliplab.rigs.cameras.settings, sliplab.rigs.cameras.health; "
         "sys.exit('pypylon' in sys.modules or 'dv_processing' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

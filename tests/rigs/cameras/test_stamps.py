@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rigs.cameras.settings import FrameTrigger
-from rigs.cameras.stamps import Abilities, Stamping, choose
+from sliplab.rigs.cameras.settings import FrameTrigger
+from sliplab.rigs.cameras.stamps import Abilities, Stamping, choose
 
 ALL = Abilities(
     chunk=True, result=True, event=True, latch=True, sync_level=True, exposure_line=True

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rigs.capabilities import Segment
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import FrameCamera as FrameSettings
-from rigs.mock.settings import MockSettings
+from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
+from sliplab.rigs.mock.settings import MockSettings
 
 SMALL = MockSettings(frame_camera=FrameSettings(width=640, height=640, px_per_mm=4.0))
 CODE = 4321

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from protocols.timing import Timing
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import Arm, Clocks, FrameCamera, MockSettings
-from storage.streams import FrameChunk, PoseChunk
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import Arm, Clocks, FrameCamera, MockSettings
+from sliplab.storage.streams import FrameChunk, PoseChunk
 
 CODE = 4321
 

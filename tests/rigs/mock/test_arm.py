@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rigs.capabilities import ArmFault, ArmState, RigError, Segment
-from rigs.mock.devices import build_mock
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError, Segment
+from sliplab.rigs.mock.devices import build_mock
 from tests.rigs.mock.driving import SMALL
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.mock.devices import MockDevices
-from storage.streams import ClockReads
+from sliplab.rigs.mock.devices import MockDevices
+from sliplab.storage.streams import ClockReads
 from tests.rigs.mock.standing import CODE, rig
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigs.mock.devices import build_mock
+from sliplab.rigs.mock.devices import build_mock
 from tests.rigs.mock.driving import SMALL, Trial, gravity, same, slide, with_faults
 
 

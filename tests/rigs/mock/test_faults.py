@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from protocols import InputError
-from protocols.yaml_file import parse_yaml, validate
-from rigs.capabilities import ArmFault, ArmState, RigError
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.fault_settings import KINDS
-from rigs.rig_file import RigFile
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.fault_settings import KINDS
+from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 from tests.rigs.mock.driving import SMALL, Trial, go, gravity, same, slide, with_faults
 
@@ -268,7 +268,7 @@ def test_a_wrong_fault_is_said_as_any_wrong_input(fault: Any, key: str, said: st
 def test_every_kind_is_documented_with_its_parameters() -> None:
     from typing import get_args
 
-    from rigs.mock.fault_settings import AnyFault
+    from sliplab.rigs.mock.fault_settings import AnyFault
 
     text = Path(ROOT / "docs" / "faults.md").read_text().split("## Once each")[0]
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}

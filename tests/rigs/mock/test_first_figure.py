@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rigs.capabilities import Segment
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import MockSettings
+from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import MockSettings
 
 QUIET = {"noise_hz": 0.0, "hot_pixels": 0, "readout_hz": 0}
 CORNERS = [(2.4, 0.6, 0), (2.4, 1.6, 225), (3.4, 1.6, 90), (2.8, 1.0, 315), (3.4, 0.8, 180)]

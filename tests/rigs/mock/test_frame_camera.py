@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.labels.plate import track_video
-from rigs.capabilities import Segment
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.mock.settings import FrameCamera, MockSettings
-from rigs.scene.frames import FrameOptics, PlateView
-from storage.streams import FrameChunk
+from sliplab.analysis.labels.plate import track_video
+from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.mock.settings import FrameCamera, MockSettings
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.storage.streams import FrameChunk
 
 SIZE = 832
 

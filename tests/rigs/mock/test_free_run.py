@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigs.mock.free_run import FreeRun
-from rigs.mock.settings import Clocks, FrameCamera, MockSettings
-from rigs.mock.world import World
+from sliplab.rigs.mock.free_run import FreeRun
+from sliplab.rigs.mock.settings import Clocks, FrameCamera, MockSettings
+from sliplab.rigs.mock.world import World
 
 CASES: tuple[list[dict[str, Any]], ...] = (
     [],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigs.mock.history import History
+from sliplab.rigs.mock.history import History
 
 
 def filled(times: list[int]) -> History:

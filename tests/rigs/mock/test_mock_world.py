@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rigs.capabilities import Arm, Clock, EventCamera, FrameCamera, Operator, Plate, SyncBox
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.pulse_code import code_bits
-from storage.clockmap import ClockMap
+from sliplab.rigs.capabilities import Arm, Clock, EventCamera, FrameCamera, Operator, Plate, SyncBox
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.pulse_code import code_bits
+from sliplab.storage.clockmap import ClockMap
 from tests.rigs.mock.driving import CODE, SMALL, Trial, same, slide
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.holds import run
-from protocols import Plan, Trial
-from protocols.plan import load_plan
-from rigs.mock.devices import MockDevices, build_mock
-from rigs.rig_file import load_rig_file
+from sliplab.protocols import Plan, Trial
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.mock.devices import MockDevices, build_mock
+from sliplab.rigs.rig_file import load_rig_file
 from tests.conftest import ROOT
 from tests.rigs.mock.driving import SMALL, gravity
 

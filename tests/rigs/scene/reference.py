@@ -18,8 +18,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from rigs.scene.friction import KNOT_MM
-from rigs.scene.springs import NORMAL_BRANCH, Springs, Tips
+from sliplab.rigs.scene.friction import KNOT_MM
+from sliplab.rigs.scene.springs import NORMAL_BRANCH, Springs, Tips
 
 RTOL, ATOL = 1e-11, 1e-13
 

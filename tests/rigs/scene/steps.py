@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from rigs.scene.contact import advance
-from rigs.scene.friction import friction_knots
-from rigs.scene.plate import advance_free
-from rigs.scene.skin import Skin, SkinGeometry, make_skin
-from rigs.scene.springs import Springs, Tips, make_springs, new_tips, track_width
+from sliplab.rigs.scene.contact import advance
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.plate import advance_free
+from sliplab.rigs.scene.skin import Skin, SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import Springs, Tips, make_springs, new_tips, track_width
 
 MU = 0.85
 H = 1e-3

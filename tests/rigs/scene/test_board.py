@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rigs.scene.board import VIEWS, BoardCamera, BoardPlace, BoardPrint, charuco, draw_board
-from rigs.scene.lens import Lens
+from sliplab.rigs.scene.board import VIEWS, BoardCamera, BoardPlace, BoardPrint, charuco, draw_board
+from sliplab.rigs.scene.lens import Lens
 
 
 @pytest.mark.parametrize(

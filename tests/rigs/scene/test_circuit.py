@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rigs.scene.circuit import ON, SEEN
-from rigs.scene.edges import CUT
-from rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.rigs.scene.circuit import ON, SEEN
+from sliplab.rigs.scene.edges import CUT
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 
 QUIET = {
     "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rigs.scene.friction import friction_knots, grip_at
-from rigs.scene.skin import SkinGeometry, make_skin
-from rigs.scene.springs import FREE, SLIDING, STUCK, make_springs, new_tips
+from sliplab.rigs.scene.friction import friction_knots, grip_at
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import FREE, SLIDING, STUCK, make_springs, new_tips
 from tests.rigs.scene.steps import (
     MU,
     at,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from rigs.scene.friction import friction_field, friction_knots, grip_at
-from rigs.scene.slides import run_slide
-from rigs.scene.springs import make_springs
+from sliplab.rigs.scene.friction import friction_field, friction_knots, grip_at
+from sliplab.rigs.scene.slides import run_slide
+from sliplab.rigs.scene.springs import make_springs
 from tests.rigs.scene.steps import MU, ideal_skin
 
 RICH = {"static_excess": 0.03, "relaxation_share": 0.2, "strengthening": 0.01}

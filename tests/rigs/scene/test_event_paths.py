@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from rigs.scene.edges import CUT
-from rigs.scene.events import EventOptics, Events, MarkerSensor
-from rigs.scene.marker_path import excursion, fit_blocks, inner_weights, slope_weights
+from sliplab.rigs.scene.edges import CUT
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.rigs.scene.marker_path import excursion, fit_blocks, inner_weights, slope_weights
 
 QUIET = {
     "noise_hz": 0.0, "hot_pixels": 0, "threshold_sigma": 0.0, "refractory_us": 0.0,

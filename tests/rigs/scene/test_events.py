@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigs.scene.edges import CUT, level_at, rim_of
-from rigs.scene.events import EventOptics, Events, MarkerSensor, _empty_lists
+from sliplab.rigs.scene.edges import CUT, level_at, rim_of
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor, _empty_lists
 
 STEP_NS = 1_000_000
 ONE = np.zeros((1, 2))

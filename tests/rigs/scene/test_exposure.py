@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from rigs.scene.exposure import Exposures, expose, moved
+from sliplab.rigs.scene.exposure import Exposures, expose, moved
 
 PX_PER_MM = 20.0
 EXPOSURE_NS = 2_000_000

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from analysis.labels.plate import PlateTracker
-from rigs.scene.exposure import Way
-from rigs.scene.frames import FrameOptics, PlateView
-from rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.analysis.labels.plate import PlateTracker
+from sliplab.rigs.scene.exposure import Way
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
 
 SKIN = make_skin(SkinGeometry(), 1)
 SIZE = 832

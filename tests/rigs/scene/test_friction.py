@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rigs.scene.friction import KNOT_MM, KNOTS, friction_field, friction_knots, grip_at
+from sliplab.rigs.scene.friction import KNOT_MM, KNOTS, friction_field, friction_knots, grip_at
 from tests.rigs.scene.steps import MU, ideal_skin
 
 

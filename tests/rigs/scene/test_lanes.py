@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from rigs.scene.column import relaxing
-from rigs.scene.friction import friction_knots
-from rigs.scene.lanes import respond, settle
-from rigs.scene.rows import DEEP, LANES, ROWS, TABLE, TO_X, TO_Y, block_of, gather, spread
-from rigs.scene.skin import SkinGeometry, make_skin
-from rigs.scene.springs import (
+from sliplab.rigs.scene.column import relaxing
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.lanes import respond, settle
+from sliplab.rigs.scene.rows import DEEP, LANES, ROWS, TABLE, TO_X, TO_Y, block_of, gather, spread
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import (
     FREE,
     GAP,
     LAYOUT_X,
@@ -24,7 +24,7 @@ from rigs.scene.springs import (
     make_springs,
     new_tips,
 )
-from rigs.scene.tip import tip_step
+from sliplab.rigs.scene.tip import tip_step
 from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
 
 SWITCHES = {

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rigs.scene.skin import SkinGeometry, make_skin
-from rigs.scene.springs import SLIDING, STUCK, make_springs, new_tips
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import SLIDING, STUCK, make_springs, new_tips
 from tests.rigs.scene.steps import MU, at, ideal_skin, line, places, pressed, run, slid, springs_of
 
 GEOMETRY = SkinGeometry()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rigs.scene.lens import Lens
+from sliplab.rigs.scene.lens import Lens
 
 PLACES = np.random.default_rng(3).uniform(-20.8, 20.8, (50, 2))
 TILT = st.floats(-20.0, 20.0)

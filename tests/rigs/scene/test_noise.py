@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rigs.scene.events import EventOptics, Events, MarkerSensor
-from rigs.scene.noise import (
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.rigs.scene.noise import (
     BIN_NS,
     BRIGHT_SHARE,
     NoiseRates,

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from rigs.scene.friction import friction_knots
-from rigs.scene.onsets import Material, retraction_onsets, slide_onsets
-from rigs.scene.skin import SkinGeometry, make_skin
-from rigs.scene.slides import run_slide
-from rigs.scene.springs import make_springs, new_tips
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.onsets import Material, retraction_onsets, slide_onsets
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.slides import run_slide
+from sliplab.rigs.scene.springs import make_springs, new_tips
 from tests.rigs.scene.steps import MU, H, fall, ideal_skin, line, run, slid
 
 MATERIAL = Material(MU, static_excess=0.03, relaxation_share=0.2, relaxation_s=1.0)

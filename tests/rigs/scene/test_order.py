@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rigs.scene.friction import friction_knots
-from rigs.scene.springs import make_springs
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.springs import make_springs
 from tests.rigs.scene.reference import Leg, follow, papilla, rows_of, straight_legs
 from tests.rigs.scene.steps import MU, ideal_skin, places, pressed, run
 

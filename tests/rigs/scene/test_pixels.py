@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from numba import njit
 from scipy.optimize import brentq
 
-from rigs.scene.crossings import events_of_piece
-from rigs.scene.edges import CUT, dark_pixels, rim_of, see_discs
-from rigs.scene.marker_path import bound_rates, fit_blocks, inner_weights, slope_weights
-from rigs.scene.pieces import BLOCK, FIELDS, R0, X0, Y0, ZERO, cut_block
-from rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
-from rigs.scene.pixels import events_of_pixels
-from rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
+from sliplab.rigs.scene.crossings import events_of_piece
+from sliplab.rigs.scene.edges import CUT, dark_pixels, rim_of, see_discs
+from sliplab.rigs.scene.marker_path import bound_rates, fit_blocks, inner_weights, slope_weights
+from sliplab.rigs.scene.pieces import BLOCK, FIELDS, R0, X0, Y0, ZERO, cut_block
+from sliplab.rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
+from sliplab.rigs.scene.pixels import events_of_pixels
+from sliplab.rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
 
 CONTRAST, EDGE, RADIUS = 2.08, 0.8, 8.0
 HEIGHT, WIDTH, STEPS = 40, 44, 8

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from rigs.scene.springs import SLIPPED, STUCK, Springs, Tips, new_tips
+from sliplab.rigs.scene.springs import SLIPPED, STUCK, Springs, Tips, new_tips
 from tests.rigs.scene.steps import MU, H, fall, ideal_skin, run, slid, times
 from tests.rigs.scene.steps import springs_of as skin_springs
 

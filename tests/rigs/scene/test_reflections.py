@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rigs.scene.frames import FrameOptics, PlateView
-from rigs.scene.reflections import Reflections, draw_reflections
+from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.reflections import Reflections, draw_reflections
 
 NOTHING = np.empty((2, 0, 2))
 

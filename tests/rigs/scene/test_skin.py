@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rigs.scene.skin import (
+from sliplab.rigs.scene.skin import (
     SkinGeometry,
     bending_stiffness,
     make_skin,

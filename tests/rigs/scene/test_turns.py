@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigs.scene.friction import friction_knots
-from rigs.scene.skin import SkinGeometry, make_skin
-from rigs.scene.springs import SLIDING, Springs, make_springs, new_tips
+from sliplab.rigs.scene.friction import friction_knots
+from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.springs import SLIDING, Springs, make_springs, new_tips
 from tests.rigs.scene.steps import MU, ideal_skin, line, pressed, run, springs_of
 
 LEVELS = pytest.mark.parametrize("level", [1, 2, 3])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rigs.scene.vibration import Vibration
+from sliplab.rigs.scene.vibration import Vibration
 
 T_NS = np.arange(20_000, dtype=np.int64) * 1_000_000
 

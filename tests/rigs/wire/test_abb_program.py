@@ -16,7 +16,7 @@ from abb_motion_program_exec.commands.rapid_types import (
     tooldata,
 )
 
-from rigs.wire.abb_program import MoveL, ProgramError, Wait, read_program
+from sliplab.rigs.wire.abb_program import MoveL, ProgramError, Wait, read_program
 
 LOAD = loaddata(0.4, [0, 0, 50], [1, 0, 0, 0], 0, 0, 0)
 SPEED = speeddata(1.6, 500, 5000, 1000)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 
-from rigs.arms.abb_watchdog import BEAT, BEAT_S, ECHO, LIMIT
-from rigs.arms.settings import AbbSettings
-from rigs.wire.abb_rws import WATCH_S
+from sliplab.rigs.arms.abb_watchdog import BEAT, BEAT_S, ECHO, LIMIT
+from sliplab.rigs.arms.settings import AbbSettings
+from sliplab.rigs.wire.abb_rws import WATCH_S
 from tests.conftest import ROOT
 
 RAPID = ROOT / "docs" / "rapid"

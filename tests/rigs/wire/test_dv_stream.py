@@ -14,9 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs.wire.dv_server import DvServer
-from rigs.wire.dv_stream import events_header, events_packet, triggers_header, triggers_packet
-from storage.streams import EventChunk
+from sliplab.rigs.wire.dv_server import DvServer
+from sliplab.rigs.wire.dv_stream import (
+    events_header,
+    events_packet,
+    triggers_header,
+    triggers_packet,
+)
+from sliplab.storage.streams import EventChunk
 
 _WRITER = """
 import os, sys

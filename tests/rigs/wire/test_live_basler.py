@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from rigs.cameras.basler import BaslerCamera
-from rigs.cameras.settings import BaslerSettings
-from rigs.capabilities import RigError
-from rigs.wire.live_basler import LiveBasler
-from storage.streams import FrameChunk
+from sliplab.rigs.cameras.basler import BaslerCamera
+from sliplab.rigs.cameras.settings import BaslerSettings
+from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.wire.live_basler import LiveBasler
+from sliplab.storage.streams import FrameChunk
 from tests.rigs.loopback import until
 
 pytestmark = pytest.mark.realtime

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigs.capabilities import Pose
-from rigs.wire.motion import ControllerClock, Ramp, StraightMotion
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.motion import ControllerClock, Ramp, StraightMotion
 
 A, B = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pose((15.0, 0.0, 0.0), (0.0, 0.0, 90.0))
 

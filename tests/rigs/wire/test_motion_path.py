@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigs.capabilities import Pose, RigError, Segment
-from rigs.mock.geometry import ContactPlane
-from rigs.mock.path import TOOL
-from rigs.mock.settings import MockSettings
-from rigs.wire.motion_path import MotionPath
-from storage.clockmap import ClockMap
+from sliplab.rigs.capabilities import Pose, RigError, Segment
+from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.path import TOOL
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.wire.motion_path import MotionPath
+from sliplab.storage.clockmap import ClockMap
 
 PLANE = ContactPlane.from_settings(MockSettings().scene.contact)
 HOME = PLANE.pose(0.0, 0.0, -5.0)

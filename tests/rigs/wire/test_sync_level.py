@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from protocols.timing import Code
-from rigs.pulse_code import code_bits
-from rigs.sync_box import SerialSyncBox
-from rigs.sync_settings import SyncBoxSettings
-from rigs.wire.sync_box import PtySyncBox, Train
-from rigs.wire.sync_level import PULSE_NS, SyncLevel
-from storage.clockmap import ClockMap
+from sliplab.protocols.timing import Code
+from sliplab.rigs.pulse_code import code_bits
+from sliplab.rigs.sync_box import SerialSyncBox
+from sliplab.rigs.sync_settings import SyncBoxSettings
+from sliplab.rigs.wire.sync_box import PtySyncBox, Train
+from sliplab.rigs.wire.sync_level import PULSE_NS, SyncLevel
+from sliplab.storage.clockmap import ClockMap
 from tests.rigs.loopback import until
 
 FIRST_NS, PERIOD_NS = 3_000_000_000, 10_000_000

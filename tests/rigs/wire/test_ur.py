@@ -13,11 +13,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from rigs.arms import ur_ports
-from rigs.arms.rtde import RtdeError, RtdeReader
-from rigs.capabilities import Pose
-from rigs.wire.faults import Kind
-from rigs.wire.ur import HOME, UrStandIn
+from sliplab.rigs.arms import ur_ports
+from sliplab.rigs.arms.rtde import RtdeError, RtdeReader
+from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.wire.faults import Kind
+from sliplab.rigs.wire.ur import HOME, UrStandIn
 from tests.rigs.loopback import own_address, until
 
 pytestmark = pytest.mark.realtime
@@ -154,7 +154,7 @@ def test_in_local_control_nothing_from_outside_runs(robot: UrStandIn) -> None:
 
 def test_it_runs_as_a_process_of_its_own() -> None:
     host = own_address()
-    process = subprocess.Popen([sys.executable, "-m", "rigs.wire.ur", host])
+    process = subprocess.Popen([sys.executable, "-m", "sliplab.rigs.wire.ur", host])
     try:
         until(lambda: _answers(host), 20.0)
     finally:

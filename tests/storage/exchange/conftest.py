@@ -2,7 +2,7 @@
 
 import pytest
 
-from storage.exchange import lab_pickles
+from sliplab.storage.exchange import lab_pickles
 from tests.storage.exchange.files import SMALL
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from storage.streams import EventChunk
+from sliplab.storage.streams import EventChunk
 
 SMALL = (6, 8)
 """Rows and columns of a camera of few pixels."""

@@ -18,23 +18,23 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 
-from protocols.errors import InputError
-from storage.catalogue import catalogue
-from storage.derived import Derived
-from storage.exchange import lab_pickles as lab
-from storage.exchange.aedat4 import Aedat4File, Aedat4Writer, Stream
-from storage.exchange.dv_buffers import events_buffer, frame_buffer
-from storage.exchange.find import kind_of, name_of, trials_in
-from storage.exchange.foreign import Triggers, Wrong
-from storage.exchange.hand_out import hand_out
-from storage.exchange.manifest import MANIFEST
-from storage.exchange.tables import label_table, write_table
-from storage.exchange.take_in import take_in
-from storage.files import read_json
-from storage.recording import Recording
-from storage.store import Store
-from storage.streams import EventChunk
-from storage.verify import verify
+from sliplab.protocols.errors import InputError
+from sliplab.storage.catalogue import catalogue
+from sliplab.storage.derived import Derived
+from sliplab.storage.exchange import lab_pickles as lab
+from sliplab.storage.exchange.aedat4 import Aedat4File, Aedat4Writer, Stream
+from sliplab.storage.exchange.dv_buffers import events_buffer, frame_buffer
+from sliplab.storage.exchange.find import kind_of, name_of, trials_in
+from sliplab.storage.exchange.foreign import Triggers, Wrong
+from sliplab.storage.exchange.hand_out import hand_out
+from sliplab.storage.exchange.manifest import MANIFEST
+from sliplab.storage.exchange.tables import label_table, write_table
+from sliplab.storage.exchange.take_in import take_in
+from sliplab.storage.files import read_json
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.verify import verify
 from tests.storage.exchange.files import SMALL, lab_hdf5, lab_pickles
 from tests.storage.trials import campaign, commit
 
@@ -557,7 +557,7 @@ def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> Non
 def test_without_faery_its_files_are_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("storage.exchange.by_faery.LIBRARY", "no_such_library")
+    monkeypatch.setattr("sliplab.storage.exchange.by_faery.LIBRARY", "no_such_library")
     (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n")
     with pytest.raises(InputError, match="pip install"):
         _import(tmp_path / "store", tmp_path / "a.raw")

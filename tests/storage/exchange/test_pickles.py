@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocols.errors import InputError
-from storage.exchange.pickles import parse_pickle, read_pickle
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.pickles import parse_pickle, read_pickle
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 PLAIN = (
@@ -214,7 +214,7 @@ def test_what_is_told_twice_stays_one_thing() -> None:
 
 
 def test_too_many_containers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("storage.exchange.pickle_machine.MAX_CONTAINERS", 1000)
+    monkeypatch.setattr("sliplab.storage.exchange.pickle_machine.MAX_CONTAINERS", 1000)
     with pytest.raises(InputError, match="containers"):
         parse_pickle(b"(" + b"]" * 1001 + b"l.", "x")
 

@@ -13,14 +13,14 @@ import h5py
 import numpy as np
 import pytest
 
-from protocols.errors import InputError
-from storage.exchange.aedat4 import Aedat4Writer, Stream
-from storage.exchange.find import kind_of, trials_in
-from storage.exchange.take_in import take_in
-from storage.recording import Recording
-from storage.store import Store
-from storage.streams import EventChunk
-from storage.verify import verify
+from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.exchange.find import kind_of, trials_in
+from sliplab.storage.exchange.take_in import take_in
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.verify import verify
 from tests.storage.exchange.files import SMALL, lab_cells, lab_hdf5
 
 SIZE = SMALL[::-1]

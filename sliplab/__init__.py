@@ -1,0 +1,1 @@
+"""SlipLab: run tactile slip experiments, from a protocol file to a report."""
