@@ -23,6 +23,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.motion import build_program, check_limits
 from sliplab.protocols.program import Dwell, Program
 from sliplab.protocols.quantity import FILE_UNITS, canonical, to_decimal
+from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.yaml_file import KeyedError, load
 
@@ -203,12 +204,14 @@ def load_plan(path: Path, enable: Iterable[str] = (), *, stored: bool = False) -
     """Read the protocol at `path` and expand it.
 
     Args:
+        path: of the file, or the name of a protocol that ships with the package (``pilot``).
         enable: levels to switch on, as ``factor=level`` (``disturbance=125``).
         stored: it is a campaign's own copy, which is not held to rules that came after it.
 
     Raises:
         InputError: anything wrong, with file, key, value and what would be right.
     """
+    path = path if stored else protocol_path(path)
     protocol = load(Protocol, path, "protocol")
     if not stored:
         try:

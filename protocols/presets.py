@@ -53,13 +53,13 @@ PAPER = (
     Value("training.schedule", "constant", "assumed", "schedule of the learning rate"),
     Value("training.warm_up", 0.0, "assumed", "share of steps to warm up"),
     Value("training.gain", 1.0, "assumed", "gain of a spike in the cross-entropy"),
-    Value("training.mirror", False, "published", "windows mirrored in training"),
+    Value("training.mirror", False, "assumed", "windows mirrored in training"),
     Value("detection.smoothing", 4, "published", "windows of the sliding mean"),
     Value("detection.margin", 2.0, "published", "lead of a winner (spikes)"),
     Value("detection.choose", "protocol", "published", "source of sliding mean and lead"),
     Value("detection.stride_ms", None, "published", "stride of the windows (ms)"),
 )
-"""Mirroring and overlapping windows would have been said; layers' sizes, loss and rate are not."""
+"""Overlapping windows would have been said; mirroring, layers' sizes, loss and rate are not."""
 
 COMPARED = ("network", "training", "detection")
 """Sections that a network beside the protocol's own takes from a preset; it shares the others."""

@@ -17,7 +17,7 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
-from sliplab.rigs.cameras.patience import STEP_S, Patience
+from sliplab.rigs.patience import STEP_S, Patience
 
 KILL_S = 2.0
 """How long a child that was asked to end, or killed, may take to be gone, s."""

@@ -17,8 +17,9 @@ from typing import Literal, get_args
 
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, read_json, write_new_json
+from sliplab.storage.names import safe_name
 from sliplab.storage.process import now, user_name
-from sliplab.storage.store import Store, safe_name
+from sliplab.storage.store import Store
 from sliplab.storage.streams import Json
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.files import read_json, write_bytes, write_json
-from sliplab.storage.store import Store, inside, safe_name
+from sliplab.storage.names import inside, safe_name
+from sliplab.storage.store import Store
 from sliplab.storage.streams import Json
 
 

@@ -21,9 +21,11 @@ from typing import Any, Literal
 
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.decisions import SKIPPED
+from sliplab.storage.fetching import objects_folder
 from sliplab.storage.files import json_text, read_json, sha256
+from sliplab.storage.names import safe_name
 from sliplab.storage.remote import SMALL_BYTES, Remote, RemoteError, RemoteMissing
-from sliplab.storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError, safe_name
+from sliplab.storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError
 from sliplab.storage.streams import Json
 from sliplab.storage.whole import read_sums
 from sliplab.storage.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD, SPOOL
@@ -74,11 +76,6 @@ class Manifest:
         """As an object; equal manifests are equal bytes."""
         data = {"format": FORMAT, **vars(self)}
         return json_text({**data, "sum": hash_data(data)}).encode()
-
-
-def objects_folder(campaign: str) -> str:
-    """Where a campaign's files stand below the URL."""
-    return f"campaigns/{safe_name(campaign)}/objects"
 
 
 def manifest_key(kind: Kind, campaign: str, name: str = "") -> str:

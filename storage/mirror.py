@@ -11,18 +11,17 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 from sliplab.protocols.hashing import hash_text
 from sliplab.storage.bring import bring
-from sliplab.storage.errors import StoreError, disk_explained
+from sliplab.storage.errors import disk_explained
+from sliplab.storage.fetching import ORIGIN, origin_of, remote_at
 from sliplab.storage.files import make_folder, write_json
-from sliplab.storage.manifest import Manifest, objects_folder, read_manifests
-from sliplab.storage.pull import ORIGIN, Pulled, origin_of, pull
+from sliplab.storage.manifest import Manifest, read_manifests
+from sliplab.storage.pull import Pulled, pull
 from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
 from sliplab.storage.store import FORMAT, STORE, Store
-from sliplab.storage.streams import Json
 from sliplab.storage.urls import check_url, is_url
 from sliplab.storage.whole import partial
 
@@ -74,30 +73,8 @@ def reach(place: str, campaign: str, trial: str) -> Store:
     store = _bare_mirror(place)
     target = store.campaign(campaign).folder / "trials" / trial
     if partial(target) is not None:
-        _bring_one(_remote(place), campaign, trial, target)
+        _bring_one(remote_at(place), campaign, trial, target)
     return store
-
-
-def fetch(path: Path, said: Json) -> None:
-    """Bring a file of a trial that a mirror has left out until now.
-
-    Raises:
-        StoreError: it is not at the URL any more, damaged there, or the storage cannot be reached.
-    """
-    campaign, store = path.parents[2].name, path.parents[4]
-    url = origin_of(store)
-    if url is None:
-        raise StoreError(f"{path}: is missing, and {store / ORIGIN} does not say where it is")
-    try:
-        with disk_explained(store):
-            _remote(url).get_file(f"{objects_folder(campaign)}/{said['sha256']}", path, said)
-    except RemoteError as error:
-        raise RemoteError(f"{path}: {error}") from None
-
-
-@lru_cache(maxsize=4)
-def _remote(url: str) -> Remote:
-    return Remote(url)
 
 
 def _bare_mirror(url: str) -> Store:

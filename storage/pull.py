@@ -12,16 +12,16 @@ from pathlib import Path
 
 from sliplab.storage.bring import BIG, bring, get, holds
 from sliplab.storage.errors import StoreError, disk_explained
-from sliplab.storage.files import make_folder, read_json, sync_folder, write_bytes, write_json
+from sliplab.storage.fetching import ORIGIN, origin_of
+from sliplab.storage.files import make_folder, sync_folder, write_bytes, write_json
 from sliplab.storage.lock import STORE_LOCK, exclusive
 from sliplab.storage.manifest import Manifest, read_manifests, take_of
+from sliplab.storage.names import safe_name
 from sliplab.storage.remote import OnBytes, Remote, RemoteError
-from sliplab.storage.store import Campaign, Store, safe_name
+from sliplab.storage.store import Campaign, Store
 from sliplab.storage.whole import ELSEWHERE, partial, to_fetch
 from sliplab.storage.writer import CHECKSUMS
 
-ORIGIN = "origin.json"
-"""In a store that was pulled: from where."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
 
 
@@ -45,14 +45,6 @@ class Pulled:
     files: int = 0
     bytes: int = 0
     problems: list[str] = field(default_factory=list)
-
-
-def origin_of(folder: Path) -> str | None:
-    """The URL that the store in `folder` was pulled from; None for one that was collected."""
-    try:
-        return str(read_json(folder / ORIGIN)["url"])
-    except (OSError, ValueError, KeyError):
-        return None
 
 
 def pull(

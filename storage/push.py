@@ -13,7 +13,8 @@ from pathlib import Path
 
 from sliplab.storage import manifest as manifests
 from sliplab.storage.errors import StoreError
-from sliplab.storage.manifest import Kind, Manifest, objects_folder, read_manifests
+from sliplab.storage.fetching import objects_folder
+from sliplab.storage.manifest import Kind, Manifest, read_manifests
 from sliplab.storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
 from sliplab.storage.store import AGAIN, INFO, Campaign, Store
 from sliplab.storage.streams import Json

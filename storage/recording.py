@@ -12,6 +12,7 @@ import numpy as np
 
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
+from sliplab.storage.fetching import fetch
 from sliplab.storage.files import read_json
 from sliplab.storage.hdf5 import StreamReader
 from sliplab.storage.record_shape import check_clocks, check_record
@@ -109,8 +110,6 @@ class Recording:
             if name not in self._sums:
                 raise self._damaged(f"{path}: is not among the checksums")
             if to_fetch(path):
-                from sliplab.storage.mirror import fetch  # which stands on this module
-
                 fetch(path, self._sums[name])
             if (problem := byte_problem(path, self._sums[name])) is not None:
                 raise self._damaged(f"{path}: {problem}")

@@ -5,15 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from sliplab.storage.manifest import (
-    Kind,
-    Manifest,
-    check_against_sums,
-    objects_folder,
-    read_manifests,
-)
+from sliplab.storage.fetching import objects_folder
+from sliplab.storage.manifest import Kind, Manifest, check_against_sums, read_manifests
+from sliplab.storage.names import safe_name
 from sliplab.storage.remote import OnBytes, Remote, RemoteError, RemoteMissing
-from sliplab.storage.store import StoreError, safe_name
+from sliplab.storage.store import StoreError
 from sliplab.storage.verify import Problem
 from sliplab.storage.writer import CHECKSUMS
 

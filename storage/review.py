@@ -18,8 +18,9 @@ from typing import Literal, get_args
 
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import make_folder, read_json, write_new_json
+from sliplab.storage.names import safe_name
 from sliplab.storage.process import now, user_name
-from sliplab.storage.store import Store, safe_name
+from sliplab.storage.store import Store
 from sliplab.storage.streams import Json
 
 Verdict = Literal["accept", "adjust", "reject", "reopen"]

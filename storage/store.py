@@ -20,7 +20,6 @@ reading, and quarantined and taken again by the next collection. docs/store.md h
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,13 +34,14 @@ from sliplab.storage.files import (
     write_bytes,
     write_json,
 )
+from sliplab.storage.names import inside, safe_name
 from sliplab.storage.recording import Recording
 from sliplab.storage.secrets import masked
 from sliplab.storage.streams import Json
 from sliplab.storage.whole import partial, write_sums
 from sliplab.storage.writer import CHECKSUMS, PROVENANCE, TrialWriter
 
-__all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError", "safe_name"]
+__all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError"]
 
 FORMAT = 2
 """What this version writes; `storage.migrate` says what changed, and brings older ones forward."""
@@ -55,35 +55,10 @@ IMPORTED = "imported"
 AGAIN, FORGIVEN = "again", "forgiven"
 """A committed trial that a person wants anew; a failed attempt that counts no longer."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
-_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
 def _holds(path: Path, data: bytes) -> bool:
     return path.is_file() and not path.is_symlink() and path.read_bytes() == data
-
-
-def safe_name(name: str) -> str:
-    """`name` if it is a plain file name.
-
-    Raises:
-        StoreError: it could lead out of its folder.
-    """
-    if not _SAFE.fullmatch(name) or ".." in name:
-        raise StoreError(f"'{name}' cannot be the name of a folder in a store")
-    return name
-
-
-def inside(path: Path, store: Path) -> Path:
-    """`path`, if no link on the way to it leads out of the store's folder.
-
-    Raises:
-        StoreError: one does.
-    """
-    if not path.resolve().is_relative_to(store.resolve()):
-        raise StoreError(
-            f"{path}: a link leads out of the store; put a folder of its own in its place"
-        )
-    return path
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
     """Share right by lead with its interval, and how many windows there are of each.
 
     Args:
-        rows: from `analysis.nets.reliability.by_lead`.
+        rows: from `analysis.statistics.reliability.by_lead`.
     """
     with plt.rc_context(STYLE):
         figure, (top, low) = plt.subplots(
@@ -64,7 +64,7 @@ def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simula
     """Recall of each class over its phase, a panel a class.
 
     Args:
-        tenths: from `analysis.nets.window_groups.by_tenth`.
+        tenths: from `analysis.statistics.window_groups.by_tenth`.
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(tenths), figsize=(6.4, 2.4), sharey=True)

@@ -16,7 +16,6 @@ from sliplab.flows.cli.common import (
     RigOption,
     StoreOption,
     finish,
-    prepare_store,
 )
 from sliplab.flows.cli.control import register as register_control
 from sliplab.flows.cli.detect import register as register_detect
@@ -34,6 +33,7 @@ from sliplab.flows.cli.steps import register as register_steps
 from sliplab.flows.cli.store import register as register_store
 from sliplab.flows.cli.tradeoff import register as register_tradeoff
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 
 app = typer.Typer(
     name="sliplab",

@@ -3,39 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption, prepare_store
+from sliplab.flows.cli.common import JsonOption, RigOption
 from sliplab.flows.running import console
-
-FULL = ("kinematic", "gravity", "disturbance")
-PILOT = ("pilot", "pilot_gravity")
-EXTRA = ("disturbance=125",)
-LABELS_CHECKED = 60
-"""Trials whose labels of tracks a study checks with video, unless another number is asked for."""
-HELD_OUT = 144
-"""Trials that choose nothing: half of the conditions of the kinematic grid, each once."""
-
-
-def package_file(package: str, name: str) -> Path:
-    """A file that ships with one of the packages below `sliplab`."""
-    return Path(import_module(f"sliplab.{package}").__path__[0]) / name
-
-
-def shipped(pilot: bool, extra: bool) -> dict[Path, tuple[str, ...]]:
-    """A study's protocols, and the optional levels that are switched on in each.
-
-    Args:
-        pilot: the small ones, which have none.
-        extra: with the disturbance of 125 % that the paper left out.
-    """
-    on = {"disturbance": EXTRA} if extra else {}
-    names = PILOT if pilot else FULL
-    return {package_file("protocols", f"{name}.yaml"): on.get(name, ()) for name in names}
+from sliplab.flows.steps import prepare_store
+from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, study_protocols
 
 
 def study(
@@ -82,7 +58,7 @@ def study(
     if status:
         _status(folder, as_json)
         return
-    files = dict.fromkeys(protocol, ()) if protocol else shipped(pilot, extra)
+    files = dict.fromkeys(protocol, ()) if protocol else study_protocols(pilot, extra)
     if holdout is None:
         holdout = 0 if pilot or protocol else HELD_OUT
     _chain(folder, files, rig, as_json, check_labels, searches, holdout)
@@ -113,7 +89,7 @@ def demo(
             "The demo's outside camera hands over simulated tracks of the markers, no video; "
             "`sliplab demo --rig mock` draws, stores and tracks the video, which takes longer."
         )
-    _chain(folder, shipped(pilot=True, extra=False), rig, as_json)
+    _chain(folder, study_protocols(pilot=True, extra=False), rig, as_json)
 
 
 def _chain(

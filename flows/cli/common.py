@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from sliplab.flows.running import console
+from sliplab.flows.steps import run_step
 
 ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol file (YAML).")]
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
@@ -31,25 +32,6 @@ EnableOption = Annotated[
 CampaignOption = Annotated[
     list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
 ]
-STEPS = {
-    "sync": "sliplab.flows.syncing.sync",
-    "label": "sliplab.flows.labelling.label",
-    "train": "sliplab.flows.learning.train",
-    "evaluate": "sliplab.flows.learning.evaluate",
-    "judge_model": "sliplab.flows.learning.other_networks",
-    "window_baselines": "sliplab.flows.learning.window_baselines",
-    "window_checks": "sliplab.flows.learning.window_checks",
-    "report": "sliplab.flows.reporting.report",
-}
-"""Where each step stands: the module whose function has the step's name."""
-
-
-def prepare_store(folder: Path) -> None:
-    """Make the store and point Prefect at it; everything that imports Prefect comes after."""
-    from sliplab.flows.running import orchestration
-    from sliplab.storage.store import Store
-
-    orchestration.prepare(Store.create(folder).folder)
 
 
 def located(place: str) -> Path:
@@ -79,35 +61,6 @@ def located(place: str) -> Path:
 def step(place: str, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
     """Run one analysis step on a store and print what it did."""
     finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
-
-
-def run_step(
-    folder: Path, names: list[str] | None, step: str, dask: str | None = None, **options: Any
-) -> dict[str, Any]:
-    """Run one analysis step on a store.
-
-    Args:
-        dask: the scheduler whose workers take the trials.
-    """
-    from importlib import import_module
-
-    from sliplab.storage.store import Store
-
-    store = Store.open(folder)
-    prepare_store(folder)
-    from sliplab.flows.running.campaigns import collected
-    from sliplab.flows.running.cluster import connected
-
-    campaigns = collected(store, names)
-    with connected(dask) as cluster:
-        if cluster is not None:
-            options["cluster"] = cluster
-        result: dict[str, Any] = getattr(import_module(STEPS[step]), step)(
-            store, campaigns, **options
-        )
-    if not result["done"]:
-        console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
-    return result
 
 
 def finish(result: dict[str, Any], title: str, as_json: bool) -> None:

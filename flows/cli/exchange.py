@@ -33,7 +33,8 @@ def import_(
     from sliplab.flows.collecting.stretch import owned
     from sliplab.storage.exchange.find import KINDS, kind_of, trials_in
     from sliplab.storage.exchange.take_in import take_in
-    from sliplab.storage.store import Store, StoreError, safe_name
+    from sliplab.storage.names import safe_name
+    from sliplab.storage.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path
     kind = kind_of(where) if path is None else kind_or_path

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 
 
 def generalise(

@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.chain import HELD_OUT
-from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, prepare_store
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
+from sliplab.flows.study_defaults import HELD_OUT
 
 
 def holdout(

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, JsonOption, prepare_store
+from sliplab.flows.cli.common import CampaignOption, JsonOption
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
 
 

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, RigOption, StoreOption, prepare_store
+from sliplab.flows.cli.common import JsonOption, RigOption, StoreOption
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 
 
 def serve(

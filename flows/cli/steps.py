@@ -15,10 +15,10 @@ from sliplab.flows.cli.common import (
     PlaceArgument,
     finish,
     located,
-    run_step,
     step,
 )
 from sliplab.flows.running import console
+from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
 
 

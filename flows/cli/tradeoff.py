@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import CampaignOption, DaskOption, JsonOption, located, prepare_store
+from sliplab.flows.cli.common import CampaignOption, DaskOption, JsonOption, located
 from sliplab.flows.cli.steps import ReviewedOption
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
 
 SCENE_OUT = Path("sliplab-tradeoff")

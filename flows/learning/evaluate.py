@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
@@ -16,7 +16,8 @@ from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import counting, window_scores
 from sliplab.flows.learning.counting import COUNTS, count_spikes
 from sliplab.flows.learning.detector_trials import hear_trials, heard_step
-from sliplab.flows.learning.detector_work import DetectorWork, detector_work
+from sliplab.flows.learning.detector_work import detector_work
+from sliplab.flows.learning.evaluation_job import Job
 from sliplab.flows.learning.other_networks import judge_beside
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import Model, rules_of, training_settings, wanted_models
@@ -25,11 +26,9 @@ from sliplab.flows.learning.window_scores import key_inputs, score_windows
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.orchestration import Parcel, run
 from sliplab.flows.running.timing import timed
-from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import read_json
-from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store, StoreError
 
 if TYPE_CHECKING:
@@ -40,24 +39,6 @@ VERSION = 4
 NAME = "evaluation"
 FORMAT = [VERSION, window_scores.VERSION]
 """Stands in an evaluation, so that who reads it knows that its keys are those of today."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """Everything an evaluation depends on, found before anything is computed."""
-
-    store: Store
-    campaigns: list[Collected]
-    labels: Labels
-    model: Model
-    models: list[Model]
-    """Of all seeds, the chosen one among them."""
-    detection: dict[str, Detection]
-    trials: list[tuple[Collected, Trial, Recording, str]]
-    """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
-    detectors: DetectorWork
-    key: str
-    cluster: Cluster | None = None
 
 
 def choose_model(models: list[Model]) -> Model:

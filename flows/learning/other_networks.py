@@ -17,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from prefect import flow
 
-from sliplab.analysis.nets import dataset, metrics, model_file, training, window_groups
+from sliplab.analysis.nets import dataset, metrics, model_file, training
 from sliplab.analysis.nets.external_model import Description, ExternalModel, load_external
 from sliplab.analysis.nets.network import spike_counts
 from sliplab.analysis.nets.samples import strided_windows
 from sliplab.analysis.nets.sparse import SparseWindows
 from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.statistics import window_groups
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.train import models_beside, rules_of, training_settings

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import base64
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,17 +15,18 @@ from prefect.cache_policies import NO_CACHE
 
 from sliplab.analysis.nets import dataset, model_file, training, training_device
 from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.pictures.figures import training_curves
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.learning.training_progress import progress
-from sliplab.flows.running import console
+from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.orchestration import Parcel, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
 from sliplab.storage.derived import make_key
-from sliplab.storage.files import read_json, write_bytes, write_json
+from sliplab.storage.files import read_json, write_bytes, write_json, write_text
 from sliplab.storage.store import Store, StoreError
 
 if TYPE_CHECKING:
@@ -142,7 +146,7 @@ def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     model, train, validation, simulated = job.content
     settings = model.settings
     model.path.parent.mkdir(parents=True, exist_ok=True)
-    with progress(model, settings.training.epochs, simulated) as told:
+    with _progress(model, settings.training.epochs, simulated) as told:
         fitted = training.fit(
             train.windows,
             train.y,
@@ -245,3 +249,60 @@ def _check_device(item: Collected) -> None:
             device,
             f"there is none here; must be one of {', '.join(there)}",
         )
+
+
+@contextmanager
+def _progress(model: Model, epochs: int, simulated: bool) -> Iterator[_Progress]:
+    """Show the training of a model while the block runs."""
+    with console.bar(f"train {model.title} (epochs)", epochs) as bar:
+        yield _Progress(model, bar, simulated)
+
+
+class _Progress:
+    """What people see of a training while it runs: a bar, and a picture drawn after each epoch.
+
+    The picture is in the store and on Prefect's page. Where the page cannot be reached, the store
+    has it.
+    """
+
+    def __init__(self, model: Model, bar: Any, simulated: bool) -> None:
+        self._model, self._bar, self._simulated = model, bar, simulated
+        self._records: list[dict[str, Any]] = []
+        self._best: EpochRecord | None = None
+        self._artifact: Any = None
+
+    def epoch(self, record: EpochRecord) -> None:
+        """An epoch is over."""
+        self._records.append(asdict(record))
+        if self._best is None or record.merit > self._best.merit:
+            self._best = record
+        self._bar.advance(1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict")
+        svg = training_curves(self._records, self._best.epoch, simulated=self._simulated)
+        write_text(self._model.curves_path, svg)
+        if not orchestration.private():
+            with suppress(Exception):
+                self._show(svg)
+
+    def _show(self, svg: str) -> None:
+        """On the page of the flow run; made at the first epoch, changed after."""
+        from prefect.client.orchestration import get_client
+        from prefect.client.schemas.actions import ArtifactCreate, ArtifactUpdate
+        from prefect.context import get_run_context
+
+        data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+        words = f"training curves of {self._model.title}, {len(self._records)} epochs"
+        with get_client(sync_client=True) as client:
+            if self._artifact is not None:
+                client.update_artifact(self._artifact, ArtifactUpdate(data=data, description=words))
+                return
+            run: Any = get_run_context()
+            made = client.create_artifact(
+                ArtifactCreate(
+                    key=f"train-{self._model.title.replace(' ', '-')}-curves",
+                    type="image",
+                    data=data,
+                    description=words,
+                    flow_run_id=run.task_run.flow_run_id,
+                )
+            )
+            self._artifact = made.id

@@ -15,16 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import (
-    metrics,
-    model_file,
-    reliability,
-    synaptic,
-    training,
-    window_groups,
-)
+from sliplab.analysis.nets import metrics, model_file, synaptic, training
 from sliplab.analysis.nets.baselines import evaluate_baselines
 from sliplab.analysis.nets.dataset import SampleSet, recorded_span
+from sliplab.analysis.statistics import reliability, window_groups
 from sliplab.flows.learning.samples import TrialRef, load_samples, several, split_trials
 from sliplab.flows.learning.train import Model, training_settings
 from sliplab.flows.running.campaigns import Collected
@@ -34,7 +28,7 @@ from sliplab.storage.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.labelling.reviewed import Labels
-    from sliplab.flows.learning.evaluate import Job
+    from sliplab.flows.learning.evaluation_job import Job
 
 VERSION = 4
 STEP = "windows"
@@ -197,8 +191,8 @@ def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
         evaluated: the evaluation's key.
 
     Returns:
-        by name what `analysis.nets.window_groups.share` gives; empty where the evaluation kept
-        none.
+        what `analysis.statistics.window_groups.share` gives, by name; empty where the evaluation
+        kept none.
     """
     found = kept_counts(store, evaluated)
     if found is None:

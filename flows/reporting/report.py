@@ -29,7 +29,8 @@ from sliplab.flows.running.orchestration import Parcel, run
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
 from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import make_folder, read_json, write_json, write_text
-from sliplab.storage.store import Store, safe_name
+from sliplab.storage.names import safe_name
+from sliplab.storage.store import Store
 
 STEP = "report"
 VERSION = 10

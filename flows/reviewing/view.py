@@ -14,34 +14,18 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sliplab.flows.reviewing.view_streams import Subject
 from sliplab.flows.running import stopping
 from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store
 
-TIMELINE = "trial_time"
 APPLICATION = "sliplab"
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A trial that is to be looked at."""
-
-    store: Store
-    item: Collected
-    recording: Recording
-
-    @property
-    def trial(self) -> str:
-        """Its id."""
-        return self.recording.folder.name
 
 
 def find(store: Store, trial: str, campaign: str | None = None) -> Subject:

@@ -14,6 +14,7 @@ network/no_slip ...        spike counts of the evaluated network
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -26,11 +27,14 @@ from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of
 from sliplab.flows.reviewing.review_trial import event_rate
-from sliplab.flows.reviewing.view import TIMELINE, Subject
+from sliplab.flows.running.campaigns import Collected
 from sliplab.storage import review
 from sliplab.storage.derived import Derived
+from sliplab.storage.recording import Recording
+from sliplab.storage.store import Store
 from sliplab.storage.streams import I64, EventChunk, Json
 
+TIMELINE = "trial_time"
 BIN_NS = 5_000_000
 MOST_POINTS = 5_000_000
 """More events than this become pictures; as points they would take 40 MB and more."""
@@ -40,6 +44,20 @@ MOST_FRAMES = 2000
 """Of more frames than this, every second, third, ... is taken."""
 _QUALITY = 90
 COUNTS = "counts"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A trial that is to be looked at."""
+
+    store: Store
+    item: Collected
+    recording: Recording
+
+    @property
+    def trial(self) -> str:
+        """Its id."""
+        return self.recording.folder.name
 
 
 class _Columns:

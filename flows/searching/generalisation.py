@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import dataset, metrics, model_file, training, window_groups
+from sliplab.analysis.nets import dataset, metrics, model_file, training
 from sliplab.analysis.nets.dataset import SampleSet
 from sliplab.analysis.nets.epoch_record import EpochRecord
+from sliplab.analysis.statistics import window_groups
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels

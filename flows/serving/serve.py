@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import ProxyHandler, build_opener
 
-from sliplab.flows.cli.chain import package_file
+from sliplab import protocols
 from sliplab.flows.running import console, run_records
 from sliplab.flows.running.embedded_server import new_password
 from sliplab.flows.serving.serve_control import answer_page
@@ -233,7 +233,8 @@ def _protocols(folders: Sequence[Path], schedules: Sequence[Scheduled]) -> tuple
     named = [
         Path(item.parameters["protocol"]) for item in schedules if "protocol" in item.parameters
     ]
-    found = [path.resolve() for path in (*folders, package_file("protocols", ""), *named)]
+    ours = Path(protocols.__path__[0])
+    found = [path.resolve() for path in (*folders, ours, *named)]
     return tuple(str(path) for path in found if path != path.parent)
 
 

@@ -11,13 +11,13 @@ from typing import Any
 
 from prefect import flow
 
-from sliplab.flows.cli.chain import LABELS_CHECKED, shipped
-from sliplab.flows.cli.common import STEPS
 from sliplab.flows.collecting import controlling
 from sliplab.flows.planning.orders import Bench, Order, check_disk, make_order
 from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, Evaluate, OnRig, Step, Study
 from sliplab.flows.serving.serve_runs import HOOKS, run_of, until_of, when_free
 from sliplab.flows.serving.service import Service
+from sliplab.flows.steps import STEPS
+from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from sliplab.storage import control
 from sliplab.storage.store import Store
 
@@ -134,7 +134,7 @@ def _chain(wanted: Chain, here: Service, run: Any) -> str:
 def _study(wanted: Study, here: Service, run: Any) -> str:
     from sliplab.flows.study import study as whole
 
-    files = shipped(wanted.pilot, wanted.extra)
+    files = study_protocols(wanted.pilot, wanted.extra)
     orders = [_order(here, wanted, file, run, enable=on) for file, on in files.items()]
     check_disk(orders)
     done: dict[str, Any] = {}

@@ -19,9 +19,9 @@ import numpy as np
 from sliplab.rigs.cameras.counts import EventCounts
 from sliplab.rigs.cameras.event_process import EventProcess
 from sliplab.rigs.cameras.event_source import DEVICE, Look
-from sliplab.rigs.cameras.patience import Patience
 from sliplab.rigs.cameras.settings import DvxplorerSettings
 from sliplab.rigs.capabilities import DeviceHealth, RigError
+from sliplab.rigs.patience import Patience
 from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
 
 POLL_S = 0.001

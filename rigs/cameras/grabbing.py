@@ -16,9 +16,9 @@ from typing import Any
 
 from sliplab.rigs.cameras.counts import GrabCounts
 from sliplab.rigs.cameras.nodes import DEVICE
-from sliplab.rigs.cameras.patience import Patience
 from sliplab.rigs.cameras.stamps import Stamping
 from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.patience import Patience
 from sliplab.storage.streams import U8
 
 POLL_MS = 100

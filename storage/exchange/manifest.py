@@ -10,7 +10,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.exchange.foreign import ForeignTrial
 from sliplab.storage.files import read_json
-from sliplab.storage.store import safe_name
+from sliplab.storage.names import safe_name
 from sliplab.storage.streams import Json
 
 MANIFEST = "sliplab-export.json"

@@ -17,9 +17,10 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
 from sliplab.storage.exchange.foreign import ForeignTrial, Wrong
 from sliplab.storage.files import json_text
+from sliplab.storage.names import safe_name
 from sliplab.storage.process import now
 from sliplab.storage.recording import RECORD_FORMAT
-from sliplab.storage.store import IMPORTED, Campaign, Store, safe_name
+from sliplab.storage.store import IMPORTED, Campaign, Store
 from sliplab.storage.streams import EventChunk, Json, PulseChunk
 from sliplab.storage.writer import TrialWriter
 

@@ -24,7 +24,6 @@ PUBLISHED: dict[str, Any] = {
     "windows.polarity": "positive",
     "samples.per_class": 50,
     "network.outputs_per_class": 1,
-    "training.mirror": False,
     "detection.smoothing": 4,
     "detection.margin": 2,
     "detection.choose": "protocol",
@@ -54,6 +53,7 @@ def test_the_preset_is_the_papers_table() -> None:
     assert (found.training.gain, found.training.schedule) == (1.0, "constant")
     assert (found.training.learning_rate, found.training.warm_up) == (1e-3, 0.0)
     assert not found.network.biases
+    assert not found.training.mirror  # no word of it
     assert found.overrides == ()
     assert found.split.train == pytest.approx(0.70)
     assert found.most_spikes == 30

@@ -17,17 +17,11 @@ from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.catalogue import catalogue
 from sliplab.storage.decisions import again
+from sliplab.storage.fetching import ORIGIN, objects_folder
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.manifest import (
-    Manifest,
-    manifest_key,
-    objects_folder,
-    of_trial,
-    parse,
-    read_manifests,
-)
+from sliplab.storage.manifest import Manifest, manifest_key, of_trial, parse, read_manifests
 from sliplab.storage.mirror import mirror_folder, open_mirror, place_of, reach
-from sliplab.storage.pull import ORIGIN, pull
+from sliplab.storage.pull import pull
 from sliplab.storage.push import Wishes, push
 from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
 from sliplab.storage.remote_check import verify_remote

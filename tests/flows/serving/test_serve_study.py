@@ -8,19 +8,23 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.cli.chain import LABELS_CHECKED, shipped
 from sliplab.flows.planning.orders import make_order
 from sliplab.flows.serving import serve_flows
 from sliplab.flows.serving.serve_parameters import Study
 from sliplab.flows.study import Outcome
+from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from tests.conftest import ROOT
 
 
 def test_only_the_whole_study_has_the_extra_disturbance() -> None:
-    assert [file.stem for file in shipped(False, True)] == ["kinematic", "gravity", "disturbance"]
-    assert list(shipped(False, True).values()) == [(), (), ("disturbance=125",)]
-    assert list(shipped(False, False).values()) == [(), (), ()]
-    assert {file.stem: on for file, on in shipped(True, True).items()} == {
+    assert [file.stem for file in study_protocols(False, True)] == [
+        "kinematic",
+        "gravity",
+        "disturbance",
+    ]
+    assert list(study_protocols(False, True).values()) == [(), (), ("disturbance=125",)]
+    assert list(study_protocols(False, False).values()) == [(), (), ()]
+    assert {file.stem: on for file, on in study_protocols(True, True).items()} == {
         "pilot": (), "pilot_gravity": ()
     }  # fmt: skip
 
@@ -43,6 +47,6 @@ def test_a_served_study_asks_for_the_same_trials(
     orders, check = asked
     assert check == LABELS_CHECKED
     assert [len(order.plan.trials) for order in orders] == [864, 180, trials]
-    for order, (file, on) in zip(orders, shipped(False, extra).items(), strict=True):
+    for order, (file, on) in zip(orders, study_protocols(False, extra).items(), strict=True):
         rig = ROOT / "rigs" / "rehearsal.yaml"
         assert order.plan == make_order(file, rig, tmp_path / "other", enable=on).plan

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from sliplab.rigs.cameras.patience import STEP_S, Patience
+from sliplab.rigs.patience import STEP_S, Patience
 
 
 def test_only_time_that_somebody_watched_counts(monkeypatch: pytest.MonkeyPatch) -> None:

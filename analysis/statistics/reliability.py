@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
 
 from sliplab.analysis.nets.metrics import Counts, IntArray, Labels, check
-from sliplab.analysis.nets.window_groups import share
+from sliplab.analysis.statistics.window_groups import share
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[dict[str, A
 
     Returns:
         a row for each of `EDGES` with windows: ``lead`` and ``to``, the least and the most of it
-        (None: and more), ``right``, and what `analysis.nets.window_groups.share` gives.
+        (None: and more), ``right``, and what `analysis.statistics.window_groups.share` gives.
     """
     counts, labels = check(counts, labels)
     by = lead(counts)

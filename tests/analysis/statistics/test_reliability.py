@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sliplab.analysis.nets.reliability import (
+from sliplab.analysis.statistics.reliability import (
     by_lead,
     calibration,
     cross_entropy,

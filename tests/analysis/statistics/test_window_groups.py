@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.nets.metrics import accuracy
-from sliplab.analysis.nets.window_groups import (
+from sliplab.analysis.statistics.intervals import share_interval
+from sliplab.analysis.statistics.window_groups import (
     by_factor,
     by_tenth,
     by_trial,
@@ -15,7 +16,6 @@ from sliplab.analysis.nets.window_groups import (
     share,
     strict_hits,
 )
-from sliplab.analysis.statistics.intervals import share_interval
 
 COUNTS = np.array([[5, 0, 0], [3, 3, 0], [0, 0, 0], [0, 2, 1], [0, 0, 4], [9, 0, 0]])
 LABELS = np.array([0, 1, 2, 1, 2, 2])

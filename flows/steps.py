@@ -1,0 +1,56 @@
+"""The analysis steps by name, and how one is run on a store."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from sliplab.flows.running import console
+
+STEPS = {
+    "sync": "sliplab.flows.syncing.sync",
+    "label": "sliplab.flows.labelling.label",
+    "train": "sliplab.flows.learning.train",
+    "evaluate": "sliplab.flows.learning.evaluate",
+    "judge_model": "sliplab.flows.learning.other_networks",
+    "window_baselines": "sliplab.flows.learning.window_baselines",
+    "window_checks": "sliplab.flows.learning.window_checks",
+    "report": "sliplab.flows.reporting.report",
+}
+"""Where each step stands: the module whose function has the step's name."""
+
+
+def prepare_store(folder: Path) -> None:
+    """Make the store and point Prefect at it; everything that imports Prefect comes after."""
+    from sliplab.flows.running import orchestration
+    from sliplab.storage.store import Store
+
+    orchestration.prepare(Store.create(folder).folder)
+
+
+def run_step(
+    folder: Path, names: list[str] | None, step: str, dask: str | None = None, **options: Any
+) -> dict[str, Any]:
+    """Run one analysis step on a store.
+
+    Args:
+        dask: the scheduler whose workers take the trials.
+    """
+    from sliplab.storage.store import Store
+
+    store = Store.open(folder)
+    prepare_store(folder)
+    from sliplab.flows.running.campaigns import collected
+    from sliplab.flows.running.cluster import connected
+
+    campaigns = collected(store, names)
+    with connected(dask) as cluster:
+        if cluster is not None:
+            options["cluster"] = cluster
+        result: dict[str, Any] = getattr(import_module(STEPS[step]), step)(
+            store, campaigns, **options
+        )
+    if not result["done"]:
+        console.say(f"{step}: nothing to do, all {result['fresh']} results are fresh")
+    return result
