@@ -1,0 +1,66 @@
+"""A store with its model and rig file that SlipLab 0.1.0 made stays readable, with its figures.
+
+The fixture was made when the five packages were top-level ones:
+``sliplab study store --protocol small.yaml --rig rehearsal --check-labels 0``.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.rigs.rig_file import load_rig_file
+from sliplab.storage.files import read_json
+from sliplab.storage.store import Store
+from tests.command_line import here
+
+FIXTURE = Path(__file__).parent / "fixtures" / "store-0.1.0.tar.xz"
+STEPS = ("sync", "label", "train", "evaluate")
+
+
+@pytest.fixture
+def older(tmp_path: Path) -> Path:
+    folder = tmp_path / "store"
+    with tarfile.open(FIXTURE) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+def run(*arguments: object) -> dict[str, Any]:
+    done = here(*arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def test_everything_in_it_is_sound_and_fresh(older: Path) -> None:
+    assert run("verify", older)["problems"] == []
+    assert {step: run(step, older)["done"] for step in STEPS} == dict.fromkeys(STEPS, 0)
+    assert len(run("trials", older)["trials"]) == 4
+
+
+def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
+    before = read_json(older / "report" / "summary.json")
+    labels = {path.name: path.read_bytes() for path in older.glob("derived/labels/small/*.json")}
+    assert len(labels) == 4
+    shutil.rmtree(older / "derived")
+    done = {step: run(step, older)["done"] for step in STEPS}
+    assert done == {"sync": 4, "label": 4, "train": 0, "evaluate": 1}
+    again = {path.name: path.read_bytes() for path in older.glob("derived/labels/small/*.json")}
+    assert again == labels
+    run("report", older)
+    after = read_json(older / "report" / "summary.json")
+    for part in ("kinematic", "quality", "sync", "seeds"):
+        assert after[part] == before[part]
+    assert after["simulated"] is True
+
+
+def test_its_rig_file_describes_the_same_rig(older: Path) -> None:
+    (campaign,) = Store.open(older).campaigns()
+    rig, _ = load_rig_file(campaign.folder / "rig.yaml")
+    assert (rig.name, rig.simulated) == (campaign.info["rig"], True)
