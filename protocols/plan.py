@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.consistency import check_consistency
@@ -26,6 +26,9 @@ from sliplab.protocols.quantity import FILE_UNITS, canonical, to_decimal
 from sliplab.protocols.shipped import protocol_path
 from sliplab.protocols.split import assign, check_split
 from sliplab.protocols.yaml_file import KeyedError, load
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Role = Literal["measured", "reference"]
 MAX_ID = 240
@@ -61,7 +64,26 @@ class Task:
     """Which occurrence it is; with the rig's seed it decides a simulated rezero."""
 
 
-@dataclass(frozen=True)
+def condition_columns(condition: Mapping[str, str]) -> dict[str, float | str]:
+    """A condition's levels by the names of table columns.
+
+    A level with a unit is a number, and the unit stands in the column's name: ``depth_mm``, or
+    ``speed_mm_per_s`` where the unit has a slash.
+
+    Args:
+        condition: text with unit, by factor: ``{"depth": "2.4 mm"}``.
+    """
+    columns: dict[str, float | str] = {}
+    for name, text in condition.items():
+        number, _, unit = text.partition(" ")
+        if unit:
+            columns[f"{name}_{unit.replace('/', '_per_')}"] = float(number)
+        else:
+            columns[name] = number
+    return columns
+
+
+@dataclass(frozen=True, repr=False)
 class Plan:
     """A protocol expanded. Iterating gives the trials in the order they are taken."""
 
@@ -72,6 +94,28 @@ class Plan:
     _programs: dict[tuple[tuple[str, Level], ...], Program] = field(
         default_factory=dict, repr=False, compare=False
     )
+
+    def __repr__(self) -> str:
+        hours = self.total_seconds / 3600
+        return f"<Plan {self.protocol.name}: {len(self)} trials, {hours:.2f} h of motion>"
+
+    def table(self) -> pd.DataFrame:
+        """The trials as a table, in the order in which they are taken; units in the headers."""
+        import pandas as pd  # most plans are never looked at as a table
+
+        rows = [
+            {
+                "trial": trial.id,
+                "role": trial.role,
+                "block": trial.block,
+                "repetition": trial.repetition,
+                **condition_columns(self.describe(trial)),
+                "split": trial.split,
+                "motion_s": self.seconds(trial),
+            }
+            for trial in self
+        ]
+        return pd.DataFrame(rows)
 
     def __len__(self) -> int:
         return len(self.trials)

@@ -1,1 +1,74 @@
-"""SlipLab: run tactile slip experiments, from a protocol file to a report."""
+"""SlipLab: run tactile slip experiments, from a protocol file to a report.
+
+    import sliplab
+
+    plan = sliplab.plan("pilot")
+    store = sliplab.collect("pilot", rig="rehearsal", store="data", trials=2)
+    store.label()
+    trial = next(iter(store))
+    events = trial.events()
+    print(trial.onsets(), len(events), events.t_ns[0])
+
+Importing this loads nothing and starts nothing; each name is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sliplab.flows.api import (
+        Events,
+        Model,
+        Onsets,
+        Poses,
+        Store,
+        Trial,
+        WindowCounts,
+        collect,
+        load_model,
+        open_store,
+        plan,
+    )
+    from sliplab.protocols.errors import InputError
+    from sliplab.protocols.plan import Plan
+    from sliplab.storage.errors import StoreError
+
+__all__ = [
+    "Events",
+    "InputError",
+    "Model",
+    "Onsets",
+    "Plan",
+    "Poses",
+    "Store",
+    "StoreError",
+    "Trial",
+    "WindowCounts",
+    "__version__",
+    "collect",
+    "load_model",
+    "open_store",
+    "plan",
+]
+__version__: str
+
+_ELSEWHERE = {
+    "InputError": "sliplab.protocols.errors",
+    "Plan": "sliplab.protocols.plan",
+    "StoreError": "sliplab.storage.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    from importlib import import_module, metadata
+
+    if name == "__version__":
+        return metadata.version("sliplab")
+    if name not in __all__:
+        raise AttributeError(f"module 'sliplab' has no attribute '{name}'")
+    return getattr(import_module(_ELSEWHERE.get(name, "sliplab.flows.api")), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sliplab.protocols.plan import condition_columns
 from sliplab.storage import catalogue_index
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Campaign, Store, StoreError
@@ -141,24 +142,13 @@ def _row(campaign: str, recording: Recording) -> dict[str, Any]:
         "frame_source": recording.frame_source,
         "sync_uncertainty_us": _us(recording.clocks["events"].get("uncertainty_ns")),
         "passed": record["quality"]["passed"],
-        **_condition(record["condition"]),
+        **condition_columns(record["condition"]),
     }
 
 
 def _us(ns: float | None) -> float | None:
     """Unknown where a trial was imported."""
     return None if ns is None else ns / 1000
-
-
-def _condition(condition: dict[str, str]) -> dict[str, Any]:
-    columns: dict[str, Any] = {}
-    for name, text in condition.items():
-        number, _, unit = text.partition(" ")
-        if unit:
-            columns[f"{name}_{unit.replace('/', '_per_')}"] = float(number)
-        else:
-            columns[name] = number
-    return columns
 
 
 def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
