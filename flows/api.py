@@ -178,10 +178,7 @@ class Trial:
         try:
             return Derived.of(self._store, "labels", self.campaign).read(self.id)
         except FileNotFoundError:
-            raise StoreError(
-                f"{self.campaign}/{self.id}: has no label yet; run `sliplab label` or "
-                "`Store.label()`"
-            ) from None
+            raise self._unlabelled() from None
 
     def onsets(self) -> Onsets:
         """The onsets of the label, by the rule that the protocol names.
@@ -201,9 +198,16 @@ class Trial:
         Raises:
             StoreError: the trial has no label yet.
         """
-        assert self.label is not None
-        found = Derived.of(self._store, "labels", self.campaign).arrays(self.id)
+        try:
+            found = Derived.of(self._store, "labels", self.campaign).arrays(self.id)
+        except FileNotFoundError:
+            raise self._unlabelled() from None
         return found["frame_ns"], found["displacement_px"].astype(np.float64)
+
+    def _unlabelled(self) -> StoreError:
+        return StoreError(
+            f"{self.campaign}/{self.id}: has no label yet; run `sliplab label` or `Store.label()`"
+        )
 
 
 class Store:
@@ -259,8 +263,13 @@ class Store:
             if campaign in (None, item.name) and trial_id in item.committed()
         ]
         if len(found) != 1:
-            where = ", ".join(item.name for item in found) or "no campaign"
-            raise StoreError(f"{self.folder}: trial {trial_id}: is in {where}; name one campaign")
+            where = ", ".join(item.name for item in found)
+            raise StoreError(
+                f"{self.folder}: trial {trial_id}: is in several campaigns ({where}): name one"
+                if found
+                else f"{self.folder}: trial {trial_id}: there is none of this id"
+                + ("" if campaign is None else f" in campaign {campaign}")
+            )
         return Trial(self._store, found[0].name, found[0].recording(trial_id))
 
     def __iter__(self) -> Iterator[Trial]:
@@ -305,9 +314,11 @@ class Store:
         return sorted((self.folder / "models").glob("*.pt"))
 
     def _run(self, step: str, campaigns: Sequence[str] | None) -> dict[str, Any]:
+        from sliplab.flows.running import stopping
         from sliplab.flows.steps import run_step
 
-        return run_step(self.folder, None if campaigns is None else list(campaigns), step)
+        with stopping.signals():
+            return run_step(self.folder, None if campaigns is None else list(campaigns), step)
 
 
 class Model:
@@ -423,6 +434,7 @@ def collect(
         CampaignStopped: collection cannot go on; the message says why.
     """
     from sliplab.flows.planning.orders import make_order
+    from sliplab.flows.running import stopping
     from sliplab.flows.steps import prepare_store
 
     if trials is not None and trials < 1:
@@ -434,5 +446,6 @@ def collect(
     prepare_store(order.store)
     from sliplab.flows.collecting.collect import collect as take
 
-    take(order)
+    with stopping.signals():
+        take(order)
     return open_store(order.store)
