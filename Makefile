@@ -1,10 +1,11 @@
 # Every target sets up .venv once and is quick the next time.
 PYTHON ?= python3
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest
 DONE := .venv/.installed
 LINKS := build/lint
 
-.PHONY: setup demo test test-long lint links docs bench clean
+.PHONY: setup demo test test-programs test-realtime test-long lint links docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -18,12 +19,19 @@ demo: $(DONE)
 	$(BIN)/sliplab demo
 
 test: $(DONE)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not realtime and not long'
-	$(BIN)/python -m pytest -m 'realtime and not long'
+	$(PYTEST) -n 2 --dist worksteal -m 'not realtime and not programs and not long'
+
+# whole programs, servers and clusters; they wait more than they compute
+test-programs: $(DONE)
+	$(PYTEST) -n 3 --dist worksteal -m 'programs and not realtime and not long'
+
+# stand-ins in real time
+test-realtime: $(DONE)
+	$(PYTEST) -n 2 --dist worksteal -m 'realtime and not long'
 
 # further cases of what has been tested, which take longer than they tell
 test-long: $(DONE)
-	$(BIN)/python -m pytest -m long
+	$(PYTEST) -m long
 
 lint: $(DONE) links
 	$(BIN)/ruff check .

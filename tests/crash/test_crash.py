@@ -6,8 +6,12 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.conftest import ROOT
 from tests.crash.__main__ import PARTS
+
+pytestmark = pytest.mark.programs
 
 
 def test_a_short_crash_test() -> None:

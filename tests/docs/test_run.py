@@ -9,11 +9,15 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+import pytest
+
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from tests.conftest import ROOT
 from tests.docs.blocks import PAGES, Command, commands
 from tests.docs.walk import run
+
+pytestmark = pytest.mark.programs
 
 ORDER = (
     "plan", "schema", "rigs", "check", "trials", "verify", "migrate", "sync", "teach", "calibrate",

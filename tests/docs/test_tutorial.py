@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import ROOT
 from tests.docs.walk import walk
+
+pytestmark = pytest.mark.programs
 
 
 def test_the_tutorial_runs_as_printed(tmp_path: Path) -> None:

@@ -35,6 +35,8 @@ from sliplab.storage.files import write_bytes
 from sliplab.storage.store import Store, StoreError
 from tests.flows.conftest import tiny, tiny_gravity, write
 
+pytestmark = pytest.mark.programs
+
 
 def store_of(ran: tuple[list[Order], Outcome]) -> Store:
     """The study's store."""

@@ -21,6 +21,8 @@ from sliplab.flows.study_searches import searches
 from sliplab.protocols.errors import InputError
 from sliplab.storage.store import Store
 
+pytestmark = pytest.mark.programs
+
 NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
 
 

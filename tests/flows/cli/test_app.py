@@ -131,6 +131,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {trial.name: read_json(trial / "checksums.json") for trial in trials.iterdir()}
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize(
     "number",
     [signal.SIGKILL, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)],

@@ -25,6 +25,8 @@ from tests.command_line import SLIPLAB, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 
+pytestmark = pytest.mark.programs
+
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 

@@ -36,6 +36,8 @@ from tests.flows.conftest import six_trials
 from tests.flows.listening import listening
 from tests.storage.remotes import tree
 
+pytestmark = pytest.mark.programs
+
 WAIT_S = 30.0
 STEPS = (label, train, evaluate)
 

@@ -21,6 +21,8 @@ from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until
 from tests.storage.remotes import tree
 
+pytestmark = pytest.mark.programs
+
 PORT = "8786"
 
 

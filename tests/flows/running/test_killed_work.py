@@ -26,6 +26,8 @@ from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until
 
+pytestmark = pytest.mark.programs
+
 STEPS = ("sync", "label", "train", "evaluate", "report")
 FILES = {"sync": 6, "label": 6, "train": 5, "evaluate": 4, "report": 3}
 """Fewer than how many files each has written when it is killed."""

@@ -26,6 +26,8 @@ from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.flows.serving.serving import until
 
+pytestmark = pytest.mark.programs
+
 END_S = 60.0
 """Generous: a run that waits for its server takes many minutes."""
 STOP_S = 20.0

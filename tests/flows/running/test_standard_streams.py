@@ -17,6 +17,8 @@ from sliplab.flows.running import standard_streams
 from sliplab.flows.running.standard_streams import OutputLost
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.programs
+
 PIPE_BYTES = 4096
 PLAN = f"{sys.executable} -m flows plan {ROOT / 'protocols' / 'kinematic.yaml'}"
 LOST = "error: the result cannot be written to standard output: "

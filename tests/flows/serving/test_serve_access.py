@@ -24,6 +24,8 @@ from sliplab.storage.store import Store
 from tests.conftest import ROOT
 from tests.flows.serving.serving import Page, serving, until
 
+pytestmark = pytest.mark.programs
+
 EVIL = "http://evil.example"
 RUN = {"parameters": {"wanted": {"protocol": "pilot.yaml"}}, "state": {"type": "SCHEDULED"}}
 

@@ -11,7 +11,7 @@ from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 from tests.flows.serving.serving import Page, serving
 
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.programs]
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,8 @@ from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 from tests.flows.serving.serving import FINAL, Page, serving, until
 
+pytestmark = pytest.mark.programs
+
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 
