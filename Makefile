@@ -5,7 +5,7 @@ PYTEST := $(BIN)/python -m pytest
 DONE := .venv/.installed
 LINKS := build/lint
 
-.PHONY: setup demo test test-programs test-realtime test-long lint links docs bench clean
+.PHONY: setup demo test test-programs test-realtime test-long lint types imports links docs bench clean
 .DEFAULT_GOAL := setup
 
 setup: $(DONE)
@@ -33,10 +33,14 @@ test-realtime: $(DONE)
 test-long: $(DONE)
 	$(PYTEST) -m long
 
-lint: $(DONE) links
+lint: types imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(DONE) links
 	$(BIN)/mypy
+
+imports: $(DONE) links
 	cd $(LINKS) && $(CURDIR)/$(BIN)/lint-imports --config $(CURDIR)/pyproject.toml
 
 # the packages as they are installed: tools that only look at files do not find them otherwise

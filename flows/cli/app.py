@@ -45,6 +45,24 @@ app = typer.Typer(
 )
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        console.show(f"sliplab {version('sliplab')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
+
+
 @app.command()
 def plan(
     protocol: ProtocolArgument,
