@@ -62,8 +62,8 @@ class Read:
         for chunk in chunks.RrdReader(path).stream():
             table = chunk.to_record_batch()
             times = [None] * table.num_rows
-            if view.TIMELINE in table.schema.names:
-                times = table.column(view.TIMELINE).cast("int64").to_pylist()
+            if view_streams.TIMELINE in table.schema.names:
+                times = table.column(view_streams.TIMELINE).cast("int64").to_pylist()
             for name in table.schema.names:
                 if ":" in name:
                     cells = zip(times, table.column(name).to_pylist(), strict=True)
