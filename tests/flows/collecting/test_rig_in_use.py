@@ -33,8 +33,8 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a device was opened")
 
     for place in (
-        "sliplab.flows.collecting.stretch.build_rig", "sliplab.rigs.build.build_rig", "sliplab.flows.cli.rigs.reach",
-        "sliplab.rigs.reach.reach",
+        "flows.collecting.stretch.build_rig", "rigs.build.build_rig", "flows.cli.rigs.reach",
+        "rigs.reach.reach",
     ):  # fmt: skip
         monkeypatch.setattr(f"sliplab.{place}", opened)
     name = next(iter(lock_names(load_rig_file(UR5)[0])))
