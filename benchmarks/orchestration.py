@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks.catalogues import catalogue_figures
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, spread
 from benchmarks.start_up import startup_seconds
-from sliplab.flows.running.orchestration import Parcel, begin, embedded, prepare, run
+from sliplab.flows.running.orchestration import Opaque, begin, embedded, prepare, run
 
 DRAIN_LIMIT_S = 120.0
 
@@ -68,18 +68,18 @@ def _flows() -> Any:
     from sliplab.flows.collecting.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
-    def collect(wanted: Parcel[tuple[range, int, Any]]) -> str:
+    def collect(wanted: Opaque[tuple[range, int, Any]]) -> str:
         every, size, look = wanted.content
         session: Any = _Steps()
         for at in range(0, len(every), size):
-            take_trials(Parcel(session), Parcel(every[at : at + size]))
+            take_trials(Opaque(session), Opaque(every[at : at + size]))
             look(session.taken)
         if session.taken != len(every):
             raise RuntimeError(f"{session.taken} of {len(every)} trials were taken")
         return str(flow_run.id)
 
     @flow(name="empty", validate_parameters=False, persist_result=False)
-    def empty(wanted: Parcel[None]) -> None:
+    def empty(wanted: Opaque[None]) -> None:
         assert wanted.content is None
 
     return collect, empty
@@ -97,12 +97,12 @@ def _compare(trials: int, runs: int) -> Figures:
 
     def through_prefect(name: str, size: int) -> None:
         before = time.process_time() + _server_cpu_s()
-        run_id = run(collect, Parcel((every, size, lambda taken: None)))
+        run_id = run(collect, Opaque((every, size, lambda taken: None)))
         _drained(run_id, -(-trials // size))
         spent[name].append(time.process_time() + _server_cpu_s() - before)
 
     def alone() -> None:
-        run(empty, Parcel(None))
+        run(empty, Opaque(None))
 
     one_plan, a_run_each = _bluesky(trials)
     taken = alternate(
@@ -165,7 +165,7 @@ def _memory(long: int) -> Figures:
             held[taken] = (resident_mb(), resident_mb(server.pid))
 
     collect, _ = _flows()
-    run_id = run(collect, Parcel((range(long), 1, look)))
+    run_id = run(collect, Opaque((range(long), 1, look)))
     _drained(run_id, long)
     (ours, its), (ours_late, its_late) = held[long // 10], held[long]
     return {"memory_growth_mb": ours_late - ours, "server_growth_mb": its_late - its}

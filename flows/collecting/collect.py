@@ -18,7 +18,7 @@ from sliplab.flows.collecting.showing import shown
 from sliplab.flows.collecting.stretch import owned, refresh, stretch
 from sliplab.flows.planning.orders import Order, campaign_counts, check_disk
 from sliplab.flows.running import console, stopping
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols import Trial
 from sliplab.storage import control
@@ -28,14 +28,14 @@ MOCK_BATCH = 25
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
-def take_trials(session: Parcel[Session], trials: Parcel[list[Trial]]) -> int:
+def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
     """Take some trials; returns how many."""
     session.content.take(trials.content)
     return len(trials.content)
 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
-def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
+def collect_flow(order: Opaque[Order]) -> dict[str, Any]:
     """Take the trials of an order that its store lacks."""
     wanted = order.content
     with (
@@ -61,7 +61,7 @@ def collect_flow(order: Parcel[Order]) -> dict[str, Any]:
                 size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
                 while trials:
                     for start in range(0, len(trials), size):
-                        take_trials(Parcel(session), Parcel(trials[start : start + size]))
+                        take_trials(Opaque(session), Opaque(trials[start : start + size]))
                     trials = work.boundary.more() if wanted.most is None else []
                     bar.extend(len(trials))
                     page.more(len(trials))
@@ -88,5 +88,5 @@ def collect(order: Order) -> dict[str, Any]:
             carry_out(store)
     if order.wanted(store.campaign(order.campaign)):
         check_disk([order])
-        return run(collect_flow, Parcel(order))
+        return run(collect_flow, Opaque(order))
     return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}

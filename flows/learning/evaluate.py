@@ -24,7 +24,7 @@ from sliplab.flows.learning.train import Model, rules_of, training_settings, wan
 from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import key_inputs, score_windows
 from sliplab.flows.running.campaigns import Collected, training_campaigns
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.settings import Detection
 from sliplab.storage.derived import Derived, make_key
@@ -121,7 +121,7 @@ def evaluation_of(store: Store) -> tuple[str, dict[str, Any]]:
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(wanted: Parcel[tuple[Job, SampleSet, SampleSet]]) -> None:
+def score(wanted: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
     job, train, test = wanted.content
     settings = training_settings(job.campaigns)
@@ -166,7 +166,7 @@ def trial_counts(
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
-def evaluate_flow(wanted: Parcel[Job]) -> None:
+def evaluate_flow(wanted: Opaque[Job]) -> None:
     """Count spikes where needed, then score."""
     job = wanted.content
     with timed(job.store, "evaluate"):
@@ -183,7 +183,7 @@ def evaluate_flow(wanted: Parcel[Job]) -> None:
             load_samples(job.labels, job.campaigns, split, job.cluster)
             for split in ("train", "test")
         )
-        score(Parcel((job, train, test)))
+        score(Opaque((job, train, test)))
 
 
 def evaluate(
@@ -199,7 +199,7 @@ def evaluate(
     job = make_job(store, campaigns, margin, smoothing, cluster, reviewed)
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
-        run(evaluate_flow, Parcel(job), cluster)
+        run(evaluate_flow, Opaque(job), cluster)
     stale |= judge_beside(store, campaigns, cluster, reviewed)
     return {
         "step": "evaluate",

@@ -31,7 +31,7 @@ from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import intervals_of
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, training_campaigns
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.errors import InputError
@@ -175,7 +175,7 @@ class Judgement:
         """Compute it if anything changed; whether it did."""
         stale = not Derived.of(self.store, STEP).fresh(self.network.name, self.key)
         if stale:
-            run(_flow, Parcel(self), self.cluster)
+            run(_flow, Opaque(self), self.cluster)
         return stale
 
 
@@ -298,7 +298,7 @@ def kept(store: Store, campaigns: list[Collected], reviewed: bool = False) -> di
 
 
 @flow(name="judge a network", validate_parameters=False, persist_result=False)
-def _flow(wanted: Parcel[Judgement]) -> None:
+def _flow(wanted: Opaque[Judgement]) -> None:
     """Count spikes of every test trial, then score."""
     job = wanted.content
     with timed(job.store, "evaluate"):

@@ -21,7 +21,7 @@ from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.campaigns import Collected, training_campaigns
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
@@ -141,7 +141,7 @@ def _models(
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
-def train_one(job: Parcel[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
+def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     """Train one network and keep it."""
     model, train, validation, simulated = job.content
     settings = model.settings
@@ -191,7 +191,7 @@ def begun(model: Model) -> bytes | None:
 
 @flow(name="train", validate_parameters=False, persist_result=False)
 def train_flow(
-    wanted: Parcel[tuple[Labels, list[Collected], list[Model], Cluster | None]],
+    wanted: Opaque[tuple[Labels, list[Collected], list[Model], Cluster | None]],
 ) -> int:
     """Train the seeds that are stale, one after the other."""
     labels, campaigns, models, cluster = wanted.content
@@ -203,7 +203,7 @@ def train_flow(
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
         for model in models:
-            train_one(Parcel((model, train, validation, simulated)))
+            train_one(Opaque((model, train, validation, simulated)))
     return len(models)
 
 
@@ -231,7 +231,7 @@ def train(
     stale = [model for model in models if not model.fresh]
     if stale:
         _check_device(training_campaigns(campaigns)[0])
-        run(train_flow, Parcel((labels, campaigns, stale, cluster)), cluster)
+        run(train_flow, Opaque((labels, campaigns, stale, cluster)), cluster)
     return {
         "step": "train",
         "done": len(stale),

@@ -25,7 +25,7 @@ from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.reporting.summary import make_summary
 from sliplab.flows.running import timing
 from sliplab.flows.running.campaigns import Collected
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
 from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import make_folder, read_json, write_json, write_text
@@ -79,7 +79,7 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)
-def report_flow(wanted: Parcel[tuple[Store, list[Collected], str]]) -> None:
+def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
     """Write page and summary; the summary last, with the key."""
     store, campaigns, key = wanted.content
     folder = report_folder(store)
@@ -141,7 +141,7 @@ def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         or not (report_folder(store) / "index.html").exists()
     )
     if stale:
-        run(report_flow, Parcel((store, campaigns, key)))
+        run(report_flow, Opaque((store, campaigns, key)))
     return {"step": "report", "done": int(stale), "fresh": int(not stale)}
 
 

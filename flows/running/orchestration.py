@@ -31,26 +31,26 @@ _servers: dict[str, EmbeddedServer] = {}
 _store: Path | None = None
 
 
-class Parcel(Generic[T]):
-    """Carries any object into a flow or task without Prefect validating, walking or storing it.
+class Opaque(Generic[T]):
+    """Opaque flow or task argument: Prefect does not validate, walk or store its content.
 
-    It stays in its process: with a task that runs elsewhere Prefect also sends what its flow was
-    called with, which that task has no use for.
+    Pickled without its content: with a task that runs elsewhere Prefect also sends the arguments
+    of its flow, which that task has no use for.
     """
 
     def __init__(self, content: T) -> None:
         self.content = content
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Without its content."""
+        """Pickle without the content."""
         return type(self), (None,)
 
 
-class Freight(Parcel[T]):
-    """A parcel that goes to other processes with its content."""
+class Pickled(Opaque[T]):
+    """Opaque argument that is pickled with its content, for tasks in other processes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """With its content."""
+        """Pickle with the content."""
         return type(self), (self.content,)
 
 
@@ -104,7 +104,7 @@ def private() -> bool:
     return PREFECT_API_URL.value() in {None, *(server.address for server in _servers.values())}
 
 
-def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
+def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Inside a flow that is served it is part of that flow's run, which has an end of its own.
@@ -125,7 +125,7 @@ def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
     from sliplab.flows.running import run_events
 
     if FlowRunContext.get() is not None:
-        return flow.fn(parcel)
+        return flow.fn(argument)
     updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
     server = run_records.server_name(PREFECT_API_URL.value())
     calls = server_calls.Calls(server, _store)
@@ -147,4 +147,4 @@ def run(flow: Any, parcel: Parcel[Any], cluster: Cluster | None = None) -> Any:
         context = SyncClientContext()
         calls.through(context.client)
         with context:
-            return flow(parcel)
+            return flow(argument)

@@ -19,7 +19,7 @@ from prefect.cache_policies import NO_CACHE
 from prefect.settings import PREFECT_API_URL
 
 from sliplab.flows.running import stopping
-from sliplab.flows.running.orchestration import Freight, Parcel
+from sliplab.flows.running.orchestration import Opaque, Pickled
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -62,7 +62,7 @@ def spread(
     ) as pool:
         try:
             for start in range(0, len(jobs), CHUNK):
-                local(Parcel((piece, jobs[start : start + CHUNK], start, pool, done)))
+                local(Opaque((piece, jobs[start : start + CHUNK], start, pool, done)))
         except BrokenProcessPool:
             raise WorkerKilled(
                 f"{name}: a worker process was killed, perhaps because memory was short; what was "
@@ -76,7 +76,7 @@ def spread(
 
 @flow(name="pieces", validate_parameters=False, persist_result=False)
 def spread_flow(
-    wanted: Parcel[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
+    wanted: Opaque[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
 ) -> int:
     """`spread` for who has no flow. In a module: Prefect sends a flow along with its tasks."""
     spread(*wanted.content)
@@ -85,10 +85,10 @@ def spread_flow(
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
 def _local_chunk(
-    parcel: Parcel[tuple[Piece, Sequence[Any], int, ProcessPoolExecutor, Done]],
+    argument: Opaque[tuple[Piece, Sequence[Any], int, ProcessPoolExecutor, Done]],
 ) -> int:
     """Some pieces on all cores; each is handed over as soon as it is there."""
-    piece, jobs, start, pool, done = parcel.content
+    piece, jobs, start, pool, done = argument.content
     futures = {pool.submit(piece, job): start + k for k, job in enumerate(jobs)}
     for future in as_completed(futures):
         done(futures[future], future.result())
@@ -106,7 +106,7 @@ def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluste
     remote = _remote_chunk.with_options(name=f"{name} trials")
     program = this_program()
     futures = [
-        remote.submit(Freight((piece, jobs[start : start + size], program))) for start in starts
+        remote.submit(Pickled((piece, jobs[start : start + size], program))) for start in starts
     ]
 
     def handed_over(number: int, results: list[Any]) -> None:
@@ -120,10 +120,10 @@ def _on_cluster(name: str, piece: Piece, jobs: Sequence[Any], done: Done, cluste
 
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
-def _remote_chunk(freight: Freight[tuple[Piece, Sequence[Any], dict[str, str]]]) -> list[Any]:
+def _remote_chunk(payload: Pickled[tuple[Piece, Sequence[Any], dict[str, str]]]) -> list[Any]:
     """Some pieces, one after the other, on a worker that may have joined after the others."""
     from sliplab.flows.running.cluster import same_program
 
-    piece, jobs, program = freight.content
+    piece, jobs, program = payload.content
     same_program(program)
     return [piece(job) for job in jobs]

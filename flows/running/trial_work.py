@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow
 
 from sliplab.flows.running import console
-from sliplab.flows.running.orchestration import Parcel, run
+from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.spread import Done, spread
 from sliplab.flows.running.timing import timed
 from sliplab.storage.derived import Derived
@@ -99,11 +99,11 @@ def run_trials(
     """Make every result of `work` and keep it among the derived results of `step`."""
     if work:
         named = _trials_flow.with_options(name=title, validate_parameters=False)
-        run(named, Parcel(_Step(store, step, title, work, make, cluster)), cluster)
+        run(named, Opaque(_Step(store, step, title, work, make, cluster)), cluster)
 
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
-def _trials_flow(wanted: Parcel[_Step]) -> int:
+def _trials_flow(wanted: Opaque[_Step]) -> int:
     """All that is stale."""
     step = wanted.content
     with timed(step.store, step.title):

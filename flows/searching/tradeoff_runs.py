@@ -113,7 +113,7 @@ def everywhere(
     Args:
         done: called in this thread after each.
     """
-    from sliplab.flows.running.orchestration import Parcel
+    from sliplab.flows.running.orchestration import Opaque
     from sliplab.flows.running.orchestration import run as orchestrate
     from sliplab.flows.running.spread import spread_flow
 
@@ -123,7 +123,7 @@ def everywhere(
         found[number] = result
         done()
 
-    orchestrate(spread_flow, Parcel(("trade-off", piece, jobs, keep, cluster)), cluster)
+    orchestrate(spread_flow, Opaque(("trade-off", piece, jobs, keep, cluster)), cluster)
     return [found[number] for number in range(len(jobs))]
 
 

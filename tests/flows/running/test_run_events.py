@@ -16,7 +16,7 @@ from prefect.settings import temporary_settings
 
 from benchmarks.orchestration import _drained
 from sliplab.flows.running import embedded_database
-from sliplab.flows.running.orchestration import Parcel, embedded, run
+from sliplab.flows.running.orchestration import Opaque, embedded, run
 
 COUNT = 120
 
@@ -30,7 +30,7 @@ def quick(number: int) -> int:
 
 
 @flow(name="many", validate_parameters=False, persist_result=False)
-def many(told: Parcel[list[str]]) -> None:
+def many(told: Opaque[list[str]]) -> None:
     """Many quick tasks, of which the last fails."""
     told.content.append(str(flow_run.id))
     for number in range(COUNT):
@@ -40,7 +40,7 @@ def many(told: Parcel[list[str]]) -> None:
 def test_every_quick_task_run_is_kept_with_its_end() -> None:
     told: list[str] = []
     with pytest.raises(ValueError, match="the last one fails"):
-        run(many, Parcel(told))
+        run(many, Opaque(told))
     _drained(told[0], COUNT - 1)
     found: list[dict[str, Any]] = []
     for offset in (0, 100):
