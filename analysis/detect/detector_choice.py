@@ -35,7 +35,7 @@ class Judged:
 
 def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
     """What a detector makes of trials."""
-    return [Judged(detector.hear(t.heard), t.slip) for t in trials]
+    return [Judged(detector.evidence(t.predictions), t.slip) for t in trials]
 
 
 def allowed_early(rate: float, trials: int) -> int:

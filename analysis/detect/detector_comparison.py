@@ -22,10 +22,10 @@ from sliplab.analysis.detect.detector_choice import (
 )
 from sliplab.analysis.detect.detectors import (
     Detector,
-    Heard,
     Labelled,
     Learned,
     Levels,
+    Predictions,
     Smoothing,
     decide,
     learn,
@@ -91,8 +91,10 @@ def compare(
 
 def thinned(trial: Labelled, every: int) -> Labelled:
     """A trial with each `every`-th of its windows, the first one among them."""
-    heard = trial.heard
-    kept = Heard(heard.counts[::every], heard.events[::every], heard.end_ns[::every])
+    predictions = trial.predictions
+    kept = Predictions(
+        predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
+    )
     return Labelled(kept, trial.slip)
 
 

@@ -27,8 +27,8 @@ IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What detectors may hear of one trial.
+class Predictions:
+    """Predictions of one trial: the input of every detector.
 
     Attributes:
         counts: int64 (n, 3), the network's output spikes in each window.
@@ -58,12 +58,12 @@ class Heard:
 class Labelled:
     """A trial with its true slip, on the time line of its windows."""
 
-    heard: Heard
+    predictions: Predictions
     slip: TrueSlip
 
     def states(self, length_ns: int) -> IntArray:
         """The class that each window of this length holds most of, by its middle; int64 (n,)."""
-        middle = self.heard.end_ns - length_ns // 2
+        middle = self.predictions.end_ns - length_ns // 2
         return (middle >= self.slip.incipient_ns).astype(np.int64) + (middle >= self.slip.gross_ns)
 
 
@@ -86,7 +86,7 @@ class Evidence:
 class Detector(Protocol):
     """Evidence that slip has begun."""
 
-    def hear(self, heard: Heard) -> Evidence:
+    def evidence(self, predictions: Predictions) -> Evidence:
         """The evidence of one trial."""
 
 
@@ -99,11 +99,13 @@ class Smoothing:
 
     width: int
 
-    def hear(self, heard: Heard) -> Evidence:
+    def evidence(self, predictions: Predictions) -> Evidence:
         """See `Detector`."""
-        gross = lead_of(heard.counts, self.width, GROSS)
+        gross = lead_of(predictions.counts, self.width, GROSS)
         return Evidence(
-            heard.end_ns, lead_of(heard.counts, self.width, INCIPIENT), lambda first: gross
+            predictions.end_ns,
+            lead_of(predictions.counts, self.width, INCIPIENT),
+            lambda first: gross,
         )
 
 
@@ -122,9 +124,9 @@ class Reading:
     events: bool
     weight: float
 
-    def log(self, heard: Heard) -> FloatArray:
+    def log(self, predictions: Predictions) -> FloatArray:
         """Log likelihoods float64 (n, 3)."""
-        return self.weight * self.likelihood.log(features(heard, self.events))
+        return self.weight * self.likelihood.log(features(predictions, self.events))
 
 
 @dataclass(frozen=True)
@@ -134,11 +136,11 @@ class Filter:
     chain: Chain
     reading: Reading
 
-    def hear(self, heard: Heard) -> Evidence:
+    def evidence(self, predictions: Predictions) -> Evidence:
         """See `Detector`."""
-        belief = forward(self.chain, self.reading.log(heard))
+        belief = forward(self.chain, self.reading.log(predictions))
         gross = log_odds(belief, GROSS)
-        return Evidence(heard.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
+        return Evidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
 
 
 @dataclass(frozen=True)
@@ -147,9 +149,9 @@ class Cusum:
 
     reading: Reading
 
-    def hear(self, heard: Heard) -> Evidence:
+    def evidence(self, predictions: Predictions) -> Evidence:
         """See `Detector`."""
-        log = self.reading.log(heard)
+        log = self.reading.log(predictions)
         ratio = log[:, GROSS] - log[:, INCIPIENT]
 
         def gross_after(first: int) -> FloatArray:
@@ -157,7 +159,7 @@ class Cusum:
             out[first + 1 :] = cusum(ratio[first + 1 :])
             return out
 
-        return Evidence(heard.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after)
+        return Evidence(predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after)
 
 
 @dataclass(frozen=True)
@@ -184,15 +186,15 @@ def first_above(evidence: FloatArray, level: float, start: int = 0) -> int | Non
     return start + int(found[0]) if len(found) else None
 
 
-def features(heard: Heard, events: bool) -> FloatArray:
+def features(predictions: Predictions, events: bool) -> FloatArray:
     """The counts; if wanted, the logarithm of one plus the events, and all products of two.
 
     float64 (n, 3), or (n, 14) with events; the counts come first.
     """
-    counts = heard.counts.astype(np.float64)
+    counts = predictions.counts.astype(np.float64)
     if not events:
         return counts
-    each = [*counts.T, np.log1p(heard.events)]
+    each = [*counts.T, np.log1p(predictions.events)]
     products = [one * other for k, one in enumerate(each) for other in each[k:]]
     return np.stack([*each, *products], axis=1)
 
@@ -213,7 +215,7 @@ class Learned:
         """A filter and a test for each reading, by name.
 
         Args:
-            stride_share: stride over length of the windows that they will hear.
+            stride_share: stride over length of the windows that they will read.
         """
         # a state is left as often per second whatever the stride
         chain = Chain(-np.expm1(stride_share * np.log1p(-self.chain.leave)))
@@ -233,7 +235,7 @@ def learn(trials: Sequence[Labelled], length_ns: int, most: int) -> Learned:
     """
     labels = [trial.states(length_ns) for trial in trials]
     flat = np.concatenate([np.empty(0, np.int64), *labels])
-    both = np.concatenate([np.empty((0, 14)), *(features(t.heard, True) for t in trials)])
+    both = np.concatenate([np.empty((0, 14)), *(features(t.predictions, True) for t in trials)])
     counts = both[:, :3]
     classes = len(CLASSES)
     return Learned(

@@ -1,7 +1,7 @@
 """A slip goes one way: the forward filter of a left-to-right hidden Markov model.
 
 A trial is at rest, then slips at its rim, then slips as a whole, and never goes back. That is all
-this model knows besides what a window looks like in each state, and it is why it can hear a weak
+this model knows besides what a window looks like in each state, and it is why it can detect a weak
 change earlier than an average can: evidence adds up over windows instead of being forgotten. The
 recursion is the forward one of Rabiner (1989), equation 19, normalised at every step and kept in
 logarithms, so that neither thousands of windows nor an impossible one underflow.

@@ -1,4 +1,4 @@
-"""What detectors hear of a trial: spikes and events of windows at any stride, kept once made.
+"""Predictions that detectors read: spikes and events of windows at any stride, kept once made.
 
 Consecutive windows of the trials that are scored are counted by `flows.learning.counting`; this is
 for windows that overlap, and for the trials that detectors learn from and are set by.
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.carried import carried_spikes, trailing_sums
+from sliplab.analysis.detect.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.nets import dataset, model_file, training
 from sliplab.analysis.nets.samples import strided_windows
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
@@ -27,13 +27,14 @@ from sliplab.storage.store import Store
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
-HEARD = "heard"
+PREDICTIONS = "heard"
+"""The step's name in stores and keys."""
 VERSION = 1
 
 
-def heard_step(stride_ms: int, carried: bool = False) -> str:
-    """Where results of a stride stand: those of different strides do not displace each other."""
-    return f"{HEARD}_{'carried_' if carried else ''}{stride_ms}ms"
+def predictions_step(stride_ms: int, carried: bool = False) -> str:
+    """Name of a stride's step: results of different strides do not displace each other."""
+    return f"{PREDICTIONS}_{'carried_' if carried else ''}{stride_ms}ms"
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Wanted:
     """Windows of one trial at one stride.
 
     Attributes:
-        carried: neurons keep their states from each window to the next.
+        carried: stateful inference; neurons keep their states from each window to the next.
         key: what the result must have been made with.
     """
 
@@ -53,8 +54,8 @@ class Wanted:
 
     @property
     def step(self) -> str:
-        """Where the result stands."""
-        return heard_step(self.stride_ms, self.carried)
+        """Name of the step that keeps the result."""
+        return predictions_step(self.stride_ms, self.carried)
 
 
 def want(
@@ -67,13 +68,13 @@ def want(
 ) -> Wanted:
     """Windows at a stride, with the key of the model that counts them."""
     inputs = [model_key, recording.checksum, stride_ms, carried]
-    key = make_key(HEARD, VERSION, inputs, windows.model_dump(mode="json"))
+    key = make_key(PREDICTIONS, VERSION, inputs, windows.model_dump(mode="json"))
     return Wanted(campaign, recording, stride_ms, carried, key)
 
 
 @dataclass(frozen=True)
-class _Hearing:
-    """What it depends on besides the trial; `threads` of the network, None for all."""
+class _Inference:
+    """Inputs of inference besides the trial; `threads` of the network, None for all."""
 
     model: bytes
     windows: Windows
@@ -82,14 +83,14 @@ class _Hearing:
     threads: int | None
 
 
-def hear_trials(
+def predict_trials(
     store: Store,
     model: Path,
     windows: Windows,
     wanted: Sequence[Wanted],
     cluster: Cluster | None = None,
 ) -> int:
-    """Make what is stale; stands in a flow. Returns how many trials that were."""
+    """Run inference for stale trials, inside a flow; return the number of them."""
     content, threads = model.read_bytes(), None if cluster is None else 1
     made = 0
     for step in sorted({item.step for item in wanted}):
@@ -99,43 +100,43 @@ def hear_trials(
             [
                 TrialWork(
                     item.recording, item.campaign, item.key,
-                    _Hearing(content, windows, item.stride_ms, item.carried, threads),
+                    _Inference(content, windows, item.stride_ms, item.carried, threads),
                 )
                 for item in wanted
                 if item.step == step
             ],
         )  # fmt: skip
         if work:
-            keep_trials(store, step, "evaluate", work, _hear, cluster, processes=False)
+            keep_trials(store, step, "evaluate", work, _infer, cluster, processes=False)
         made += len(work)
     return made
 
 
-def heard(store: Store, wanted: Wanted) -> dict[str, npt.NDArray[Any]]:
-    """``counts`` int64 (n, 3), ``events`` int64 (n,) and ``end_ns`` int64 (n,) of a trial."""
+def predictions(store: Store, wanted: Wanted) -> dict[str, npt.NDArray[Any]]:
+    """Return ``counts`` int64 (n, 3), ``events`` int64 (n,) and ``end_ns`` int64 (n,)."""
     return Derived.of(store, wanted.step, wanted.campaign).arrays(wanted.recording.folder.name)
 
 
-def _hear(
-    recording: Recording, hearing: _Hearing
+def _infer(
+    recording: Recording, inference: _Inference
 ) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    if hearing.threads is not None:
-        training.limit_threads(hearing.threads)
-    fitted = _fitted(hearing.model)
-    return {}, _carried(recording, hearing, fitted) if hearing.carried else _reset(
-        recording, hearing, fitted
+    if inference.threads is not None:
+        training.limit_threads(inference.threads)
+    fitted = _fitted(inference.model)
+    return {}, _stateful(recording, inference, fitted) if inference.carried else _stateless(
+        recording, inference, fitted
     )
 
 
-def _reset(
-    recording: Recording, hearing: _Hearing, fitted: training.Fitted
+def _stateless(
+    recording: Recording, inference: _Inference, fitted: training.Fitted
 ) -> dict[str, npt.NDArray[Any]]:
-    """Every window a sample of its own."""
-    length_ns = hearing.windows.length_ms * 1_000_000
+    """Run inference with states reset at every window."""
+    length_ns = inference.windows.length_ms * 1_000_000
     starts = strided_windows(
-        *dataset.recorded_span(recording), length_ns, hearing.stride_ms * 1_000_000
+        *dataset.recorded_span(recording), length_ns, inference.stride_ms * 1_000_000
     )
-    x = dataset.cut_windows(recording, starts, hearing.windows)
+    x = dataset.cut_windows(recording, starts, inference.windows)
     return {
         "counts": training.predict_counts(fitted, x),
         "events": x.totals,
@@ -143,22 +144,22 @@ def _reset(
     }
 
 
-def _carried(
-    recording: Recording, hearing: _Hearing, fitted: training.Fitted
+def _stateful(
+    recording: Recording, inference: _Inference, fitted: training.Fitted
 ) -> dict[str, npt.NDArray[Any]]:
-    """One run through the trial; windows are where one looks back."""
-    windows = hearing.windows
+    """Run inference once through the trial; windows are trailing sums of its spikes."""
+    windows = inference.windows
     x, ends = dataset.trial_windows(recording, windows)
-    spikes = carried_spikes(training.engine(fitted), x)
+    spikes = stateful_spikes(training.engine(fitted), x)
     running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
     events = np.diff(running[x.offsets])
-    length, stride = windows.steps, hearing.stride_ms // windows.step_ms
+    length, stride = windows.steps, inference.stride_ms // windows.step_ms
     counts = trailing_sums(spikes, length, stride)
     first = int(ends[0]) if len(ends) else 0
     return {
         "counts": counts,
         "events": trailing_sums(events[:, None], length, stride)[:, 0],
-        "end_ns": first + np.arange(len(counts), dtype=np.int64) * hearing.stride_ms * 1_000_000,
+        "end_ns": first + np.arange(len(counts), dtype=np.int64) * inference.stride_ms * 1_000_000,
     }
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.detect.detector_comparison import Parts, compare
-from sliplab.analysis.detect.detectors import Heard, Labelled
+from sliplab.analysis.detect.detectors import Labelled, Predictions
 from sliplab.analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
 from sliplab.analysis.detect.true_slip import TrueSlip, true_slip
 from sliplab.flows.labelling.reviewed import Labels
-from sliplab.flows.learning.detector_trials import Wanted, heard, want
+from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.recording import Recording
@@ -35,7 +35,7 @@ class DetectorWork:
         choosing: by campaign, the trials that choose its smoothing and margin; empty where the
             protocol says them.
         compared: ``train``, ``validation`` and ``test`` trials of the comparison; None without.
-        carried: the same with states carried; None without.
+        carried: the same by stateful inference; None without.
     """
 
     scored: list[Wanted]
@@ -116,7 +116,7 @@ def detector_work(
     settings = used[0].settings
     length = settings.windows.length_ms
 
-    def hear(name: str, recording: Recording, stride_ms: int, carried: bool = False) -> Wanted:
+    def wanted_of(name: str, recording: Recording, stride_ms: int, carried: bool = False) -> Wanted:
         return want(name, recording, model_key, settings.windows, stride_ms, carried)
 
     def known(
@@ -132,7 +132,7 @@ def detector_work(
                     return found
                 found.append(
                     Known(
-                        hear(item.name, recording, stride_ms, carried),
+                        wanted_of(item.name, recording, stride_ms, carried),
                         labels.key(item, recording),
                         slip,
                     )
@@ -152,7 +152,7 @@ def detector_work(
                     "and no kinematic one has both onsets"
                 )
         if ours.stride_ms is not None:
-            scored += [hear(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
+            scored += [wanted_of(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
     fine, asked = settings.fine_stride_ms, settings.detection.compare
 
     def compared(carried: bool) -> dict[str, list[Known]] | None:
@@ -175,10 +175,10 @@ def _parts(store: Store, known: dict[str, list[Known]] | None) -> Parts | None:
 
 
 def _labelled(store: Store, trial: Known) -> Labelled:
-    arrays = heard(store, trial.wanted)
-    return Labelled(Heard(arrays["counts"], arrays["events"], arrays["end_ns"]), trial.slip)
+    arrays = predictions(store, trial.wanted)
+    return Labelled(Predictions(arrays["counts"], arrays["events"], arrays["end_ns"]), trial.slip)
 
 
 def _counted(store: Store, trial: Known) -> Counted:
-    arrays = heard(store, trial.wanted)
+    arrays = predictions(store, trial.wanted)
     return Counted(arrays["counts"], arrays["end_ns"], trial.slip)

@@ -15,7 +15,7 @@ from sliplab.flows.labelling.label_errors import label_errors, rules_compared
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import counting, window_scores
 from sliplab.flows.learning.counting import COUNTS, count_spikes
-from sliplab.flows.learning.detector_trials import hear_trials, heard_step
+from sliplab.flows.learning.detector_trials import predict_trials, predictions_step
 from sliplab.flows.learning.detector_work import detector_work
 from sliplab.flows.learning.evaluation_job import Job
 from sliplab.flows.learning.other_networks import judge_beside
@@ -161,7 +161,7 @@ def trial_counts(
     store: Store, campaign: str, trial_id: str, settings: Detection
 ) -> dict[str, npt.NDArray[Any]]:
     """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
-    step = COUNTS if settings.stride_ms is None else heard_step(settings.stride_ms)
+    step = COUNTS if settings.stride_ms is None else predictions_step(settings.stride_ms)
     return Derived.of(store, step, campaign).arrays(trial_id)
 
 
@@ -178,7 +178,7 @@ def evaluate_flow(wanted: Opaque[Job]) -> None:
             job.cluster,
         )
         windows = training_settings(job.campaigns).windows
-        hear_trials(job.store, job.model.path, windows, job.detectors.wanted, job.cluster)
+        predict_trials(job.store, job.model.path, windows, job.detectors.wanted, job.cluster)
         train, test = (
             load_samples(job.labels, job.campaigns, split, job.cluster)
             for split in ("train", "test")

@@ -28,7 +28,7 @@ class Check:
 
 
 def check_devices(order: Order) -> list[Check]:
-    """Connect every device, hear what it says of itself, and fit the clocks; nothing moves."""
+    """Connect every device, read its state, and fit the clocks; nothing moves."""
     from sliplab.rigs.rig_lock import held
 
     try:
@@ -83,7 +83,7 @@ def _check_reach(order: Order) -> list[Check]:
 
 
 def _check_clocks(order: Order, rig: Rig) -> list[Check]:
-    """Every clock that can be heard without frames, fitted as a trial's would be."""
+    """Fit every clock that needs no frames, as a trial's would be."""
     from sliplab.analysis.timeline.synchronise import streams_of, synchronise
     from sliplab.storage.hdf5 import StreamReader
     from sliplab.storage.writer import DATA, TrialWriter
@@ -95,7 +95,7 @@ def _check_clocks(order: Order, rig: Rig) -> list[Check]:
         rig.listen(LISTEN_S, writer, rate)
         with StreamReader(writer.seal() / DATA) as reader:
             streams = streams_of(reader, None)
-    heard = synchronise(streams, rig.timing, rate)
+    fitted = synchronise(streams, rig.timing, rate)
     found = [
         Check(
             f"clock: {name}",
@@ -103,9 +103,9 @@ def _check_clocks(order: Order, rig: Rig) -> list[Check]:
             f"{device.map.drift_ppm():+.1f} ppm, within {device.uncertainty_ns / 1000:.1f} us "
             f"({device.grade})",
         )
-        for name, device in heard.devices.items()
+        for name, device in fitted.devices.items()
     ]
-    return found + [Check(f"clock: {name}", False, why) for name, why in heard.refused.items()]
+    return found + [Check(f"clock: {name}", False, why) for name, why in fitted.refused.items()]
 
 
 def _said(device: DeviceHealth) -> str:

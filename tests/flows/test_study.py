@@ -299,7 +299,7 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
     assert [(s["step"], s["done"]) for s in study(orders).steps][2:] == [
         ("train", 0), ("evaluate", 1), ("report", 1),
     ]  # fmt: skip
-    # what was heard before is not heard again
+    # kept predictions are not made again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
     summary = read_summary(store)
     choice = summary["choices"]["tiny"]

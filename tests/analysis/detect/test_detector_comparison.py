@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.detect.detector_comparison import Parts, compare, thinned
-from sliplab.analysis.detect.detectors import Heard, Labelled
+from sliplab.analysis.detect.detectors import Labelled, Predictions
 from sliplab.analysis.detect.true_slip import TrueSlip
 from sliplab.protocols.settings import Comparison, Detection, Windows
 
@@ -33,7 +33,7 @@ def trial(seed: int, stride: int) -> Labelled:
     ends = np.arange(30, end + 1, stride)
     counts = sums[ends] - sums[ends - 30]
     slip = TrueSlip(onset * MS, gross * MS, int(ends[-1] + 1) * MS)
-    return Labelled(Heard(counts, counts.sum(axis=1), ends * MS), slip)
+    return Labelled(Predictions(counts, counts.sum(axis=1), ends * MS), slip)
 
 
 def parts(validation: int = 10, test: int = 10) -> Parts:
@@ -111,9 +111,9 @@ def test_one_stride_is_compared_once() -> None:
 
 def test_thinned_windows_are_the_consecutive_ones() -> None:
     fine, coarse = trial(5, 10), trial(5, 30)
-    kept = thinned(fine, 3).heard
-    assert kept.end_ns.tolist() == coarse.heard.end_ns.tolist()
-    assert (kept.counts == coarse.heard.counts).all()
+    kept = thinned(fine, 3).predictions
+    assert kept.end_ns.tolist() == coarse.predictions.end_ns.tolist()
+    assert (kept.counts == coarse.predictions.counts).all()
 
 
 @pytest.mark.parametrize("missing", ["train", "validation", "test", "compare"])

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import nn
 
-from sliplab.analysis.detect.carried import carried_spikes, trailing_sums
+from sliplab.analysis.detect.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.nets.network import (
     build,
     by_class,
@@ -33,7 +33,7 @@ def network() -> tuple[nn.Sequential, Engine]:
 
 
 def carried(engine: Engine, x: np.ndarray) -> np.ndarray:
-    return carried_spikes(engine, SparseWindows.of(x))
+    return stateful_spikes(engine, SparseWindows.of(x))
 
 
 def samples(n: int, seed: int = 0) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The network run through a whole trial without a pause: its neurons keep what they hold.
+"""Stateful inference: the network runs through a whole trial and its neurons are never reset.
 
 Everywhere else a window is a sample of its own and every neuron starts it at zero. Here each step
 goes on from the last, as it would on a chip that nobody resets, and the spikes of the last 30 ms
@@ -19,7 +19,7 @@ from sliplab.analysis.nets.sparse import SparseWindows
 from sliplab.analysis.nets.spiking import Engine
 
 
-def carried_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
+def stateful_spikes(engine: Engine, x: SparseWindows) -> npt.NDArray[np.uint8]:
     """Output spikes of every step of consecutive windows, states kept from each to the next.
 
     Args:
