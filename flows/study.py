@@ -63,19 +63,19 @@ def study(
     ledger = Ledger(orders[0].store, expected(orders, check, more, holdout))
     done = []
     for order in orders:
-        with ledger.step(f"collect {order.campaign}") as tell:
+        with ledger.step(f"collect {order.campaign}") as on_done:
             result = collect(order)
             done.append(result)
-            _tell(tell, result["taken"], "trials taken")
+            _report_done(on_done, result["taken"], "trials taken")
     store = Store.open(orders[0].store)
     campaigns = collected(store, [order.campaign for order in orders])
     steps = []
 
     def run(name: str, work: Callable[[], dict[str, Any]], of: str) -> None:
-        with ledger.step(name) as tell:
+        with ledger.step(name) as on_done:
             result = work()
             steps.append(result)
-            _tell(tell, result["done"], of)
+            _report_done(on_done, result["done"], of)
 
     run("sync", lambda: sync(store, campaigns), "trials")
     run("label", lambda: label(store, campaigns), "trials")
@@ -123,11 +123,11 @@ def _training_s(orders: list[Order]) -> float:
         return 0.0
     settings = found[0].plan.protocol.analysis
     training = settings.training
-    networks = len(training.seeds) + (settings.beside() is not None)
+    networks = len(training.seeds) + (settings.comparison_settings() is not None)
     return training_windows(found) * training.epochs * networks / SAMPLES_PER_S
 
 
-def _tell(tell: Callable[[str, bool], None], done: int, of: str) -> None:
+def _report_done(on_done: Callable[[str, bool], None], done: int, of: str) -> None:
     if done == 1:
         of = of.replace("s", "", 1)  # the one of the noun
-    tell(f"{done} {of}" if done else "nothing to do", bool(done))
+    on_done(f"{done} {of}" if done else "nothing to do", bool(done))

@@ -74,18 +74,18 @@ class Ledger:
 
     @contextmanager
     def step(self, name: str) -> Iterator[Callable[[str, bool], None]]:
-        """Measure a step; give what tells what it did, and whether that was anything."""
+        """Measure a step; yield a callback that reports what it did and if that was anything."""
         before, began = self._rows[name], self._clock()
         self._put(before, state=RUNNING)
         place = list(self._rows).index(name) + 1
-        told: list[tuple[str, bool]] = []
+        reports: list[tuple[str, bool]] = []
         console.say(f"[{place}/{len(self._rows)}] {name}{self._times()}")
         state = STOPPED
         try:
-            yield lambda note, worked: told.append((note, worked))
+            yield lambda note, worked: reports.append((note, worked))
             state = DONE
         finally:
-            note, worked = told[-1] if told else ("", True)
+            note, worked = reports[-1] if reports else ("", True)
             spent = self._clock() - began if worked else 0.0
             self._put(before, state=state, seconds=before.seconds + spent, note=note)
 
@@ -104,8 +104,8 @@ class Ledger:
     def _times(self) -> str:
         spent = sum(row.seconds for row in self._rows.values())
         left = self.left_s()
-        told = f": about {console.duration(left)} left" if left else ""
-        return told + (f", {console.duration(spent)} so far" if spent else "")
+        reports = f": about {console.duration(left)} left" if left else ""
+        return reports + (f", {console.duration(spent)} so far" if spent else "")
 
     def _put(self, row: Row, *, state: str, seconds: float | None = None, note: str = "") -> None:
         spent = row.seconds if seconds is None else seconds

@@ -307,8 +307,8 @@ class AnalysisSettings(StrictModel):
         found = ((each, at(self, each.key)) for each in PAPER)
         return tuple((each, value) for each, value in found if value != each.value)
 
-    def beside(self) -> AnalysisSettings | None:
-        """The settings of the network that `also` asks for; None without one.
+    def comparison_settings(self) -> AnalysisSettings | None:
+        """Settings of the comparison network that `also` names; None without one.
 
         Network, training and rule are the preset's; epochs, batch, patience and device of the
         training, and all else, are those here.

@@ -29,13 +29,13 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
     Raises:
         TypeError: an array of objects.
     """
-    told, at = {}, 0
+    header, at = {}, 0
     for name, array in arrays.items():
         if array.dtype.hasobject:
             raise TypeError(f"{name} holds objects; expected numbers")
-        told[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "at": at}
+        header[name] = {"dtype": array.dtype.str, "shape": list(array.shape), "at": at}
         at += _up(array.nbytes)
-    write_blocks(path, _blocks(json.dumps(told, sort_keys=True).encode() + b"\n", arrays))
+    write_blocks(path, _blocks(json.dumps(header, sort_keys=True).encode() + b"\n", arrays))
 
 
 def map_arrays(path: Path) -> Arrays:
@@ -49,11 +49,11 @@ def map_arrays(path: Path) -> Arrays:
         if file.readline(64) != _MAGIC:
             raise ValueError(f"{path}: is no file of arrays of this program")
         try:
-            told = json.loads(file.readline())
+            header = json.loads(file.readline())
             start = _up(file.tell())
             size = path.stat().st_size
             arrays = {}
-            for name, item in told.items():
+            for name, item in header.items():
                 dtype, shape = np.dtype(item["dtype"]), tuple(int(n) for n in item["shape"])
                 count = math.prod(shape)
                 if dtype.hasobject or min(shape, default=0) < 0 or item["at"] < 0:

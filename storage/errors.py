@@ -48,7 +48,7 @@ def disk_error(folder: Path, error: BaseException) -> StoreError | None:
 
 
 @contextmanager
-def disk_explained(folder: Path, *others: type[BaseException]) -> Iterator[None]:
+def translated_disk_errors(folder: Path, *others: type[BaseException]) -> Iterator[None]:
     """Turn a disk's errors inside the block into one `StoreError` that says what to do.
 
     Args:

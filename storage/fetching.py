@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from sliplab.storage.errors import StoreError, disk_explained
+from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import read_json
 from sliplab.storage.names import safe_name
 from sliplab.storage.remote import Remote, RemoteError
@@ -39,7 +39,7 @@ def fetch(path: Path, said: Json) -> None:
     if url is None:
         raise StoreError(f"{path}: is missing, and {store / ORIGIN} does not say where it is")
     try:
-        with disk_explained(store):
+        with translated_disk_errors(store):
             remote_at(url).get_file(f"{objects_folder(campaign)}/{said['sha256']}", path, said)
     except RemoteError as error:
         raise RemoteError(f"{path}: {error}") from None

@@ -78,9 +78,9 @@ def exclusive(
         if os.fstat(handle).st_nlink == 0:  # somebody cleaned the folder up in between
             raise Locked(f"{what}: the lock file {path} was deleted meanwhile; try again")
         _check(handle, path, what)
-        told = {**this_process(), "brief": brief, **(about or {})}
+        holder = {**this_process(), "brief": brief, **(about or {})}
         os.ftruncate(handle, 0)
-        os.pwrite(handle, json.dumps(told).encode(), 0)
+        os.pwrite(handle, json.dumps(holder).encode(), 0)
         try:
             yield
         finally:

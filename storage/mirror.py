@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sliplab.protocols.hashing import hash_text
 from sliplab.storage.bring import bring
-from sliplab.storage.errors import disk_explained
+from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.fetching import ORIGIN, origin_of, remote_at
 from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.manifest import Manifest, read_manifests
@@ -32,9 +32,9 @@ CACHE = "SLIPLAB_CACHE"
 def mirror_folder(url: str) -> Path:
     """Where the mirror of `url` stands on this machine."""
     url = check_url(url)
-    told = os.environ.get(CACHE)
+    configured = os.environ.get(CACHE)
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    base = Path(told) if told else Path(cache) / "sliplab"
+    base = Path(configured) if configured else Path(cache) / "sliplab"
     name = re.sub(r"[^A-Za-z0-9]+", "-", url.rpartition("/")[2]).strip("-") or "store"
     return base.absolute() / f"{name[:40]}-{hash_text(url)[:12]}"
 
@@ -48,7 +48,7 @@ def open_mirror(url: str, on_trial: Callable[[str], None] | None = None) -> tupl
         Locked: another program brings it up to date just now.
     """
     folder = mirror_folder(url)
-    with disk_explained(folder):
+    with translated_disk_errors(folder):
         make_folder(folder)
     done = pull(Remote(url), folder, small=True, on_trial=on_trial)
     return Store.open(folder), done
@@ -81,7 +81,7 @@ def _bare_mirror(url: str) -> Store:
     """The mirror's folder with whatever it holds so far; several processes may do this at once."""
     folder = mirror_folder(url)
     if not (folder / STORE).is_file() or origin_of(folder) is None:
-        with disk_explained(folder):
+        with translated_disk_errors(folder):
             make_folder(folder)
             write_json(folder / ORIGIN, {"url": check_url(url)})
             write_json(folder / STORE, {"format": FORMAT})
@@ -97,7 +97,7 @@ def _bring_one(remote: Remote, campaign: str, trial: str, target: Path) -> None:
     if isinstance(found, RemoteError):
         raise found
     folder = target.parent.parent
-    with disk_explained(target):
+    with translated_disk_errors(target):
         for name in ("trials", "incoming"):
             make_folder(folder / name)
         bring(remote, found, folder / "incoming" / f"{trial}.{os.getpid()}", target, small=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.storage.bring import BIG, bring, get, holds
-from sliplab.storage.errors import StoreError, disk_explained
+from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.fetching import ORIGIN, origin_of
 from sliplab.storage.files import make_folder, sync_folder, write_bytes, write_json
 from sliplab.storage.lock import STORE_LOCK, exclusive
@@ -79,7 +79,7 @@ def pull(
     store = Store.create(folder)
     done = Pulled()
     with (
-        disk_explained(folder),
+        translated_disk_errors(folder),
         exclusive(folder / STORE_LOCK, f"the store {folder}", brief=small),
     ):
         if fresh:

@@ -150,7 +150,7 @@ class Remote:
         if not keys:
             return {}
         paths = {self._path(key): key for key in keys}
-        with self._told(keys[0], "read"):
+        with self._errors_translated(keys[0], "read"):
             found = self._fs.cat(list(paths), on_error="return")
         if not isinstance(found, dict):  # of a single path
             found = {next(iter(paths)): found}
@@ -158,7 +158,7 @@ class Remote:
         for path, data in found.items():
             key = paths.get(path) or paths[f"/{path.lstrip('/')}"]
             try:
-                with self._told(key, "read"):
+                with self._errors_translated(key, "read"):
                     if isinstance(data, Exception):
                         raise data
                     read[key] = data
@@ -186,7 +186,7 @@ class Remote:
         Raises:
             RemoteMissing: it is not there.
         """
-        with self._told(key, "read"):
+        with self._errors_translated(key, "read"):
             return int(self._fs.info(self._path(key))["size"])
 
     def put_bytes(self, key: str, data: bytes) -> None:
@@ -225,13 +225,13 @@ class Remote:
     def remove(self, key: str) -> None:
         """Take an object away; nothing happens if it is gone."""
         try:
-            with self._told(key, "removed"):
+            with self._errors_translated(key, "removed"):
                 self._fs.rm_file(self._path(key))
         except RemoteMissing:
             pass
 
     def _put(self, key: str, blocks: Callable[[], Iterable[bytes]], put: Callable[[], Any]) -> None:
-        with self._told(key, "written"):
+        with self._errors_translated(key, "written"):
             if self.local:  # fsspec neither flushes to the disk nor writes aside
                 path = Path(self._path(key))
                 make_folder(path.parent)
@@ -246,7 +246,7 @@ class Remote:
             most = self.size(key)
         for start in range(0, most, _BLOCK):
             end = min(most, start + _BLOCK)
-            with self._told(key, "read"):
+            with self._errors_translated(key, "read"):
                 block = self._fs.cat_file(path, start=start, end=end)
             yield block
             if len(block) < end - start:
@@ -255,7 +255,7 @@ class Remote:
     def _list(self, folder: str) -> list[dict[str, Any]]:
         path = self._path(folder) if folder else self._root
         try:
-            with self._told(folder, "listed"):
+            with self._errors_translated(folder, "listed"):
                 self._fs.invalidate_cache()
                 found = self._fs.ls(path, detail=True)
         except RemoteMissing:
@@ -267,8 +267,8 @@ class Remote:
         return f"{self._root}/{key}"
 
     @contextmanager
-    def _told(self, key: str, done: str) -> Iterator[None]:
-        """Say in one line what went wrong, without anything that is secret."""
+    def _errors_translated(self, key: str, done: str) -> Iterator[None]:
+        """Translate errors to one line, without anything that is secret."""
         try:
             yield
         except StoreError:

@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplab.storage.errors import NoStore, StoreError, disk_explained
+from sliplab.storage.errors import NoStore, StoreError, translated_disk_errors
 from sliplab.storage.files import (
     json_text,
     make_folder,
@@ -329,7 +329,7 @@ class Store:
             StoreError: nothing can be written there.
         """
         if not Store.exists(folder):
-            with disk_explained(folder):
+            with translated_disk_errors(folder):
                 make_folder(folder)
                 write_json(folder / STORE, {"format": FORMAT})
         return Store.open(folder)

@@ -54,7 +54,7 @@ def live(store: Path, arguments: list[str], log: Path, kill_s: float | None = No
             return process.wait(30)
 
 
-def told(store: Path) -> dict[str, Any]:
+def figures(store: Path) -> dict[str, Any]:
     """What a finished study says: hashes of its trials and models, and its summary."""
     summary = json.loads((store / "report" / "summary.json").read_text())
     del summary["quality"]["interrupted"]  # what the kills broke off
@@ -106,7 +106,7 @@ def kill_study(folder: Path, kills: int, seed: int, arguments: list[str]) -> dic
         "seed": seed,
         "undisturbed_s": round(whole_s, 1),
         "killed_after_s": at,
-        "wrong": differences(told(calm), told(stopped)),
+        "wrong": differences(figures(calm), figures(stopped)),
     }
 
 

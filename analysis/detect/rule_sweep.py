@@ -1,4 +1,4 @@
-"""The paper's rule at every smoothing and margin at once, and what each pair is worth.
+"""The paper's rule at every smoothing and margin at once, and the score of each pair.
 
 `analysis.detect.detection.detect` is the rule for one pair; a search asks for dozens of pairs on
 every trial of every network, so the sums over windows are made once for all margins here. Tests
@@ -60,7 +60,7 @@ class Uncounted:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a pair is worth over trials.
+    """Scores of a pair over trials.
 
     Attributes:
         mean_ms, p95_ms: incipient latency of counted detections; None without one.
@@ -131,7 +131,7 @@ def _first(lead: F64, margin: float, start: int) -> int | None:
     return start + at if there.size and there[at] else None
 
 
-def worth(found: I64, trials: Trials) -> Figures:
+def score(found: I64, trials: Trials) -> Figures:
     """One pair's detections int64 (n, 2) against the true onsets of n trials, n at least 1."""
     out = trials.uncounted(found)
     counted = ~(out.false_early | out.missed | out.late)

@@ -63,7 +63,7 @@ def bin_events(
     state = _bin(
         *columns, starts, settings.step_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
     )
-    _explain(state, columns, width, height)
+    _raise_for_status(state, columns, width, height)
     return out
 
 
@@ -96,7 +96,7 @@ def list_events(
         *columns, starts, settings.step_ms * 1000, settings.steps, _CODES[settings.polarity],
         of_x, of_y, settings.cells, plane, np.empty(plane.size, np.uint32), offsets, cell, count,
     )  # fmt: skip
-    _explain(state, columns, width, height)
+    _raise_for_status(state, columns, width, height)
     return SparseWindows(shape, offsets, cell[: offsets[-1]].copy(), count[: offsets[-1]].copy())
 
 
@@ -122,7 +122,7 @@ def window_totals(
     state = _total(
         *columns, starts, settings.length_ms * 1000, _CODES[settings.polarity], of_x, of_y, out
     )
-    _explain(state, columns, width, height)
+    _raise_for_status(state, columns, width, height)
     return out
 
 
@@ -192,7 +192,7 @@ def _cells(
     return along(width, column), along(height, row)
 
 
-def _explain(state: int, columns: _Columns, width: int, height: int) -> None:
+def _raise_for_status(state: int, columns: _Columns, width: int, height: int) -> None:
     if state == 0:
         return
     if state == _UNSORTED:

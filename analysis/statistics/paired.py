@@ -30,8 +30,8 @@ class Difference:
     seeds: int
 
     @property
-    def told(self) -> bool | None:
-        """Whether the interval leaves zero out; None where there is no interval."""
+    def significant(self) -> bool | None:
+        """Significance: the interval excludes zero; None where there is no interval."""
         if self.low is None or self.high is None:
             return None
         return self.low > 0 or self.high < 0

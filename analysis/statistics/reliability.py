@@ -3,7 +3,7 @@
 A detection trusts a class that leads by eight spikes. How often is that right, and by how many
 spikes does the network have to lead to be right in 99 of 100 windows? Spike counts are no
 probabilities. One number, the temperature (Guo et al., 2017), makes them some; it is fitted on
-validation windows only, and what it is worth is measured on test windows.
+validation windows only, and its scores are those of test windows.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[dict[str, A
     """Share right by lead in whole spikes, from 0 (a tie, no winner, never right) up.
 
     Args:
-        trial: integer (n,), whose window it is.
+        trial: integer (n,), the trial of each window.
 
     Returns:
         a row for each of `EDGES` with windows: ``lead`` and ``to``, the least and the most of it
@@ -109,7 +109,7 @@ def expected_calibration_error(
 def calibration(
     counts: Counts, labels: Labels, held_counts: Counts, held_labels: Labels
 ) -> dict[str, Any]:
-    """The temperature that validation windows give, and what it is worth on test windows.
+    """The temperature that validation windows give, and its scores on test windows.
 
     Args:
         counts, labels: of test windows.
@@ -125,11 +125,11 @@ def calibration(
         return {"temperature": temperature, "ece": None, "cross_entropy": None,
                 "uncalibrated": None}  # fmt: skip
 
-    def worth(t: float) -> dict[str, float]:
+    def scores(t: float) -> dict[str, float]:
         p = np.exp(log_softmax(counts / t, axis=1))
         return {
             "ece": expected_calibration_error(p, labels),
             "cross_entropy": cross_entropy(counts, labels, t),
         }
 
-    return {"temperature": temperature, **worth(temperature), "uncalibrated": worth(1.0)}
+    return {"temperature": temperature, **scores(temperature), "uncalibrated": scores(1.0)}

@@ -40,20 +40,20 @@ def share(values: FloatArray, trial: IntArray) -> dict[str, Any]:
 
     Args:
         values: (n,), what a window counts, 0..1.
-        trial: integer (n,), whose it is.
+        trial: integer (n,), the trial of each window.
 
     Returns:
         ``share``, ``low``, ``high`` (None where there is none), ``n`` windows and ``trials``.
     """
-    return _told(values, trial, share_interval)
+    return _summary(values, trial, share_interval)
 
 
 def mean(values: FloatArray, trial: IntArray) -> dict[str, Any]:
     """The same of values of any sign, such as differences, with Student's interval."""
-    return _told(values, trial, mean_interval)
+    return _summary(values, trial, mean_interval)
 
 
-def _told(
+def _summary(
     values: FloatArray,
     trial: IntArray,
     measure: Callable[[FloatArray, FloatArray], tuple[float, float] | None],

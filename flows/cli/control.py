@@ -63,10 +63,10 @@ def stop(
     from sliplab.storage.store import Store
 
     opened = Store.open(store)
-    told = halt(store)  # before anything that takes long to load
+    halted = halt(store)  # before anything that takes long to load
     from sliplab.flows.collecting import controlling
 
-    outcome = controlling.note_stop(opened, *told, who=who, why=why, limit_s=wait)
+    outcome = controlling.note_stop(opened, *halted, who=who, why=why, limit_s=wait)
     words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
     _finish([outcome], as_json, words)
 

@@ -36,8 +36,8 @@ def review(
     def ready(address: str, trials: TrialList) -> None:
         waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
         if as_json:
-            told = {"url": address, "trials": len(trials.rows), "to_decide": waiting}
-            console.print_json(told)
+            summary = {"url": address, "trials": len(trials.rows), "to_decide": waiting}
+            console.print_json(summary)
         else:
             console.say(f"{len(trials.rows)} trials, {waiting} to decide. Ctrl-C ends the page:")
             console.show(address)
@@ -72,8 +72,8 @@ def view(
     if as_json:
         console.print_json({"file": str(save), "trial": trial, **counts})
     else:
-        told = {**counts, "bytes": console.size(counts["bytes"])}
-        console.print_pairs(f"{save} (open it with `rerun {save}`)", told)
+        summary = {**counts, "bytes": console.size(counts["bytes"])}
+        console.print_pairs(f"{save} (open it with `rerun {save}`)", summary)
 
 
 def register(app: typer.Typer) -> None:

@@ -129,7 +129,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
 
     `collect` does the same before it begins.
     """
-    from sliplab.storage.errors import disk_explained
+    from sliplab.storage.errors import translated_disk_errors
     from sliplab.storage.lock import exclusive
     from sliplab.storage.migrate import kept
     from sliplab.storage.migrate import migrate as bring
@@ -137,7 +137,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
 
     opened = Store.open(store)
     with (
-        disk_explained(opened.folder),
+        translated_disk_errors(opened.folder),
         exclusive(opened.folder / ".lock", f"the store {opened.folder}"),
     ):
         passed = bring(opened)

@@ -50,12 +50,12 @@ def collect_flow(order: Opaque[Order]) -> dict[str, Any]:
         title = f"collect {wanted.campaign} ({simulated}trials)"
         with console.bar(title, len(trials), str(left)) as bar:
 
-            def told(trial: Trial, outcome: str) -> None:
+            def on_trial_done(trial: Trial, outcome: str) -> None:
                 left.done(trial)
-                page.told(trial, outcome)
+                page.on_trial_done(trial, outcome)
                 bar.advance(1, f"{trial.id} {outcome}", str(left))
 
-            session.on_trial, work.boundary.on_pause = told, left.pause
+            session.on_trial, work.boundary.on_pause = on_trial_done, left.pause
             with stopping.signals():  # Prefect has handlers of its own inside a flow
                 session.rig.connect()
                 size = MOCK_BATCH if wanted.rig.in_virtual_time else 1

@@ -25,7 +25,7 @@ from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig import Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.errors import disk_explained
+from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.recording import RECORD_FORMAT
 from sliplab.storage.store import Campaign
 from sliplab.storage.streams import Json
@@ -40,7 +40,7 @@ class Session:
 
     Attributes:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
-        boundary: asked before each attempt, and told of each trial, if there is one.
+        boundary: asked before each attempt and notified of each trial, if there is one.
     """
 
     plan: Plan
@@ -66,7 +66,7 @@ class Session:
             KeyboardInterrupt: somebody asked to stop.
         """
         for trial in trials:
-            with disk_explained(self.campaign.folder, RigError):
+            with translated_disk_errors(self.campaign.folder, RigError):
                 if not self._may_take(trial):
                     continue
                 self._prepare(trial)
@@ -267,8 +267,8 @@ class Session:
         }
         if (centre := self.rig_file.calibration.centre_px) is not None:
             record["geometry"]["event_centre_px"] = list(centre)
-        if told := self.rig.describe():
-            record["devices"] = told
+        if described := self.rig.describe():
+            record["devices"] = described
         if run.truth is not None:
             record["simulation_truth"] = run.truth
         return record

@@ -54,8 +54,8 @@ class Show:
         with self._lock:
             self._total += count
 
-    def told(self, trial: Trial, outcome: str) -> None:
-        """A trial is over."""
+    def on_trial_done(self, trial: Trial, outcome: str) -> None:
+        """Count a trial that is over."""
         with self._lock:
             self._done += 1
             self.outcomes[outcome] += 1
@@ -86,7 +86,7 @@ def shown(order: Order) -> Iterator[Show]:
 
 
 class _Page:
-    """The thread that tells the server, and what it tells."""
+    """The thread that reports progress to the server."""
 
     def __init__(self, order: Order, run: UUID) -> None:
         self._order, self._run = order, run
@@ -96,17 +96,17 @@ class _Page:
         self._public = not orchestration.private()
         settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
         self._thread = threading.Thread(
-            target=settings.run, args=(self._tell,), name="page", daemon=True
+            target=settings.run, args=(self._report_until_end,), name="page", daemon=True
         )
         self.show = Show(self._thread.start)
 
     def end(self) -> None:
-        """Tell the last of it; waits for it, but not for ever."""
+        """Send the last report; wait for it, up to a limit."""
         self._over.set()
         if self._thread.is_alive() and not server_calls.lost():
             self._thread.join(STOP_LIMIT_S if stopping.requested() else END_LIMIT_S)
 
-    def _tell(self) -> None:
+    def _report_until_end(self) -> None:
         from httpx import TransportError
         from prefect.client.orchestration import get_client
         from prefect.settings import PREFECT_CLIENT_MAX_RETRIES, temporary_settings
@@ -121,23 +121,24 @@ class _Page:
             before = None
             while not self._over.wait(PERIOD_S):
                 if (now := self.show.progress) != before and self._answered(
-                    self._tell_progress, client
+                    self._report_progress, client
                 ):
                     before = now
-            public = [self._tell_picture, lambda client: self._rig(client, False)]
-            for tell in (self._tell_progress, self._tell_table, *(public if self._public else ())):
+            public = [self._report_figure, lambda client: self._rig(client, False)]
+            last = [self._report_progress, self._report_table, *(public if self._public else ())]
+            for report in last:
                 try:
-                    tell(client)
+                    report(client)
                 except TransportError as error:
                     server_calls.lose(server_calls.reason_of(error))
                     return
                 except Exception:
                     continue
 
-    def _answered(self, tell: Callable[..., None], *about: Any) -> bool:
+    def _answered(self, report: Callable[..., None], *about: Any) -> bool:
         """Whether the server took it; without an answer again and again it is lost."""
         try:
-            tell(*about)
+            report(*about)
         except Exception as error:
             self._misses += 1
             if self._misses == LOST_AFTER:
@@ -151,7 +152,7 @@ class _Page:
         if self._public:
             sign_rig(client, self._order.rig.name, busy)
 
-    def _tell_progress(self, client: Any) -> None:
+    def _report_progress(self, client: Any) -> None:
         from prefect.client.schemas.actions import ArtifactUpdate
 
         percent, words = self.show.progress
@@ -160,14 +161,14 @@ class _Page:
         else:
             client.update_artifact(self._progress, ArtifactUpdate(data=percent, description=words))
 
-    def _tell_table(self, client: Any) -> None:
+    def _report_table(self, client: Any) -> None:
         import json
 
         campaign = Store(self._order.store).campaign(self._order.campaign)
         rows = outcome_rows(campaign_counts(self._order, campaign), self.show.outcomes)
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
-    def _tell_picture(self, client: Any) -> None:
+    def _report_figure(self, client: Any) -> None:
         from sliplab.analysis.pictures.campaign_figure import event_rates
 
         numbers, rates = self._rates()

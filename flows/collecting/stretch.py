@@ -20,7 +20,7 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig_lock import held
 from sliplab.storage import control
-from sliplab.storage.errors import disk_explained
+from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import sweep_temporary
 from sliplab.storage.lock import STORE_LOCK, exclusive
 from sliplab.storage.migrate import migrate
@@ -52,7 +52,7 @@ def owned(store: Store, *, brief: bool = False, collects: str = "") -> Iterator[
     """
     about = {"collects": collects} if collects else None
     with (
-        disk_explained(store.folder, RigError),
+        translated_disk_errors(store.folder, RigError),
         exclusive(store.folder / STORE_LOCK, f"the store {store.folder}", brief=brief, about=about),
     ):
         migrate(store)

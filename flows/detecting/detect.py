@@ -27,7 +27,7 @@ from sliplab.rigs.reacting import Reaction, run_watched
 from sliplab.rigs.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
-from sliplab.storage.errors import disk_explained
+from sliplab.storage.errors import translated_disk_errors
 
 RATE_HZ = 100
 FOREVER_S = 1e9
@@ -67,11 +67,11 @@ def detect(
         most = fitted.windows.steps * fitted.network.outputs_per_class
         view = done.enter_context(DetectView(_title(order), most))
 
-        def told(timed: Timed) -> None:
+        def on_decision(timed: Timed) -> None:
             write(timed)
-            view.told(timed)
+            view.on_decision(timed)
 
-        sink = DetectSink(detector, rig.clock, told, view.poll)
+        sink = DetectSink(detector, rig.clock, on_decision, view.poll)
         rig.connect()
         reaction, interrupted = None, False
         try:
@@ -142,7 +142,7 @@ def _lines(out: Path | None) -> Iterator[Callable[[Timed], None]]:
         return
     if not out.parent.is_dir():
         raise InputError("--out", "", out, "must be a file in a folder that is there")
-    with disk_explained(out.parent, RigError), out.open("w", encoding="utf-8") as file:
+    with translated_disk_errors(out.parent, RigError), out.open("w", encoding="utf-8") as file:
 
         def write(timed: Timed) -> None:
             file.write(json.dumps(timed.as_json(), allow_nan=False) + "\n")

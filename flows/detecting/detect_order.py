@@ -170,12 +170,12 @@ def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: floa
     # a retraction gets shallower all the way, and what presses on is cut off at the limit
     depth = _shallowest_mm(program)
     if depth + press_mm > deepest + 1e-9:
-        whose = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"
+        origin = "the protocol's" if deepest == float(limits.depth) else f"the rig {file.name}'s"
         raise InputError(
             "--reflex",
             "",
             text,
-            f"would reach {depth + press_mm:g} mm; {whose} limits.depth is {deepest:g} mm, and "
+            f"would reach {depth + press_mm:g} mm; {origin} limits.depth is {deepest:g} mm, and "
             f"the trial's motion ends at {depth:g} mm: at most press:{deepest - depth:g}",
         )
     speeds = [s.speed_mm_s for s in program.steps if isinstance(s, Move) and s.phase == "press"]

@@ -84,7 +84,7 @@ class DetectSink(Unheeded):
 
     Args:
         clock: the rig's, by which arrivals are dated.
-        told: called with each decision as soon as it is there.
+        on_decision: called with each decision as soon as it is made.
         every_poll: called each time that the streams were read.
     """
 
@@ -92,11 +92,11 @@ class DetectSink(Unheeded):
         self,
         detector: LiveDetector,
         clock: Clock,
-        told: Callable[[Timed], None],
+        on_decision: Callable[[Timed], None],
         every_poll: Callable[[], None] = lambda: None,
     ) -> None:
         self.detector, self.armed, self.phase = detector, False, ""
-        self._clock, self._told, self._every_poll = clock, told, every_poll
+        self._clock, self._on_decision, self._every_poll = clock, on_decision, every_poll
         self._camera = FreshestArrival()
         self._latency: deque[float] = deque(maxlen=KEPT)
         self._compute: deque[float] = deque(maxlen=KEPT)
@@ -112,14 +112,14 @@ class DetectSink(Unheeded):
         """Events, and at the end of each read what the clock alone decides.
 
         Raises:
-            SlipSeen: incipient slip is detected while `armed`; the rest of the read is told first.
+            SlipSeen: incipient slip is detected while `armed`; the rest of the read is reported.
             ClockFellBack: the camera's clock is another one.
         """
         here_ns, began_ns = self._clock.now_ns(), time.monotonic_ns()
         if len(chunk):
             self.events += len(chunk)
             self._camera.observe(int(chunk.t_us.max()), here_ns)
-        self._tell(self.detector.push(chunk), here_ns, began_ns)
+        self._report(self.detector.push(chunk), here_ns, began_ns)
 
     def add_event_pulses(self, chunk: PulseChunk) -> None:
         """Pulses tell the camera's time where events do not.
@@ -134,10 +134,10 @@ class DetectSink(Unheeded):
         if now_us is not None:
             # the first time that is known begins the windows; from then on events may be late
             late_us = 0 if self.detector.now_us is None else PATIENCE_US
-            self._tell(self.detector.advance(now_us - late_us), here_ns, began_ns)
+            self._report(self.detector.advance(now_us - late_us), here_ns, began_ns)
         self._every_poll()
 
-    def _tell(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
+    def _report(self, made: list[Decision], here_ns: int, began_ns: int) -> None:
         slip = False
         for decision in made:
             compute_ms = (decision.decided_ns - began_ns) / 1e6
@@ -158,7 +158,7 @@ class DetectSink(Unheeded):
             if decision.onset is not None:
                 self.onsets[decision.onset] = timed.as_json()
             slip |= decision.valid_class == INCIPIENT
-            self._told(timed)
+            self._on_decision(timed)
         if slip and self.armed:
             self.armed = False
             raise SlipSeen

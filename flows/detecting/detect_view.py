@@ -58,7 +58,7 @@ class DetectView:
             self._draw()
             self._live.stop()
 
-    def told(self, timed: Timed) -> None:
+    def on_decision(self, timed: Timed) -> None:
         """A decision was made."""
         made = timed.decision
         self._now = timed

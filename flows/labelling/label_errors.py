@@ -145,11 +145,11 @@ def _cases(store: Store, campaigns: list[Collected]) -> Any:
             label = labels.read(trial.id)
             centre = int(recording.record["geometry"]["centre"])
             for rule, keys in _TRUTH.items():
-                told = truth
+                known = truth
                 if truth is not None and rule == "paper" and label.get("reference") == "hold_start":
-                    told = truth.get("from_hold", truth)  # records from before know the motion's
+                    known = truth.get("from_hold", truth)  # older records have the motion's
                 for kind in KINDS:
-                    true = None if told is None else told.get(keys[kind])
+                    true = None if known is None else known.get(keys[kind])
                     yield rule, kind, label, true[centre] if isinstance(true, list) else true
 
 

@@ -87,8 +87,8 @@ class Labels:
                 found[state_of(decision, _automatic(item, recording))] += 1
         return found
 
-    def told(self, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
-        """The same as a part of a step's result; decisions that are not applied are said."""
+    def report_states(self, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
+        """Return the states as part of a step's result; warn of decisions that are not applied."""
         states = self.states(campaigns)
         if states is None:
             return {}

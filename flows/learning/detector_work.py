@@ -99,9 +99,9 @@ class DetectorWork:
         carried = _parts(store, self.carried)
         if found is None or carried is None:
             return found
-        beside = compare(carried, settings.windows, detection, fine, settings.most_spikes)
-        beside = beside or {"detectors": []}
-        return {**found, "carried": beside["detectors"]}
+        stateful = compare(carried, settings.windows, detection, fine, settings.most_spikes)
+        stateful = stateful or {"detectors": []}
+        return {**found, "carried": stateful["detectors"]}
 
 
 def detector_work(

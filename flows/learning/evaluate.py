@@ -18,7 +18,7 @@ from sliplab.flows.learning.counting import COUNTS, count_spikes
 from sliplab.flows.learning.detector_trials import predict_trials, predictions_step
 from sliplab.flows.learning.detector_work import detector_work
 from sliplab.flows.learning.evaluation_job import Job
-from sliplab.flows.learning.other_networks import judge_beside
+from sliplab.flows.learning.other_networks import evaluate_comparison
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import Model, rules_of, training_settings, wanted_models
 from sliplab.flows.learning.trial_scores import score_row, summaries
@@ -200,10 +200,10 @@ def evaluate(
     stale = not Derived.of(store, STEP).fresh(NAME, job.key)
     if stale:
         run(evaluate_flow, Opaque(job), cluster)
-    stale |= judge_beside(store, campaigns, cluster, reviewed)
+    stale |= evaluate_comparison(store, campaigns, cluster, reviewed)
     return {
         "step": "evaluate",
         "done": int(stale),
         "fresh": int(not stale),
-        **job.labels.told(campaigns),
+        **job.labels.report_states(campaigns),
     }

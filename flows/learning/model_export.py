@@ -28,7 +28,12 @@ from sliplab.analysis.nets.training import Fitted
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.model_latency import latencies
 from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.learning.train import models_beside, rules_of, training_settings, wanted_models
+from sliplab.flows.learning.train import (
+    comparison_models,
+    rules_of,
+    training_settings,
+    wanted_models,
+)
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.protocols.errors import InputError
@@ -159,7 +164,7 @@ def _made_from_these(source: _Source) -> bool:
     """Whether the model is what `train` would make of this store now. Raises StoreError."""
     wanted = {
         model.key
-        for make in (wanted_models, models_beside)
+        for make in (wanted_models, comparison_models)
         for model in make(source.store, source.campaigns)
     }
     try:

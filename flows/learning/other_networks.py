@@ -26,7 +26,7 @@ from sliplab.analysis.nets.spiking import Engine
 from sliplab.analysis.statistics import window_groups
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores
-from sliplab.flows.learning.train import models_beside, rules_of, training_settings
+from sliplab.flows.learning.train import comparison_models, rules_of, training_settings
 from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import intervals_of
 from sliplab.flows.running import console
@@ -246,11 +246,11 @@ def judge_model(
         "interval": found["windows"]["interval"],
         "latency_ms": kinematic["latency_ms"],
         "lead_ms": {k: v["lead_ms"] for k, v in found["experiments"].items() if k != "kinematic"},
-        **labels.told(campaigns),
+        **labels.report_states(campaigns),
     }
 
 
-def judge_beside(
+def evaluate_comparison(
     store: Store,
     campaigns: list[Collected],
     cluster: Cluster | None = None,
@@ -262,7 +262,7 @@ def judge_beside(
         StoreError: it is missing or stale.
     """
     done = False
-    for model in models_beside(store, campaigns, reviewed):
+    for model in comparison_models(store, campaigns, reviewed):
         if not model.fresh:
             raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
         settings = model.settings

@@ -95,9 +95,11 @@ def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = Fal
     return _models(store, campaigns, training_settings(campaigns), reviewed, "")
 
 
-def models_beside(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
-    """The same of the network that `analysis.also` asks for; none without one."""
-    settings = training_settings(campaigns).beside()
+def comparison_models(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> list[Model]:
+    """Models of the comparison network that `analysis.also` names; none without one."""
+    settings = training_settings(campaigns).comparison_settings()
     if settings is None:
         return []
     return _models(store, campaigns, settings, reviewed, f"{settings.preset}-")
@@ -146,7 +148,7 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     model, train, validation, simulated = job.content
     settings = model.settings
     model.path.parent.mkdir(parents=True, exist_ok=True)
-    with _progress(model, settings.training.epochs, simulated) as told:
+    with _progress(model, settings.training.epochs, simulated) as progress:
         fitted = training.fit(
             train.windows,
             train.y,
@@ -156,7 +158,7 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
             settings.windows,
             settings.training,
             model.seed,
-            on_epoch=told.epoch,
+            on_epoch=progress.epoch,
             on_state=partial(write_bytes, model.state_path),
             state=begun(model),
         )
@@ -226,7 +228,7 @@ def train(
     labels = Labels(store, reviewed)
     models = [
         *wanted_models(store, campaigns, reviewed),
-        *models_beside(store, campaigns, reviewed),
+        *comparison_models(store, campaigns, reviewed),
     ]
     stale = [model for model in models if not model.fresh]
     if stale:
@@ -236,7 +238,7 @@ def train(
         "step": "train",
         "done": len(stale),
         "fresh": len(models) - len(stale),
-        **labels.told(campaigns),
+        **labels.report_states(campaigns),
     }
 
 

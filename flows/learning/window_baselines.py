@@ -54,8 +54,8 @@ def fresh_keys(store: Store) -> list[str]:
     return [key for name in NAMES if kept.fresh(name, key := _key(store, name))]
 
 
-def beside(store: Store) -> dict[str, dict[str, Any]]:
-    """Each baseline that is there beside the network, by name; see `window_scores.compared`.
+def baselines(store: Store) -> dict[str, dict[str, Any]]:
+    """Compare each baseline in the store with the network, by name; see `window_scores.compared`.
 
     A network's figures of other windows than the baseline's are not compared.
     """
@@ -86,11 +86,13 @@ def _made(
     runs = []
     for seed in SEEDS:
 
-        def told(epoch: int, strict: float, seed: int = seed) -> None:
+        def on_epoch(epoch: int, strict: float, seed: int = seed) -> None:
             validated = f"validation {100 * strict:.1f} %"
             console.say(f"{name}: seed {seed}, epoch {epoch} of {EPOCHS}, {validated}")
 
-        runs.append(trained_net(name, train, validation, test.windows, seed=seed, on_epoch=told))
+        runs.append(
+            trained_net(name, train, validation, test.windows, seed=seed, on_epoch=on_epoch)
+        )
     shares = [metrics.accuracy(votes, test.y).argmax for votes, _ in runs]
     each = [
         {"seed": seed, "validation_strict": said["validation_strict"], "argmax": share}

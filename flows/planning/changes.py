@@ -25,8 +25,8 @@ def differences(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, s
         yield key, _text(old, key), _text(new, key)
 
 
-def told(old: Any, new: Any, key: str = "") -> str:
-    """The differences, one a line and indented, at most `MOST` of them; empty if there are none."""
+def format_differences(old: Any, new: Any, key: str = "") -> str:
+    """Format differences, one a line, indented, at most `MOST`; empty if there are none."""
     found = list(differences(old, new, key))
     lines = [f"\n  {name}: {before} -> {after}" for name, before, after in found[:MOST]]
     if len(found) > MOST:

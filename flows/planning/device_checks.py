@@ -37,7 +37,7 @@ def check_devices(order: Order) -> list[Check]:
     except Locked as error:
         return [Check("rig", False, str(error))]
     except RigError as error:
-        return [Check(error.device, False, _told(error))]
+        return [Check(error.device, False, _message(error))]
 
 
 def _check_held(order: Order) -> list[Check]:
@@ -50,7 +50,7 @@ def _check_held(order: Order) -> list[Check]:
     try:
         rig = build_rig(order.rig)
     except RigError as error:
-        return [Check(error.device, False, _told(error))]
+        return [Check(error.device, False, _message(error))]
     try:
         rig.connect()
         state = rig.arm.state()
@@ -60,12 +60,12 @@ def _check_held(order: Order) -> list[Check]:
         found += [Check(device.device, True, _said(device)) for device in rig.health()]
         found += _check_clocks(order, rig)
     except RigError as error:
-        found.append(Check(error.device, False, _told(error)))
+        found.append(Check(error.device, False, _message(error)))
     finally:
         try:
             rig.close()
         except RigError as error:  # beside what was found, not in its place
-            failed = Check(error.device, False, _told(error))
+            failed = Check(error.device, False, _message(error))
             if failed not in found:
                 found.append(failed)
     return found
@@ -116,5 +116,5 @@ def _said(device: DeviceHealth) -> str:
     return ", ".join([*parts, f"clock: {device.clock}", *device.notes])
 
 
-def _told(error: RigError) -> str:
+def _message(error: RigError) -> str:
     return str(error).removeprefix(f"{error.device}: ")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sliplab.flows.planning.changes import told
+from sliplab.flows.planning.changes import format_differences
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
@@ -129,7 +129,7 @@ def _changed(order: Order, campaign: Campaign) -> str:
             for key in ("values", "range", "optional"):
                 factor.pop(key)
             factor["levels"] = [str(level) for level in enabled[name]]
-    changes = told(old, new, "collection")
+    changes = format_differences(old, new, "collection")
     return f" What changed:{changes}" if changes else ""
 
 
@@ -137,7 +137,7 @@ def _rig_changed(order: Order, campaign: Campaign) -> str:
     """What differs from the campaign's own copy of its rig file."""
     old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
     new = parse_yaml(order.rig_text, "rig file")
-    changes = told(without_secrets(old), without_secrets(new))
+    changes = format_differences(without_secrets(old), without_secrets(new))
     return f" What changed:{changes}" if changes else ""
 
 

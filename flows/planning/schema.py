@@ -31,10 +31,10 @@ class _Described(GenerateJsonSchema):
 
     def model_schema(self, schema: Any) -> Schema:
         made = super().model_schema(schema)
-        told = _field_texts(schema["cls"])
+        texts = _field_texts(schema["cls"])
         for name, field in made.get("properties", {}).items():
-            if name in told:
-                _describe(field, told[name])
+            if name in texts:
+                _describe(field, texts[name])
         return made
 
     def field_title_should_be_set(self, schema: Any) -> bool:

@@ -48,10 +48,10 @@ def section(store: Store, summary: Json) -> Section:
             ]
         )
     counts = Counter(text for row in trials for text in _wrong(row))
-    told = "; ".join(f"{count} {text}" for text, count in counts.most_common())
+    causes = "; ".join(f"{count} {text}" for text, count in counts.most_common())
     said = [
         f"{len(failed)} of {len(trials)} judged trials failed in some way"
-        + (f": {told}." if told else "."),
+        + (f": {causes}." if causes else "."),
     ]
     if len(failed) > MOST:
         said.append(

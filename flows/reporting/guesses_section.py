@@ -43,10 +43,12 @@ def _made(found: Json) -> Section:
     for setting in settings.values():
         name = _short(setting["parameter"])
         rows[name] = None
-        told, spans = figures(setting), changes(base, setting)
+        figures_of, spans = figures(setting), changes(base, setting)
         side = sides["lower" if setting["factor"] < 1 else "higher"]
         for key in FIGURES:
-            side.setdefault(key, {})[name] = _changed(key, unchanged[key], told[key], spans[key])
+            side.setdefault(key, {})[name] = _changed(
+                key, unchanged[key], figures_of[key], spans[key]
+            )
     trials = len(base["trials"])
     share = 100 * found["change"]
     panels = [

@@ -8,7 +8,7 @@ from typing import Any
 from sliplab.analysis.pictures.report import Section, Table, number, percent
 from sliplab.analysis.statistics.intervals import exact_interval
 from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
-from sliplab.flows.reporting.report_trials import intervals, told
+from sliplab.flows.reporting.report_trials import intervals, trial_summary
 from sliplab.storage.store import Store
 
 Json = dict[str, Any]
@@ -22,7 +22,7 @@ _OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
 
 def part(found: Json) -> Json:
     """The part of the summary: all but single trials and dates, with intervals."""
-    rows = [told(row) for row in found["rows"]]
+    rows = [trial_summary(row) for row in found["rows"]]
     return {
         **{name: found[name] for name in ("trials", "protocol_seed", "skin_seed", "model")},
         "versions": [each["version"] for each in found["evaluations"]],

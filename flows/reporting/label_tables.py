@@ -52,7 +52,9 @@ def speed(figures: Json) -> Table:
         if f"{begin}frame_ms" not in figures:
             continue
         ms = float(figures[f"{begin}frame_ms"])
-        rows.append([words, f"{ms:.3g}", f"{ms / own:.3g}", _told(figures.get(f"{begin}error_px"))])
+        rows.append(
+            [words, f"{ms:.3g}", f"{ms / own:.3g}", _format(figures.get(f"{begin}error_px"))]
+        )
     return Table(
         ("way to find the markers", "a frame (ms)", "times SlipLab's", "RMS error (px)"),
         rows,
@@ -74,7 +76,7 @@ def truth(figures: Json) -> Table:
     for key, words in TRUTHS.items():
         values = [figures.get(f"{begin}{key}") for begin in sets]
         if any(value is not None for value in values):
-            rows.append([words, *map(_told, values)])
+            rows.append([words, *map(_format, values)])
     return Table(
         ("labels against the truth", *sets.values()),
         rows,
@@ -82,7 +84,7 @@ def truth(figures: Json) -> Table:
     )
 
 
-def _told(value: Any) -> str:
+def _format(value: Any) -> str:
     if not isinstance(value, int | float) or not math.isfinite(value):
         return "–"
     return f"{value:.0f}" if float(value).is_integer() else f"{value:.3g}"

@@ -237,7 +237,7 @@ def _plus_minus(summary: Json) -> str:
 
 def _trends(found: Conditions, name: str) -> list[str]:
     """Whether the mean differs between a factor's first and last level, in one sentence."""
-    told = []
+    changes = []
     for factor in found.varied():
         levels = found.factors[factor]
         if len(levels) < 2:
@@ -248,13 +248,13 @@ def _trends(found: Conditions, name: str) -> list[str]:
             continue
         change = sum(last) / len(last) - sum(first) / len(first)
         sure = not span[0] <= 0 <= span[1]
-        told.append(
+        changes.append(
             f"{levels[0]} to {levels[-1]} {change:+.0f} ms ({span[0]:+.0f} to {span[1]:+.0f}"
             f"{'' if sure else ', not told apart'})"
         )
-    if not told:
+    if not changes:
         return []
-    return [f"Mean {_NAMES[name]}, change with 95 % interval: {'; '.join(told)}."]
+    return [f"Mean {_NAMES[name]}, change with 95 % interval: {'; '.join(changes)}."]
 
 
 def _by_level(found: Conditions, factor: str) -> Table:

@@ -132,11 +132,11 @@ def tradeoff(store: Store, found: Mapping[str, Json]) -> Section:
         tables.append(table)
     pages = {"scene": "the scene's", "detector": "the detector's"}
     links = []
-    for name, whose in pages.items():
+    for name, subject in pages.items():
         file = (store.folder / FILES[name]).with_suffix(".html")
         if name in found and file.exists():
             address = os.path.relpath(file, store.folder / "report")
-            links.append(Link(address.replace(os.sep, "/"), f"The whole of {whose} search"))
+            links.append(Link(address.replace(os.sep, "/"), f"The whole of {subject} search"))
     return Section("Speed against error", said, pictures, tables, links, commands)
 
 

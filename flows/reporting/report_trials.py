@@ -46,8 +46,8 @@ def outcome(row: Json) -> str:
     return _verdict(found, "incipient", "detected_first")
 
 
-def told(row: Json) -> Json:
-    """One evaluated trial as the summary lists it."""
+def trial_summary(row: Json) -> Json:
+    """Summarise one evaluated trial."""
     found = row["latency"] or {}
     length = None
     if row["latency"] is not None:
@@ -102,7 +102,7 @@ def intervals(rows: Sequence[Json]) -> dict[str, Json]:
     """By value of a trial: n, mean, median and 95th percentile, each with its interval over trials.
 
     Args:
-        rows: from `told`.
+        rows: from `trial_summary`.
     """
     found = {}
     for name in VALUES:
@@ -133,7 +133,7 @@ class Conditions:
                 there = self.factors.setdefault(name, [])
                 there += [t for t in map(factors[name].text, levels) if t not in there]
         self.rows = [
-            {**told(row), "condition": row["condition"]}
+            {**trial_summary(row), "condition": row["condition"]}
             for row in rows
             if row["campaign"] in self.campaigns
         ]

@@ -79,8 +79,8 @@ def search(found: Json, simulated: bool) -> tuple[Figure, Table]:
         for row in shown[:MOST]
     ]
     columns = ("", "detector", *(heading for heading, _, _ in FIGURES.values()))
-    told = f" The first {MOST} of {len(shown)}, by latency." if len(shown) > MOST else ""
-    return figure, Table(columns, table, f"The front of {len(rows)} detectors, test trials.{told}")
+    note = f" The first {MOST} of {len(shown)}, by latency." if len(shown) > MOST else ""
+    return figure, Table(columns, table, f"The front of {len(rows)} detectors, test trials.{note}")
 
 
 def _mean(row: Json, key: tuple[str, str]) -> float | None:

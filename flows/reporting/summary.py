@@ -9,12 +9,12 @@ from typing import Any
 from sliplab.flows.labelling.label_errors import holds_compared, read_check
 from sliplab.flows.learning import other_networks
 from sliplab.flows.learning.train import training_settings
-from sliplab.flows.learning.window_baselines import EVALUATION, beside
+from sliplab.flows.learning.window_baselines import EVALUATION, baselines
 from sliplab.flows.learning.window_scores import window_intervals
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.campaign_section import reference_rows, wear
-from sliplab.flows.reporting.report_trials import accounted, intervals, told
+from sliplab.flows.reporting.report_trials import accounted, intervals, trial_summary
 from sliplab.flows.running import timing
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.phases import Press
@@ -71,7 +71,7 @@ def make_summary(
         "recall": windows["recall"],
         "baselines": windows["baselines"],
         "samples": windows["samples"],
-        "trained_baselines": beside(store),
+        "trained_baselines": baselines(store),
         **{name: windows[name] for name in _WINDOWS},
         "window_intervals": window_intervals(store, Derived.of(store, EVALUATION).key(EVALUATION)),
         **experiments["kinematic"],
@@ -89,7 +89,7 @@ def make_summary(
             for name, found in other_networks.kept(store, campaigns, reviewed).items()
         },
         "paper": _paper(campaigns),
-        "trials": [told(row) for row in evaluation["trials"]],
+        "trials": [trial_summary(row) for row in evaluation["trials"]],
         "references": _references(store, campaigns),
         "labels": {
             "error_ms": evaluation["label_error_ms"],
@@ -130,7 +130,9 @@ def _judged(
     rows = evaluation["trials"]
     return {
         "accounted": accounted(campaigns, rows, experiment),
-        "intervals": intervals([told(row) for row in rows if row["experiment"] == experiment]),
+        "intervals": intervals(
+            [trial_summary(row) for row in rows if row["experiment"] == experiment]
+        ),
     }
 
 

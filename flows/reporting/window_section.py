@@ -19,27 +19,30 @@ Json = dict[str, Any]
 _WORST = 10
 
 
-def window_sections(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> list[Section]:
+def window_sections(
+    windows: Json, baselines: Json, fitted: Fitted, simulated: bool
+) -> list[Section]:
     """All sections on the test windows.
 
     Args:
         windows: the evaluation's ``windows``.
-        beside: what was trained to compare, by name; see `flows.learning.window_baselines.beside`.
+        baselines: figures of other methods by name; see
+            `flows.learning.window_baselines.baselines`.
     """
-    sections = [_network(windows, beside, fitted, simulated), _where(windows, simulated)]
+    sections = [_network(windows, baselines, fitted, simulated), _where(windows, simulated)]
     if windows["reliability"]:
         sections.append(_lead(windows, simulated))
     if windows["work"] is not None:
-        sections.append(work_section.section(windows, beside))
+        sections.append(work_section.section(windows, baselines))
     return sections
 
 
-def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Section:
+def _network(windows: Json, baselines: Json, fitted: Fitted, simulated: bool) -> Section:
     """Accuracy on windows of test trials, with the other methods beside it."""
     accuracy = windows["accuracy"]
     kinds = ("argmax", "strict", "margin")
     rows = [["spiking network", *(percent(accuracy[kind]) for kind in kinds), ""]]
-    for name, found in {**windows["beside"], **beside}.items():
+    for name, found in {**windows["beside"], **baselines}.items():
         rows.append(
             [METHODS[name], percent(found["argmax"]), "", "", _points(found["network_ahead"])]
         )
@@ -47,7 +50,9 @@ def _network(windows: Json, beside: Json, fitted: Fitted, simulated: bool) -> Se
         [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
         for name, word in zip(CLASSES, figures.CLASS_WORDS, strict=True)
     ]
-    missing = [] if beside else ["Stronger methods are compared by `sliplab evaluate --baselines`."]
+    missing = (
+        [] if baselines else ["Stronger methods are compared by `sliplab evaluate --baselines`."]
+    )
     return Section(
         "The network on windows of 30 ms" if fitted.windows.length_ms == 30 else "The network",
         [

@@ -22,7 +22,7 @@ METHODS = {
 """Other methods in words, by name."""
 
 
-def section(windows: Json, beside: Json) -> Section:
+def section(windows: Json, baselines: Json) -> Section:
     """What spiking buys, and what it costs."""
     work = windows["work"]
     synaptic, dense = work["synaptic_operations"], work["dense_multiply_adds"]
@@ -45,7 +45,7 @@ def section(windows: Json, beside: Json) -> Section:
         "operation is one addition that a spike, or an event, causes at one neuron, counted by "
         "where it fired; a multiply-add does more. What is neither is not counted: keeping "
         "potentials, memory, moving spikes about. So this says nothing about joules.",
-        *_lost(windows, beside),
+        *_lost(windows, baselines),
     ]
     return Section(
         "What spiking buys, and what it costs",
@@ -55,16 +55,16 @@ def section(windows: Json, beside: Json) -> Section:
             Table(["layer", "synaptic operations", "dense multiply-adds", "share"], rows,
                   f"Means of {work['n']} test windows of {number(work['events'], 0)} events."),
             Table(["spiking layer", "spikes a window", "of neurons and steps"], fired),
-            *_others(beside),
+            *_others(baselines),
         ],
     )  # fmt: skip
 
 
-def _lost(windows: Json, beside: Json) -> list[str]:
+def _lost(windows: Json, baselines: Json) -> list[str]:
     """The accuracy that the best other method has more or less."""
-    there = {**windows["beside"], **beside}
-    found = {name: row for name, row in there.items() if row["argmax"] is not None}
-    if not beside or not found:
+    compared = {**windows["beside"], **baselines}
+    found = {name: row for name, row in compared.items() if row["argmax"] is not None}
+    if not baselines or not found:
         return []
     best = max(found, key=lambda name: float(found[name]["argmax"]))
     ahead = found[best]["network_ahead"]
@@ -101,9 +101,9 @@ def _means(ours: Json, theirs: Json, best: str) -> list[str]:
     ]
 
 
-def _others(beside: Json) -> list[Table]:
+def _others(baselines: Json) -> list[Table]:
     rows = []
-    for name, found in beside.items():
+    for name, found in baselines.items():
         made = found["made"]
         ran = made.get("epochs", made.get("rounds", made.get("iterations")))
         most = made.get("most_rounds")

@@ -14,11 +14,11 @@ class Aside:
     """Work for one tab.
 
     Args:
-        pool: does the work; told: called in the tab with an error's words.
+        pool: does the work; on_error: called in the tab with an error's message.
     """
 
-    def __init__(self, doc: Document, pool: Executor, told: Callable[[str], None]) -> None:
-        self._doc, self._pool, self._told = doc, pool, told
+    def __init__(self, doc: Document, pool: Executor, on_error: Callable[[str], None]) -> None:
+        self._doc, self._pool, self._on_error = doc, pool, on_error
         self._closed = False
 
     def do(
@@ -38,7 +38,7 @@ class Aside:
             if error is None:
                 then(done.result())
             else:
-                self._told(f"{type(error).__name__}: {error}")
+                self._on_error(f"{type(error).__name__}: {error}")
                 otherwise()
 
         self._pool.submit(work).add_done_callback(back)

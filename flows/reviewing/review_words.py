@@ -24,7 +24,7 @@ def heading(shown: Shown, position: str) -> str:
     """Which trial it is, what it was taken under, and why it is in doubt."""
     row = shown.row
     condition = shown.recording.record["condition"]
-    told = ", ".join(f"{name} {text}" for name, text in condition.items())
+    levels = ", ".join(f"{name} {text}" for name, text in condition.items())
     who = f" by {escape(row.who)}" if row.who else ""
     badges = [f"<span class='state {row.state}'>{row.state}{who}</span>"]
     if shown.recording.simulated:
@@ -45,7 +45,7 @@ def heading(shown: Shown, position: str) -> str:
     if not reasons:
         reasons = ["<li>no reason for doubt</li>"]
     return (
-        f"<h1>{escape(told)} {' '.join(badges)}</h1>"
+        f"<h1>{escape(levels)} {' '.join(badges)}</h1>"
         f"<p class='id'>{escape(row.campaign)} / {escape(row.trial)} &middot; {position}</p>"
         f"<ul>{''.join(reasons)}</ul>"
     )

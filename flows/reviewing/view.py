@@ -155,8 +155,8 @@ def program() -> str:
     """
     import sys
 
-    beside = Path(sys.executable).with_name("rerun")
-    found = str(beside) if beside.exists() else shutil.which("rerun")
+    sibling = Path(sys.executable).with_name("rerun")
+    found = str(sibling) if sibling.exists() else shutil.which("rerun")
     if found is None:
         raise StoreError("Rerun's program `rerun` cannot be found beside its library")
     return found

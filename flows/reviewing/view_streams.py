@@ -94,8 +94,8 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     label = derived.read(subject.trial) if fresh else {}
     arrays = derived.arrays(subject.trial) if fresh else {}
     condition = ", ".join(f"{name} {text}" for name, text in recording.record["condition"].items())
-    told = "**simulated**" if recording.simulated else "recorded"
-    text = f"# {condition}\n\n{told}\n\n{subject.item.name} / {subject.trial}"
+    kind = "**simulated**" if recording.simulated else "recorded"
+    text = f"# {condition}\n\n{kind}\n\n{subject.item.name} / {subject.trial}"
     document = library.TextDocument(text, media_type=library.MediaType.MARKDOWN)
     to.once("trial", document)
     _events(to, subject)

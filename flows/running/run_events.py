@@ -86,16 +86,16 @@ class BatchingWorker(EventsWorker):
 
 _engine: Any = prefect.task_engine
 _emitter: Any = prefect.events.utilities
-_tell = _engine.emit_task_run_state_change_event
+_emit = _engine.emit_task_run_state_change_event
 
 
-def _tell_but_pending(
+def _emit_but_pending(
     task_run: Any, initial_state: Any, validated_state: Any, follows: Event | None = None
 ) -> Event | None:
     if initial_state is None:
         return None
-    told: Event | None = _tell(task_run, initial_state, validated_state, follows)
-    return told
+    event: Event | None = _emit(task_run, initial_state, validated_state, follows)
+    return event
 
 
 _drain: Any = EventsWorker.drain
@@ -120,7 +120,7 @@ def install(silent: bool = False) -> None:
     bound_exit()
     BatchingWorker.set_client_override(NullEventsClient if silent else None)
     _emitter.EventsWorker = BatchingWorker
-    _engine.emit_task_run_state_change_event = _tell_but_pending
+    _engine.emit_task_run_state_change_event = _emit_but_pending
 
 
 def bound_exit() -> None:

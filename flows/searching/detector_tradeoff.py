@@ -192,16 +192,16 @@ def detector_tradeoff(
     for words, why in search.grid.left_out.items():
         console.say(f"left out: {words}: {why}")
     plan = search.plan()
-    told = (
+    message = (
         f"{plan['runs']} trainings ({len(search.grid.settings)} settings, {ask.seeds} seeds), "
         f"{plan['kept']} of them kept"
     )
     made = 0
     if minutes == 0 and not dry_run:
-        console.say(told)
+        console.say(message)
     else:
         seconds = search.estimated_s
-        console.say(f"{told}; the others take about {console.duration(seconds)}")
+        console.say(f"{message}; the others take about {console.duration(seconds)}")
         if dry_run:
             return {**plan, "estimated_s": round(seconds, 1)}
         began = time.monotonic()

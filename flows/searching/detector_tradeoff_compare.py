@@ -99,5 +99,5 @@ def _differences(row: Row, start: Row) -> dict[str, Any]:
             [of[part][key][of["seeds"].index(seed)] for seed in both] for of in (row, start)
         )
         difference = paired_difference(ours, theirs)
-        result[name] = {**asdict(difference), "told": difference.told}
+        result[name] = {**asdict(difference), "told": difference.significant}
     return result

@@ -21,8 +21,10 @@ def estimate(kept: Kept, run: Run, like: list[Run]) -> dict[str, float]:
     fire less or more than trained ones, so the second is right within a factor of two or so.
     """
     known = [kept.derived.read(other.name)["seconds"] for other in like if kept.done(other)]
-    told = next((seconds for seconds in known if seconds["train"] is not None), None)
-    train, count = _probe(kept.data, run) if told is None else (told["train"], told["count"])
+    known_run = next((seconds for seconds in known if seconds["train"] is not None), None)
+    train, count = (
+        _probe(kept.data, run) if known_run is None else (known_run["train"], known_run["count"])
+    )
     return {"train": 0.0 if kept.model_path(run).exists() else train, "count": count}
 
 

@@ -27,13 +27,13 @@ from sliplab.flows.searching.detector_tradeoff_text import (
     COLUMNS,
     cells,
     distinct,
+    format_difference,
     front_rows,
     hundred,
     ordered_front,
     scaled,
     seed_range,
     spread,
-    told,
 )
 
 MOST_ROWS = 40
@@ -206,9 +206,9 @@ def _factors(result: Mapping[str, Any]) -> Section:
             shown = ["paper's" if item["paper"] else "–"] * 3
         else:
             shown = [
-                told(found["strict"], 100, "points"),
-                told(found["mean_ms"], 1, "ms"),
-                told(found["false_early_either"], 100, "points"),
+                format_difference(found["strict"], 100, "points"),
+                format_difference(found["mean_ms"], 1, "ms"),
+                format_difference(found["false_early_either"], 100, "points"),
             ]
         table.append(
             [f"{title}: {value}", spread(row["test"]["strict"], 100, 1),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.rule_sweep import Figures, Trials, choose_pair, sweep, worth
+from sliplab.analysis.detect.rule_sweep import Figures, Trials, choose_pair, score, sweep
 from sliplab.analysis.detect.true_slip import NEVER
 from sliplab.analysis.statistics.pareto import front
 from sliplab.flows.searching.detector_tradeoff_data import Data, true_onsets
@@ -161,11 +161,11 @@ def _figures(
     result: dict[str, Any] = {}
     for part in ("validation", "test"):
         onsets = getattr(truth, part)
-        found = [vars(worth(getattr(one, part)[:, s, m], onsets)) for one in each]
+        found = [vars(score(getattr(one, part)[:, s, m], onsets)) for one in each]
         result[part] = {name: [row[name] for row in found] for name in found[0]}
         result[part]["strict"] = [one["precisions"][precision][part]["strict"] for one in figures]
     if truth.falling is not None:
-        falls = [worth(one.falling[:, s, m], truth.falling) for one in each]
+        falls = [score(one.falling[:, s, m], truth.falling) for one in each]
         result["falling"] = {
             name: [getattr(row, name) for row in falls]
             for name in ("lead_min_ms", "missed", "late", "false_early", "trials")
@@ -245,7 +245,7 @@ def pair_table(data: Data, kept: Kept, runs: Sequence[Run]) -> list[dict[str, An
     rows = []
     for s, smoothing in enumerate(SMOOTHINGS if each else ()):
         for m, margin in enumerate(truth.margins):
-            found: list[Figures] = [worth(one[:, s, m], truth.test) for one in each]
+            found: list[Figures] = [score(one[:, s, m], truth.test) for one in each]
             names = ("mean_ms", "p95_ms", "lost_either", "false_early_either")
             means = {name: mean([getattr(row, name) for row in found]) for name in names}
             rows.append({"smoothing": smoothing, "margin": margin, **means})

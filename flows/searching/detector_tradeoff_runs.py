@@ -122,14 +122,14 @@ class Kept:
         state = path.with_suffix(".state")
         train, validation = self._samples(run, "train"), self._samples(run, "validation")
 
-        def told(record: EpochRecord) -> None:
+        def on_epoch(record: EpochRecord) -> None:
             note = f"{run.words}: epoch {record.epoch}, {record.val_strict:.3f} strict"
             advance(1.0 / run.training.epochs, note)
 
         fitted = training.fit(
             train.windows, train.y, validation.windows, validation.y,
             run.network, run.windows, run.training, run.seed,
-            on_epoch=told,
+            on_epoch=on_epoch,
             on_state=partial(write_bytes, state),
             state=state.read_bytes() if state.exists() else None,
         )  # fmt: skip

@@ -139,8 +139,8 @@ def spread(values: Sequence[float | None], scale: float, digits: int) -> str:
     return text if len(values) < 2 else f"{text} ({found[1]:.{digits}f} to {found[2]:.{digits}f})"
 
 
-def told(difference: Mapping[str, Any], scale: float, unit: str) -> str:
-    """A difference with its interval, and whether it is more than seeds differ by."""
+def format_difference(difference: Mapping[str, Any], scale: float, unit: str) -> str:
+    """Format a difference, its interval, and its significance over seeds."""
     if difference["mean"] is None:
         return "–"
     text = f"{scale * difference['mean']:+.1f}".replace("-", "−")

@@ -139,7 +139,7 @@ class Generalisation:
         x, y = self.samples.windows, self.samples.y
         how = self.settings.training
 
-        def told(record: EpochRecord) -> None:
+        def on_epoch(record: EpochRecord) -> None:
             share = f"validation {100 * record.val_strict:.1f} %"
             console.say(f"without {name}: epoch {record.epoch} of at most {how.epochs}, {share}")
 
@@ -152,7 +152,7 @@ class Generalisation:
             self.settings.windows,
             how,
             how.seeds[0],
-            on_epoch=told,
+            on_epoch=on_epoch,
             on_state=partial(write_bytes, state),
             state=state.read_bytes() if state.exists() else None,
         )

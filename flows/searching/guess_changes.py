@@ -47,12 +47,12 @@ def figures(setting: Json) -> dict[str, float | None]:
     values = _values(setting)
     right = sum(found[0] for found in setting["windows"].values())
     count = sum(found[1] for found in setting["windows"].values())
-    told: dict[str, float | None] = {"strict": right / count if count else None}
+    summary: dict[str, float | None] = {"strict": right / count if count else None}
     for name, found in values.items():
         there = [value for value in found.values() if value is not None]
         middle = np.median if name in ("incipient_ms", "gross_ms") else np.mean
-        told[name] = float(middle(there)) if there else None
-    return told
+        summary[name] = float(middle(there)) if there else None
+    return summary
 
 
 def changes(base: Json, other: Json) -> dict[str, tuple[float, float] | None]:

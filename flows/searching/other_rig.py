@@ -99,8 +99,8 @@ def judge(
         settings = detection[item.name]
         for trial, recording in item.of_split("test"):
             counts, end_ns = _counts(recording, fitted, settings)
-            told = labels.read(item, recording)
-            rows.append((score_row(item, trial, told, counts, end_ns, settings), recording))
+            label = labels.read(item, recording)
+            rows.append((score_row(item, trial, label, counts, end_ns, settings), recording))
     samples = load_samples(labels, training_campaigns(campaigns), "test")
     counts = training.predict_counts(fitted, samples.windows)
     return Judged(counts, samples.y, samples.trial, rows)

@@ -152,8 +152,8 @@ def _outcome(job: _Job, advance: Callable[[], None] | None = None) -> _Outcome:
         onsets = [_slide_onsets(rig.scene, plan, trial, variant.seed(trial)) for trial in trials]
         slides = [onset for onset in onsets if onset is not None]
         # a falling plate has no contact-only run: whole ones tell
-        told = slides or [_seen_onsets(item) for item in seen]
-        known_s = np.array(told, np.float64).reshape(-1, 2)
+        known = slides or [_seen_onsets(item) for item in seen]
+        known_s = np.array(known, np.float64).reshape(-1, 2)
     return _Outcome(known_s, pooled(counted)["events_per_s"])
 
 

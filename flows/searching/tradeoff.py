@@ -104,11 +104,11 @@ def variants_of(rig: RigFile, plan: Plan, steps: Sequence[int]) -> dict[str, lis
     With a plate that may fall the contact steps by a millisecond whatever the rig file says, so
     only the rig's own step is there.
     """
-    told = rig.scene.scene.step_ms
+    stated = rig.scene.scene.step_ms
     if falls(plan):
-        steps = (told,)
+        steps = (stated,)
     return {
-        "levels": [Variant(f"L{level}", level, told) for level in (1, 2, 3)],
+        "levels": [Variant(f"L{level}", level, stated) for level in (1, 2, 3)],
         "cubic": [Variant(str(step), HIGHEST, step) for step in steps],
         "chord": [Variant(str(step), HIGHEST, step, "chord") for step in steps],
     }
@@ -126,7 +126,7 @@ def _measure(
     rig, plan, families = jobs[0].rig, jobs[0].plan, jobs[0].families
     timed(REFERENCE.of(rig), plan, jobs[0].trial, 0)  # so that compiling is not timed
     wall_s = [wall_seconds(job, ROUNDS, lambda: bar.advance()) for job in jobs]
-    told = [closed_form(rig, plan, job.trial) for job in jobs]
+    stated = [closed_form(rig, plan, job.trial) for job in jobs]
     if cluster is None:
         done = [compare_trial(job, lambda: bar.advance()) for job in jobs]
     else:
@@ -134,7 +134,7 @@ def _measure(
     windows = plan.protocol.analysis.windows
     closed = [
         (form[1], compare(item.onsets, replace(item.onsets, slips=form[0], markers=None), windows))
-        for form, item in zip(told, done, strict=True)
+        for form, item in zip(stated, done, strict=True)
         if form is not None
     ]
     steps = {level: mean_error([item.gaps[level] for item in done]) for level in (1, 2)}
@@ -175,17 +175,17 @@ def _measure(
 
 
 def _left_out(plan: Plan, closed: int, trials: int) -> list[str]:
-    told = []
+    stated = []
     if falls(plan):
-        told.append(
+        stated.append(
             "Longer steps are left out: while a plate may fall the scene steps by a millisecond."
         )
     if closed < trials:
-        told.append(
+        stated.append(
             f"L0 is told for {closed} of {trials} trials: a retraction that also goes sideways "
             "has no closed form."
         )
-    return told
+    return stated
 
 
 def _row(family: str, variant: Variant, wall_s: float, error: SceneError) -> dict[str, Any]:

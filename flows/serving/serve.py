@@ -164,7 +164,9 @@ def serve(
         url, page = stack.enter_context(page_server(port))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
-        Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols).tell()
+        Service(
+            str(store.folder.resolve()), rig, name, server, os.getpid(), protocols
+        ).export_environment()
         for item in run_records.close_dead(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
         looking = partial(watch, page, store.folder, server)

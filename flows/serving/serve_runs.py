@@ -129,13 +129,13 @@ def when_free(
             if order.until is not None and datetime.now().timestamp() >= order.until:
                 raise WindowOver(f"the window is over and nothing was taken: {busy}") from None
             if not waited:
-                _tell_waiting(run, str(busy))
+                _report_waiting(run, str(busy))
         stopping.wait(LOOK_S)
         waited += LOOK_S
 
 
-def _tell_waiting(run: Any, why: str) -> None:
-    """What Prefect's page shows of a run that waits for its rig."""
+def _report_waiting(run: Any, why: str) -> None:
+    """Show on Prefect's page that a run waits for its rig."""
     from prefect.client.orchestration import get_client
     from prefect.states import Running
 

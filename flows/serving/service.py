@@ -43,8 +43,8 @@ class Service:
         """The store's folder."""
         return Path(self.store)
 
-    def tell(self) -> None:
-        """Put it into the environment of the processes that are started from here on."""
+    def export_environment(self) -> None:
+        """Export it to the environment of processes that are started from here on."""
         os.environ[ENVIRONMENT] = json.dumps(asdict(self))
 
     def protocol(self, given: Path) -> Path:

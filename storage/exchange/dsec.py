@@ -97,7 +97,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     )  # fmt: skip
 
 
-def _resolution(told: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] | None:
+def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] | None:
     """Columns and rows of the camera, by the attribute `sensor_resolution`.
 
     The lab writes columns first, other programs that share its layout rows first. Sensors are wider
@@ -106,16 +106,16 @@ def _resolution(told: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] |
     Raises:
         Wrong: the events fit neither way.
     """
-    if told is None or len(told) < 2 or min(told[:2]) <= 0:
+    if stated is None or len(stated) < 2 or min(stated[:2]) <= 0:
         return None
-    long, short = max(told[:2]), min(told[:2])
+    long, short = max(stated[:2]), min(stated[:2])
     columns, rows = (_end(column) for column in (xs, ys))
     for size in ((long, short), (short, long)):
         if columns <= size[0] and rows <= size[1]:
             return size
     raise Wrong(
         f"holds events up to column {columns - 1} and row {rows - 1}, outside of its "
-        f"sensor_resolution {told[0]} x {told[1]}"
+        f"sensor_resolution {stated[0]} x {stated[1]}"
     )
 
 
@@ -130,8 +130,8 @@ def _same_length(columns: Mapping[str, Sized]) -> None:
     """Refuse columns of which one is cut short: nobody knows which events it has lost."""
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{key} {count}" for key, count in lengths.items())
-        raise Wrong(f"its events' columns have different lengths: {told}")
+        stated = ", ".join(f"{key} {count}" for key, count in lengths.items())
+        raise Wrong(f"its events' columns have different lengths: {stated}")
 
 
 def is_lab_hdf5(path: Path) -> bool:

@@ -18,7 +18,7 @@ from tests.crash.process import End, live
 STEP = 64 * 1024
 
 
-def told(wanted: Order, policy: Policy) -> End:
+def last_end(wanted: Order, policy: Policy) -> End:
     """Collect as the command line does, with its exit code and its message."""
 
     def work() -> None:
@@ -68,7 +68,7 @@ def fill(
         place = folder / "full"
         shutil.rmtree(place, ignore_errors=True)
         wanted = order(place, 1, video)
-        end = told(wanted, Full(room))
+        end = last_end(wanted, Full(room))
         said = wrong_message(end, "its disk is full") + wrong(wanted.store, whole)
         found += [f"room for {room} bytes: {text}" for text in said + _goes_on(wanted, whole)]
     return {"bytes": needed, "step": step, "tried": len(tried), "wrong": found}
@@ -90,7 +90,7 @@ def read_only(folder: Path) -> dict[str, Any]:
     more, none = order(folder / "some", 2), order(folder / "none", 1)
     found = []
     for wanted in (more, none):
-        end = told(wanted, ReadOnly())
+        end = last_end(wanted, ReadOnly())
         said = wrong_message(end, "its disk is read-only") + wrong(wanted.store, whole)
         found += [f"{wanted.store}: {text}" for text in said]
     if hashes(begun.store) != whole:

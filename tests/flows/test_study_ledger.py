@@ -25,9 +25,9 @@ EXPECTED = {"collect": 100.0, "label": 50.0, "train": 200.0}
 def spend(folder: Path, clock: Clock, seconds: float, worked: bool = True) -> Ledger:
     """A ledger whose first step took that long."""
     ledger = Ledger(folder, EXPECTED, clock)
-    with ledger.step("collect") as tell:
+    with ledger.step("collect") as on_done:
         clock.now += seconds
-        tell("told", worked)
+        on_done("told", worked)
     return ledger
 
 
@@ -35,17 +35,17 @@ def test_a_study_from_its_beginning_to_its_end(tmp_path: Path) -> None:
     clock = Clock()
     ledger = Ledger(tmp_path, EXPECTED, clock)
     assert ledger.left_s() == 350.0
-    with ledger.step("collect") as tell:
+    with ledger.step("collect") as on_done:
         assert [row.state for row in read(tmp_path)] == [RUNNING, TO_DO, TO_DO]
         clock.now += 50.0  # twice as fast as expected
-        tell("10 trials taken", True)
+        on_done("10 trials taken", True)
     assert ledger.left_s() == pytest.approx(250.0 * (50 + 60) / (100 + 60))
-    with ledger.step("label") as tell:
+    with ledger.step("label") as on_done:
         clock.now += 25.0
-        tell("10 trials", True)
-    with ledger.step("train") as tell:
+        on_done("10 trials", True)
+    with ledger.step("train") as on_done:
         clock.now += 75.0
-        tell("1 network", True)
+        on_done("1 network", True)
     assert ledger.left_s() == 0.0
     rows = read(tmp_path)
     assert [row.state for row in rows] == [DONE] * 3
@@ -66,9 +66,9 @@ def test_a_step_that_was_stopped_adds_up(tmp_path: Path) -> None:
     assert read(tmp_path)[0].state == STOPPED
     again = Ledger(tmp_path, EXPECTED, clock)
     assert again.left_s() == 70.0 + 50.0 + 200.0
-    with again.step("collect") as tell:
+    with again.step("collect") as on_done:
         clock.now += 90.0
-        tell("6 trials taken", True)
+        on_done("6 trials taken", True)
     assert read(tmp_path)[0].seconds == 120.0
     assert again.left_s() == pytest.approx(250.0 * (120 + 60) / (100 + 60))
 
@@ -89,15 +89,15 @@ def test_what_is_left_is_never_beyond_reason(tmp_path: Path) -> None:
 def test_a_short_first_step_says_little_about_the_rest(tmp_path: Path) -> None:
     clock = Clock()
     ledger = Ledger(tmp_path, {"collect": 15.0, "train": 60.0}, clock)
-    with ledger.step("collect") as tell:
+    with ledger.step("collect") as on_done:
         clock.now += 75.0  # a minute of it compiled what is compiled once
-        tell("36 trials taken", True)
+        on_done("36 trials taken", True)
     assert ledger.left_s() == pytest.approx(60.0 * (75 + 60) / (15 + 60))
     long = Ledger(tmp_path / "long", {"collect": 15000.0, "train": 60.0}, clock)
     (tmp_path / "long").mkdir()
-    with long.step("collect") as tell:
+    with long.step("collect") as on_done:
         clock.now += 30000.0
-        tell("864 trials taken", True)
+        on_done("864 trials taken", True)
     assert long.left_s() == pytest.approx(120.0, rel=0.01)
 
 

@@ -64,7 +64,7 @@ def test_the_preset_is_the_papers_table() -> None:
 def test_one_key_in_a_shipped_protocol_is_enough(name: str, tmp_path: Path) -> None:
     found = settings(file(name, tmp_path, preset="paper"))
     assert found.overrides == ()
-    assert found.beside() is None
+    assert found.comparison_settings() is None
 
 
 def test_keys_beside_the_preset_go_before_it_and_are_named() -> None:
@@ -112,11 +112,11 @@ def test_the_network_beside_shares_data_and_differs_in_all_else() -> None:
             "detection": {"margin": 9},
         }
     )
-    found = ours.beside()
+    found = ours.comparison_settings()
     assert found is not None
     for section in ("labelling", "windows", "samples", "split"):
         assert getattr(found, section) == getattr(ours, section)
     assert (found.training.epochs, found.training.seeds) == (3, (4,))
     assert [each.key for each, _ in found.overrides] == ["windows.length_ms"]
     assert found.detection.compare is None
-    assert AnalysisSettings().beside() is None
+    assert AnalysisSettings().comparison_settings() is None

@@ -9,7 +9,7 @@ import h5py
 import pytest
 
 from sliplab.storage.catalogue import catalogue
-from sliplab.storage.errors import disk_explained
+from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Campaign, Store, StoreError
@@ -231,9 +231,12 @@ def test_errors_of_other_devices_are_left_alone(tmp_path: Path) -> None:
     class Serial(RuntimeError):
         pass
 
-    with pytest.raises(Serial), disk_explained(tmp_path, Serial):
+    with pytest.raises(Serial), translated_disk_errors(tmp_path, Serial):
         raise Serial from OSError(5, "the cable was pulled")
-    with pytest.raises(StoreError, match="its disk reports errors"), disk_explained(tmp_path):
+    with (
+        pytest.raises(StoreError, match="its disk reports errors"),
+        translated_disk_errors(tmp_path),
+    ):
         raise OSError(5, "Input/output error")
 
 

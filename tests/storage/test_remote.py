@@ -397,6 +397,6 @@ def test_secrets_are_nowhere(endpoint: str, store: Store, tmp_path: Path) -> Non
     with pytest.raises(RemoteError) as told:
         push(store, lost)
     assert secret.decode() not in str(told.value)
-    with pytest.raises(RemoteError) as told, lost._told("key", "read"):
+    with pytest.raises(RemoteError) as told, lost._errors_translated("key", "read"):
         raise ValueError(f"signature of {secret.decode()} is wrong")
     assert "signature of *** is wrong" in str(told.value)

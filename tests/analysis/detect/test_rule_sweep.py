@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sliplab.analysis.detect.detection import detect
 from sliplab.analysis.detect.latency import score_trial, summarise_latency, summarise_lead
-from sliplab.analysis.detect.rule_sweep import Trials, choose_pair, sweep, worth
+from sliplab.analysis.detect.rule_sweep import Trials, choose_pair, score, sweep
 from sliplab.analysis.detect.smoothing_choice import Counted, choose_smoothing
 from sliplab.analysis.detect.true_slip import NEVER, TrueSlip
 from sliplab.protocols.settings import Detection
@@ -49,7 +49,7 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
                 assert each[k, s, m].tolist() == told
             scored = [score_trial(one, t.slip, 30 * MS) for one, t in zip(said, found, strict=True)]
             latency, lead = summarise_latency(scored), summarise_lead(scored)
-            figures, n = worth(each[:, s, m], truth), len(found)
+            figures, n = score(each[:, s, m], truth), len(found)
             assert figures.mean_ms == pytest.approx(latency["incipient"]["mean"])
             assert figures.p95_ms == pytest.approx(latency["incipient"]["p95"])
             assert figures.gross_mean_ms == pytest.approx(latency["gross"]["mean"])

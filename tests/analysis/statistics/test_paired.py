@@ -16,15 +16,15 @@ def test_the_interval_is_that_of_the_paired_test() -> None:
         interval = expected.confidence_interval(0.95)
         assert (found.low, found.high) == pytest.approx((interval.low, interval.high))
         assert found.mean == pytest.approx((ours - theirs).mean())
-        assert found.told == bool(expected.pvalue < 0.05)
+        assert found.significant == bool(expected.pvalue < 0.05)
         assert found.seeds == n
 
 
 def test_seeds_with_one_figure_only_are_left_out() -> None:
     found = paired_difference([1.0, None, 3.0], [0.5, 1.0, None])
     assert found == Difference(0.5, None, None, 1)
-    assert found.told is None
+    assert found.significant is None
     assert paired_difference([None], [1.0]) == Difference(None, None, None, 0)
-    assert paired_difference([2.0, 3.0], [1.0, 2.0]).told  # no spread at all
+    assert paired_difference([2.0, 3.0], [1.0, 2.0]).significant  # no spread at all
     with pytest.raises(ValueError, match="zip"):
         paired_difference([1.0], [])

@@ -150,8 +150,8 @@ def test_event_times_are_told_for_all_and_until_gross_slip() -> None:
 
 def test_closed_forms_are_held_against_slips_and_have_no_events() -> None:
     reference = seen(events((1, 1, 1, 1)), (60 * MS, 160 * MS), (50 * MS, 150 * MS))
-    told = seen(None, None, (52 * MS, 150 * MS))
-    error = compare(reference, told, WINDOWS)
+    found_error = seen(None, None, (52 * MS, 150 * MS))
+    error = compare(reference, found_error, WINDOWS)
     assert (error.first_slip_ms, error.centre_slip_ms) == (2.0, 0.0)
     assert error.flipped == pytest.approx(2 / 271)
     assert (error.unmatched, error.tensor_l1, error.early_p95_us) == (None, None, None)
@@ -211,9 +211,9 @@ def test_what_the_samples_hold() -> None:
 def test_a_trial_that_never_slips_has_no_shares() -> None:
     found = look(seen(events((130, 50, 1, 15_000))), WINDOWS, Samples(), 0)
     assert found.samples == (0, 0, 0)
-    told = pooled([found])
-    assert told["hold_share"] is None
-    assert told["ceiling"] is None
-    assert told["events_per_s"]["gross"] is None
+    found_error = pooled([found])
+    assert found_error["hold_share"] is None
+    assert found_error["ceiling"] is None
+    assert found_error["events_per_s"]["gross"] is None
     with pytest.raises(ValueError, match="no events"):
         look(seen(None), WINDOWS, Samples(), 0)

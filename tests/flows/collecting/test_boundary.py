@@ -49,17 +49,17 @@ def guarded(
 
 
 def after_first(work: Session, do: Callable[[], object]) -> list[tuple[str, str]]:
-    """Take what is pending; somebody does something during the first trial. What was told."""
-    told: list[tuple[str, str]] = []
+    """Take what is pending; somebody does something during the first trial; return outcomes."""
+    outcomes: list[tuple[str, str]] = []
 
     def on_trial(trial: Trial, outcome: str) -> None:
-        if not told:
+        if not outcomes:
             do()
-        told.append((trial.id, outcome))
+        outcomes.append((trial.id, outcome))
 
     work.on_trial = on_trial
     work.take(pending_trials(work.plan, work.campaign))
-    return told
+    return outcomes
 
 
 def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path) -> None:
@@ -158,8 +158,8 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
         control.ask(store, "skip", campaign="tiny", trials=(second, first), **by)
         control.ask(store, "again", campaign="tiny", trials=(first,), who="ben", why="dust")
 
-    told = after_first(work, ask)
-    assert told == [(first, "committed"), (second, "skipped"), (third, "committed")]
+    outcomes = after_first(work, ask)
+    assert outcomes == [(first, "committed"), (second, "skipped"), (third, "committed")]
     (request, _) = control.requests(store)
     answer = control.answered(store, request)
     assert answer is not None

@@ -59,7 +59,7 @@ def test_decisions_count_only_when_asked(made: Reviewable) -> None:
         assert found == {"key": made.keys[trial], **label()}
         assert plain.key(made.item, recording(made, trial)) == made.keys[trial]
     assert plain.states([made.item]) is None
-    assert plain.told([made.item]) == {}
+    assert plain.report_states([made.item]) == {}
 
     found = reviewed.read(made.item, recording(made, one))
     assert (found["incipient_ns"], found["gross_ns"]) == (NEW.incipient_ns, NEW.gross_ns)
@@ -98,7 +98,7 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     labels = Labels(made.store, reviewed=True)
     found = labels.read(made.item, recording(made, trial))
     assert found["incipient_ns"] == label()["incipient_ns"]
-    assert labels.told([made.item])["reviewed"]["stale"] == 1
+    assert labels.report_states([made.item])["reviewed"]["stale"] == 1
     assert (
         "decisions on 1 trials were made on labels that have changed since"
         in capsys.readouterr().err

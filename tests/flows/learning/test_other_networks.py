@@ -73,7 +73,7 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
 def test_the_preset_by_itself_is_the_network_that_stood_beside(
     store: Store, tmp_path: Path
 ) -> None:
-    beside = Derived.of(store, STEP).read("preset-paper")
+    comparison = Derived.of(store, STEP).read("preset-paper")
     shutil.copytree(store.folder, tmp_path / "store")
     for item in collected(Store.open(tmp_path / "store")):
         file = item.campaign.protocol_file
@@ -87,8 +87,8 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
     assert (models / "seed0.pt").read_bytes() == (models / "paper-seed0.pt").read_bytes()
     assert evaluate(alone, campaigns)["done"] == 1
     _, found = evaluation_of(alone)
-    assert found["windows"]["accuracy"] == beside["windows"]["accuracy"]
-    assert found["trials"] == beside["trials"]
+    assert found["windows"]["accuracy"] == comparison["windows"]["accuracy"]
+    assert found["trials"] == comparison["trials"]
     report(alone, campaigns)
     said = read_summary(alone)["paper"]
     assert (said["preset"], said["differences"]) == ("paper", [])

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.flows.planning.changes import MOST, differences, told
+from sliplab.flows.planning.changes import MOST, differences, format_differences
 from sliplab.flows.planning.orders import describe_campaign, make_order
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
@@ -29,9 +29,9 @@ def test_differences_name_key_old_and_new() -> None:
         ("g", "not there", "2"),
         ("h", "not there", "{i: 1}"),
     ]
-    assert told(old, old) == ""
+    assert format_differences(old, old) == ""
     many = {str(number): number for number in range(MOST + 3)}
-    assert told(many, {}).endswith("\n  and 3 more")
+    assert format_differences(many, {}).endswith("\n  and 3 more")
 
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
@@ -135,5 +135,8 @@ def test_a_changed_rig_and_levels_that_are_gone_are_said(tmp_path: Path) -> None
 
 def test_a_changed_secret_is_masked() -> None:
     old, new = ({"arm": {"password": word, "port": 1}} for word in ("hunter2", "hunter3"))
-    assert told(old, new) == "\n  arm.password: **** -> ****"
-    assert told({}, {"arm": new["arm"]}) == "\n  arm: not there -> {password: ****, port: 1}"
+    assert format_differences(old, new) == "\n  arm.password: **** -> ****"
+    assert (
+        format_differences({}, {"arm": new["arm"]})
+        == "\n  arm: not there -> {password: ****, port: 1}"
+    )

@@ -63,9 +63,9 @@ def test_the_region_must_cover_the_centre_marker(tmp_path: Path) -> None:
     assert not narrow.passed
     assert "widen recording.region by" in narrow.finding
     middle = {"width": "20 mm", "height": "20 mm"}
-    (told,) = check_region(order_of(tmp_path / "c", region=middle))
-    assert told.passed
-    assert "leave it on the longest" in told.finding
+    (near,) = check_region(order_of(tmp_path / "c", region=middle))
+    assert near.passed
+    assert "leave it on the longest" in near.finding
 
 
 def test_rigs_lists_what_ships_and_says_what_is_wrong_with_a_file(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def windows(*strict: float) -> Json:
     }
 
 
-def beside(*argmax: float) -> Json:
+def baselines(*argmax: float) -> Json:
     made = {
         "epochs": 10,
         "weights": 1234,
@@ -43,7 +43,7 @@ def beside(*argmax: float) -> Json:
 
 
 def test_means_of_seeds_stand_against_each_other() -> None:
-    made = section(windows(0.93, 0.94, 0.95), beside(0.96, 0.95, 0.94))
+    made = section(windows(0.93, 0.94, 0.95), baselines(0.96, 0.95, 0.94))
     said = " ".join(made.text)
     assert "Over 3 seeds the spiking network's strict accuracy is 94.0 % in the mean" in said
     assert "have 95.0 %: 1.00 points behind, ties counted as wrong" in said
@@ -52,7 +52,7 @@ def test_means_of_seeds_stand_against_each_other() -> None:
 
 @pytest.mark.parametrize(("ours", "theirs"), [((0.9,), (0.9, 0.8)), ((0.9, 0.8), (0.9,))])
 def test_one_seed_is_no_mean(ours: tuple[float, ...], theirs: tuple[float, ...]) -> None:
-    made = section(windows(*ours), beside(*theirs))
+    made = section(windows(*ours), baselines(*theirs))
     assert "It costs:" in " ".join(made.text)
     assert "Over" not in " ".join(made.text)
 

@@ -56,7 +56,7 @@ def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     store = Store.create(tmp_path / "store")
     here = str(tmp_path)
     found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid(), (here,))
-    found.tell()
+    found.export_environment()
     return found
 
 
@@ -174,7 +174,7 @@ def test_a_rig_that_is_free_again_is_taken(
     order = make_order(protocol, RIG, service.folder)
     answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
     told: list[str] = []
-    monkeypatch.setattr(serve_runs, "_tell_waiting", lambda run, why: told.append(why))
+    monkeypatch.setattr(serve_runs, "_report_waiting", lambda run, why: told.append(why))
 
     def work() -> dict[str, Any]:
         answer = answers.pop(0)
