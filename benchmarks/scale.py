@@ -25,7 +25,7 @@ from sliplab.analysis.nets.network import build, weights
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.protocols import load_plan
 from sliplab.storage.manifest import of_trial
-from sliplab.storage.push import Wishes, push
+from sliplab.storage.push import PushOptions, push
 from sliplab.storage.recording import Recording
 from sliplab.storage.remote import Remote
 from sliplab.storage.store import Store
@@ -106,7 +106,7 @@ def _rates(store: Store, runs: int, places: dict[str, Callable[[], str]]) -> Fig
         sent: list[int] = []
 
         def send(read_back: bool, new: Callable[[], str] = new, sent: list[int] = sent) -> None:
-            done = push(store, Remote(new()), wishes=Wishes(read_back=read_back))
+            done = push(store, Remote(new()), wishes=PushOptions(read_back=read_back))
             sent.append(done.bytes)
 
         taken = alternate(runs, checked=lambda: send(True), sizes=lambda: send(False))

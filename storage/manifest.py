@@ -203,7 +203,7 @@ def of_trial(campaign: Campaign, trial_id: str) -> Manifest:
     return Manifest("trials", campaign.name, trial_id, files, take_of(folder))
 
 
-def of_aside(campaign: Campaign, name: str) -> Manifest:
+def of_quarantined(campaign: Campaign, name: str) -> Manifest:
     """The manifest of something in quarantine, all of it read.
 
     Raises:

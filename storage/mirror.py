@@ -1,9 +1,9 @@
 """A pushed store opened by its URL: a store in a cache folder whose big files come when read.
 
-Records, checksums and protocols of all visible trials are brought at once, events and videos of a
-trial when something reads them first, each held against its checksum. So whatever works on a store
-works on a URL, and a machine that labels a tenth of the trials fetches that tenth. Analysis writes
-into the cache folder as into any store. It may be deleted at any time.
+Records, checksums and protocols of all visible trials are downloaded at once, events and videos of
+a trial when something reads them first, each held against its checksum. So whatever works on a
+store works on a URL, and a machine that labels a tenth of the trials fetches that tenth. Analysis
+writes into the cache folder as into any store. It may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sliplab.protocols.hashing import hash_text
-from sliplab.storage.bring import bring
+from sliplab.storage.download import download_folder
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.fetching import ORIGIN, origin_of, remote_at
 from sliplab.storage.files import make_folder, write_json
 from sliplab.storage.manifest import Manifest, read_manifests
-from sliplab.storage.pull import Pulled, pull
+from sliplab.storage.pull import PullResult, pull
 from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
 from sliplab.storage.store import FORMAT, STORE, Store
 from sliplab.storage.urls import check_url, is_url
@@ -39,8 +39,10 @@ def mirror_folder(url: str) -> Path:
     return base.absolute() / f"{name[:40]}-{hash_text(url)[:12]}"
 
 
-def open_mirror(url: str, on_trial: Callable[[str], None] | None = None) -> tuple[Store, Pulled]:
-    """The mirror of `url`, brought up to date but for the big files.
+def open_mirror(
+    url: str, on_trial: Callable[[str], None] | None = None
+) -> tuple[Store, PullResult]:
+    """Update and return the mirror of `url`, without the big files.
 
     Raises:
         RemoteError: nothing was pushed there, or the storage cannot be reached.
@@ -100,4 +102,6 @@ def _bring_one(remote: Remote, campaign: str, trial: str, target: Path) -> None:
     with translated_disk_errors(target):
         for name in ("trials", "incoming"):
             make_folder(folder / name)
-        bring(remote, found, folder / "incoming" / f"{trial}.{os.getpid()}", target, small=True)
+        download_folder(
+            remote, found, folder / "incoming" / f"{trial}.{os.getpid()}", target, small=True
+        )

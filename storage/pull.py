@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sliplab.storage.bring import BIG, bring, get, holds
+from sliplab.storage.download import BIG, download_folder, get, holds
 from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.fetching import ORIGIN, origin_of
 from sliplab.storage.files import make_folder, sync_folder, write_bytes, write_json
@@ -26,14 +26,14 @@ _FOLDERS = ("trials", "incoming", "quarantine", "bench")
 
 
 @dataclass
-class Pulled:
-    """What a pull did.
+class PullResult:
+    """Result of a pull.
 
     Attributes:
-        trials: visible at the URL; pulled and replaced: of these, brought now; there: they had
+        trials: visible at the URL; pulled and replaced: of these, downloaded now; there: they had
             been before; withdrawn: no longer visible at the URL, and quarantined here.
         set_aside: of quarantine; files and bytes: fetched.
-        problems: what was not brought, and why.
+        problems: what was not downloaded, and why.
     """
 
     trials: int = 0
@@ -56,10 +56,10 @@ def pull(
     small: bool = False,
     on_trial: Callable[[str], None] | None = None,
     on_bytes: OnBytes | None = None,
-) -> Pulled:
-    """Bring what the store in `folder` lacks; it is made if there is none.
+) -> PullResult:
+    """Download what the store in `folder` lacks; it is made if there is none.
 
-    A store that was pulled from here before follows: its descriptions are brought up to date, and
+    A store that was pulled from here before follows: its descriptions are updated, and
     trials that were taken again, or withdrawn, go to quarantine. In any other store nothing that
     is there is changed.
 
@@ -70,14 +70,14 @@ def pull(
         on_trial: called with each trial's id once it is done with.
 
     Raises:
-        RemoteError: nothing was pushed there, or the storage fails; what was brought counts.
+        RemoteError: nothing was pushed there, or the storage fails; what was downloaded stays.
         StoreError: the folder holds something else, or cannot be written.
         Locked: another program writes into the store.
     """
     remote.check()
     fresh = not folder.exists() or not any(folder.iterdir())
     store = Store.create(folder)
-    done = Pulled()
+    done = PullResult()
     with (
         translated_disk_errors(folder),
         exclusive(folder / STORE_LOCK, f"the store {folder}", brief=small),
@@ -106,7 +106,7 @@ class _Pull:
         campaign: Campaign,
         follows: bool,
         small: bool,
-        done: Pulled,
+        done: PullResult,
         on_bytes: OnBytes | None,
     ) -> None:
         self._remote, self._campaign, self._done = remote, campaign, done
@@ -125,8 +125,8 @@ class _Pull:
         except (_Differs, RemoteError) as error:
             self._done.problems.append(str(error))
             return
-        there = read_manifests(self._remote, name, "trials")
-        for trial, known in there.items():
+        pushed = read_manifests(self._remote, name, "trials")
+        for trial, known in pushed.items():
             self._done.trials += 1
             try:
                 if isinstance(known, RemoteError):
@@ -137,12 +137,12 @@ class _Pull:
             if on_trial is not None:
                 on_trial(trial)
         if self._follows:
-            for trial in sorted(self._campaign.committed() - there.keys()):
+            for trial in sorted(self._campaign.committed() - pushed.keys()):
                 path = self._campaign.folder / "trials" / trial
                 self._campaign.quarantine(path, f"withdrawn: is no longer at {self._remote.url}")
                 self._done.withdrawn += 1
         if quarantine:
-            self._aside()
+            self._pull_quarantine()
 
     def _describe(self, about: Manifest) -> None:
         """The campaign's own files: all of them, then their checksums."""
@@ -174,13 +174,13 @@ class _Pull:
             raise RemoteError(f"{self._remote.where(key)}: {name} does not match its checksum")
         return data
 
-    def _one(self, there: Manifest) -> None:
-        target = self._campaign._inside(self._campaign.folder / "trials" / there.name)
+    def _one(self, manifest: Manifest) -> None:
+        target = self._campaign._inside(self._campaign.folder / "trials" / manifest.name)
         replaced = False
         if target.exists():
             cause = partial(target) if target.is_dir() else "is no folder"
-            if cause is None and take_of(target) == there.take:
-                self._complete(target, there)
+            if cause is None and take_of(target) == manifest.take:
+                self._complete(target, manifest)
                 self._done.there += 1
                 return
             if cause is None and not self._follows:
@@ -188,29 +188,31 @@ class _Pull:
                     f"{target}: is another take than that at {self._remote.url}; pull into "
                     "another store"
                 )
-            told = f"damaged: {cause}" if cause else f"replaced: another is at {self._remote.url}"
-            self._campaign.quarantine(target, told)
+            reason = f"damaged: {cause}" if cause else f"replaced: another is at {self._remote.url}"
+            self._campaign.quarantine(target, reason)
             replaced = cause is None
-        aside = self._campaign._inside(self._campaign.folder / "incoming" / there.name)
-        if aside.exists() and not (aside / ELSEWHERE).exists():
-            self._campaign.quarantine(aside, "interrupted")
-        bring(self._remote, there, aside, target, small=self._small, on_file=self._counted)
+        staging = self._campaign._inside(self._campaign.folder / "incoming" / manifest.name)
+        if staging.exists() and not (staging / ELSEWHERE).exists():
+            self._campaign.quarantine(staging, "interrupted")
+        download_folder(
+            self._remote, manifest, staging, target, small=self._small, on_file=self._counted
+        )
         if replaced:
             self._done.replaced += 1
         else:
             self._done.pulled += 1
 
-    def _complete(self, target: Path, there: Manifest) -> None:
-        """What a mirror left out before, where all is wanted now."""
+    def _complete(self, target: Path, manifest: Manifest) -> None:
+        """Fetch the big files that a mirror left out."""
         if self._small or not (target / ELSEWHERE).exists():
             return
-        for name in sorted(BIG & there.files.keys()):
+        for name in sorted(BIG & manifest.files.keys()):
             if to_fetch(target / name):
-                self._counted(get(self._remote, there, name, target / name))
+                self._counted(get(self._remote, manifest, name, target / name))
         (target / ELSEWHERE).unlink()
         sync_folder(target)
 
-    def _aside(self) -> None:
+    def _pull_quarantine(self) -> None:
         for name, known in read_manifests(self._remote, self._campaign.name, "quarantine").items():
             target = self._campaign._inside(self._campaign.folder / "quarantine" / name)
             if target.exists():
@@ -218,8 +220,8 @@ class _Pull:
             try:
                 if isinstance(known, RemoteError):
                     raise known
-                aside = self._campaign.folder / "incoming" / f"{name}.aside"
-                bring(self._remote, known, aside, target, on_file=self._counted)
+                staging = self._campaign.folder / "incoming" / f"{name}.aside"
+                download_folder(self._remote, known, staging, target, on_file=self._counted)
                 self._done.set_aside += 1
             except RemoteError as error:
                 self._done.problems.append(str(error))

@@ -27,7 +27,7 @@ _SAME = ("name", "protocol", "experiment", "rig", "simulated")
 
 
 @dataclass
-class Pushed:
+class PushResult:
     """What a push did.
 
     Attributes:
@@ -48,7 +48,7 @@ class Pushed:
     bytes: int = 0
     problems: list[str] = field(default_factory=list)
 
-    def add(self, other: Pushed) -> None:
+    def add(self, other: PushResult) -> None:
         """Count what another round did; `trials` and `there` are those of the later one."""
         for name in ("pushed", "replaced", "withdrawn", "set_aside", "files", "bytes"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
@@ -56,7 +56,7 @@ class Pushed:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class PushOptions:
     """How a push is to be done.
 
     Attributes:
@@ -76,10 +76,10 @@ def push(
     store: Store,
     remote: Remote,
     campaigns: Sequence[Campaign] | None = None,
-    wishes: Wishes | None = None,
+    wishes: PushOptions | None = None,
     on_trial: OnTrial | None = None,
     on_bytes: OnBytes | None = None,
-) -> Pushed:
+) -> PushResult:
     """Send what `remote` lacks of some campaigns, of all by default.
 
     Args:
@@ -93,9 +93,9 @@ def push(
     if store.format < 2:
         raise StoreError(f"{store.folder}: has an older format; run `sliplab migrate` first")
     remote.begin()
-    done = Pushed()
+    done = PushResult()
     for campaign in store.campaigns() if campaigns is None else campaigns:
-        _Push(remote, campaign, wishes or Wishes(), done, on_bytes).run(on_trial)
+        _Push(remote, campaign, wishes or PushOptions(), done, on_bytes).run(on_trial)
     return done
 
 
@@ -106,11 +106,11 @@ class _Push:
         self,
         remote: Remote,
         campaign: Campaign,
-        wishes: Wishes,
-        done: Pushed,
+        wishes: PushOptions,
+        done: PushResult,
         on_bytes: OnBytes | None,
     ) -> None:
-        self._remote, self._campaign, self._wishes = remote, campaign, wishes
+        self._remote, self._campaign, self._options = remote, campaign, wishes
         self._done, self._on_bytes = done, on_bytes
         self._there: dict[str, int] = {}
         self._trusted: set[str] = set()
@@ -137,58 +137,58 @@ class _Push:
             self._one(trial, theirs.get(trial))
             if on_trial is not None:
                 on_trial(trial)
-        for trial, there in theirs.items():
-            if trial not in ours and there.take in self._takes(trial, AGAIN):
-                self._remote.remove(there.key)
+        for trial, pushed in theirs.items():
+            if trial not in ours and pushed.take in self._takes(trial, AGAIN):
+                self._remote.remove(pushed.key)
                 self._done.withdrawn += 1
-        if self._wishes.quarantine:
-            self._aside()
+        if self._options.quarantine:
+            self._push_quarantine()
 
-    def _one(self, trial: str, there: Manifest | None) -> None:
+    def _one(self, trial: str, existing: Manifest | None) -> None:
         folder = self._campaign.folder / "trials" / trial
         try:
             made = manifests.of_trial(self._campaign, trial)
         except (OSError, ValueError, StoreError) as error:
             self._problem(f"{self._campaign.name}: {trial}: {error}")
             return
-        if there is not None and there.files == made.files:
-            self._done.there += not self._wishes.check or self._send(made, folder, there)
+        if existing is not None and existing.files == made.files:
+            self._done.there += not self._options.check or self._send(made, folder, existing)
             return
-        foreign = there is not None and there.take not in {made.take, *self._takes(trial, "")}
-        if foreign and not self._wishes.replace:
+        foreign = existing is not None and existing.take not in {made.take, *self._takes(trial, "")}
+        if foreign and not self._options.replace:
             self._problem(
                 f"{self._campaign.name}: {trial}: another take of it is there that is not of "
                 "this store; push to another place, or replace it with --replace"
             )
             return
-        if self._send(made, folder, there):
-            if there is None:
+        if self._send(made, folder, existing):
+            if existing is None:
                 self._done.pushed += 1
             else:
                 self._done.replaced += 1
 
-    def _aside(self) -> None:
-        there = self._manifests("quarantine")
+    def _push_quarantine(self) -> None:
+        existing = self._manifests("quarantine")
         for known in self._campaign.quarantined():
             name = known["folder"]
             try:
-                made = manifests.of_aside(self._campaign, name)
+                made = manifests.of_quarantined(self._campaign, name)
             except (OSError, StoreError) as error:
                 self._problem(f"{self._campaign.name}: quarantine/{name}: {error}")
                 continue
-            if name in there and there[name].files == made.files and not self._wishes.check:
+            if name in existing and existing[name].files == made.files and not self._options.check:
                 continue
-            if self._send(made, self._campaign.folder / "quarantine" / name, there.get(name)):
+            if self._send(made, self._campaign.folder / "quarantine" / name, existing.get(name)):
                 self._done.set_aside += 1
 
-    def _send(self, made: Manifest, folder: Path, there: Manifest | None) -> bool:
+    def _send(self, made: Manifest, folder: Path, existing: Manifest | None) -> bool:
         """Objects, then the manifest. False where the files are not what they should be."""
         for name, said in made.files.items():
             problem = self._object(made.object_key(name), folder / name, said)
             if problem is not None:
                 self._problem(f"{self._campaign.name}: {folder / name}: {problem}")
                 return False
-        if made != there:
+        if made != existing:
             self._remote.put_bytes(made.key, made.dump())
         return True
 
@@ -223,7 +223,7 @@ class _Push:
 
     def _right(self, key: str, said: Json) -> bool:
         try:
-            if self._wishes.read_back:
+            if self._options.read_back:
                 return self._remote.matches(key, said, self._on_bytes)
             return bool(self._remote.size(key) == said["bytes"])
         except RemoteMissing:
@@ -234,12 +234,12 @@ class _Push:
             self._on_bytes(size)
 
     def _manifests(self, kind: Kind) -> dict[str, Manifest]:
-        """What is visible there; what cannot be read is sent anew."""
+        """Read the visible manifests; what cannot be read is sent anew."""
         found = {}
         for name, known in read_manifests(self._remote, self._campaign.name, kind).items():
             if isinstance(known, Manifest):
                 found[name] = known
-                if not self._wishes.check:
+                if not self._options.check:
                     self._trusted |= {str(said["sha256"]) for said in known.files.values()}
         return found
 

@@ -32,7 +32,7 @@ def import_(
 
     from sliplab.flows.collecting.stretch import owned
     from sliplab.storage.exchange.find import KINDS, kind_of, trials_in
-    from sliplab.storage.exchange.take_in import take_in
+    from sliplab.storage.exchange.import_trials import import_trials
     from sliplab.storage.names import safe_name
     from sliplab.storage.store import Store, StoreError
 
@@ -49,7 +49,7 @@ def import_(
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
     with owned(opened):
-        result = take_in(opened, name, found, where, kind, lambda trial: console.say(trial))
+        result = import_trials(opened, name, found, where, kind, lambda trial: console.say(trial))
     for text in result.get("warnings", ()):
         console.say(f"warning: {text}")
     if not as_json:
@@ -68,7 +68,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trials as files that other programs read, or their labels as a table."""
-    from sliplab.storage.exchange.hand_out import SUFFIXES, hand_out
+    from sliplab.storage.exchange.export_trials import SUFFIXES, export_trials
     from sliplab.storage.exchange.tables import label_table, write_table
     from sliplab.storage.store import Store
 
@@ -93,7 +93,7 @@ def export(
     if form not in SUFFIXES:
         raise InputError("--format", "", form, f"must be one of {', '.join(SUFFIXES)}")
     with console.bar("export (trials)", len(names)) as bar:
-        result = hand_out(
+        result = export_trials(
             [campaign.recording(name) for name in names],
             output,
             form,

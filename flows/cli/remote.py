@@ -49,7 +49,7 @@ def push(
     """
     from sliplab.flows.collecting.halting import holder_of
     from sliplab.flows.running import stopping
-    from sliplab.storage.push import Wishes
+    from sliplab.storage.push import PushOptions
     from sliplab.storage.push import push as send
     from sliplab.storage.remote import Remote
     from sliplab.storage.store import Store
@@ -57,7 +57,7 @@ def push(
     opened = Store.open(store)
     chosen = _chosen(opened, campaign)
     remote = Remote(url)
-    wishes = Wishes(quarantine, replace, not sizes_only, check)
+    wishes = PushOptions(quarantine, replace, not sizes_only, check)
     done = None
     while True:
         collects = follow and _collects(holder_of(store))
@@ -85,7 +85,7 @@ def pull(
     as_json: JsonOption = False,
 ) -> None:
     """Bring pushed trials into a store, each checked; run it again to bring what is new."""
-    from sliplab.storage.pull import pull as bring
+    from sliplab.storage.pull import pull as pull_trials
     from sliplab.storage.remote import Remote
 
     with console.bar(f"pull {url} (trials)", 0) as bar:
@@ -94,7 +94,7 @@ def pull(
             bar.extend(1)
             bar.advance(1, name)
 
-        done = bring(
+        done = pull_trials(
             Remote(url), store, campaigns=campaign, quarantine=quarantine, on_trial=seen,
             on_bytes=lambda _: bar.advance(0),
         )  # fmt: skip

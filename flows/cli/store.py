@@ -132,7 +132,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     from sliplab.storage.errors import translated_disk_errors
     from sliplab.storage.lock import exclusive
     from sliplab.storage.migrate import kept
-    from sliplab.storage.migrate import migrate as bring
+    from sliplab.storage.migrate import migrate as migrate_store
     from sliplab.storage.store import Store
 
     opened = Store.open(store)
@@ -140,7 +140,7 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
         translated_disk_errors(opened.folder),
         exclusive(opened.folder / ".lock", f"the store {opened.folder}"),
     ):
-        passed = bring(opened)
+        passed = migrate_store(opened)
     copies = [str(kept(opened, number)) for number in passed]
     if as_json:
         console.print_json({"format": opened.format, "from": passed, "copies": copies})

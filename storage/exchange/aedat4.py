@@ -29,7 +29,7 @@ from sliplab.storage.exchange.dv_buffers import (
     triggers_buffer,
 )
 from sliplab.storage.exchange.flatbuffer import Table
-from sliplab.storage.exchange.foreign import LATEST_US, MOST_PX, Triggers, Wrong, event_chunk
+from sliplab.storage.exchange.foreign import LATEST_US, MOST_PX, FormatError, Triggers, event_chunk
 from sliplab.storage.streams import U8, EventChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
@@ -69,7 +69,7 @@ class Aedat4File:
     """A file that is open for reading; a context manager.
 
     Raises:
-        Wrong: it is none, or damaged.
+        FormatError: it is none, or damaged.
         OSError: it cannot be read.
     """
 
@@ -80,17 +80,17 @@ class Aedat4File:
         try:
             self._bytes = path.stat().st_size
             if (line := self._handle.read(len(LINE))) != LINE:
-                raise Wrong(f"is no AEDAT4 file: it begins with {line!r}, not with {LINE!r}")
+                raise FormatError(f"is no AEDAT4 file: it begins with {line!r}, not with {LINE!r}")
             header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
             table = Table.root(memoryview(_prefixed(header)), b"IOHE")
             self._codec = _CODECS.get(table.number(0, "<i"), "")
             if self._codec == "":
-                raise Wrong("is compressed in an unknown way")
+                raise FormatError("is compressed in an unknown way")
             end = table.number(1, "<q", -1)
             self._begin = self._handle.tell()
             self._end = self._bytes if end <= 0 else end
             if not self._begin <= self._end <= self._bytes:
-                raise Wrong("is cut short")
+                raise FormatError("is cut short")
             self.streams = _streams(bytes(table.vector(2, 1)[1]))
         except BaseException:
             self._handle.close()
@@ -134,7 +134,7 @@ class Aedat4File:
             last = _split_events(rows, new.x, new.y, new.p, new.t_us, last)
             if last < 0:
                 event_chunk(new.x, new.y, new.p, new.t_us)
-                raise Wrong("holds events whose times run backwards")
+                raise FormatError("holds events whose times run backwards")
             filled += count
         if filled:
             yield _part(room, 0, filled)
@@ -148,7 +148,7 @@ class Aedat4File:
         ]
         times = np.array([t for t, _ in found], np.int64)
         if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
-            raise Wrong("holds triggers whose times run backwards or are none")
+            raise FormatError("holds triggers whose times run backwards or are none")
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
 
     def pictures(self, number: int) -> Iterator[Picture]:
@@ -161,12 +161,12 @@ class Aedat4File:
             channels = 1 if form == GREY else _COLOUR.get(form, 0)
             count, pixels = table.vector(10, 1)
             if not channels or width <= 0 or height <= 0 or count != width * height * channels:
-                raise Wrong(
+                raise FormatError(
                     f"holds a frame of {width} x {height} with {count} bytes of kind {form}; read "
                     "are 8-bit frames with 1, 3 or 4 channels (kinds 0, 16 and 24)"
                 )
             if not last <= t_ns < LATEST_US * 1000:
-                raise Wrong("holds frames whose times run backwards or are none")
+                raise FormatError("holds frames whose times run backwards or are none")
             last = t_ns
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
@@ -176,14 +176,16 @@ class Aedat4File:
         while (at := self._handle.tell()) < self._end:
             stream, size = struct.unpack("<ii", self._exactly(8))
             if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
-                raise Wrong(f"holds a packet of {size} bytes in stream {stream}, at byte {at}")
+                raise FormatError(
+                    f"holds a packet of {size} bytes in stream {stream}, at byte {at}"
+                )
             if stream != number:
                 self._handle.seek(size, 1)
                 continue
             try:
                 yield self._unpacked(self._exactly(size))
             except (pa.ArrowException, OSError) as error:
-                raise Wrong(
+                raise FormatError(
                     f"holds a packet that cannot be unpacked, at byte {at}: {error}"
                 ) from None
 
@@ -199,7 +201,7 @@ class Aedat4File:
             while part := stream.readinto(memoryview(self._buffer)[filled:]):
                 filled += part
                 if filled > _MOST_PACKET:
-                    raise Wrong("holds a packet that unpacks to too much")
+                    raise FormatError("holds a packet that unpacks to too much")
                 if filled == len(self._buffer):  # room for what comes, not for what a header says
                     self._buffer = self._buffer + bytearray(filled)
         return memoryview(self._buffer)[:filled]
@@ -207,7 +209,7 @@ class Aedat4File:
     def _exactly(self, count: int) -> bytes:
         found = self._handle.read(count)
         if len(found) != count:
-            raise Wrong("is cut short")
+            raise FormatError("is cut short")
         return found
 
 
@@ -221,7 +223,7 @@ def _middle_ns(frame: Table) -> int:
     if start <= 0 or end <= 0:
         return frame.number(0, "<q") * 1000
     if end < start:
-        raise Wrong(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
+        raise FormatError(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
     return (start + end) * 500
 
 
@@ -264,7 +266,7 @@ def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
 def _length(data: bytes, most: int) -> int:
     count = int(struct.unpack("<I", data)[0])
     if count > most:
-        raise Wrong(f"has a header of {count} bytes")
+        raise FormatError(f"has a header of {count} bytes")
     return count
 
 
@@ -292,7 +294,7 @@ def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
 
 def _streams(text: bytes) -> dict[int, Stream]:
     if b"<!" in text:
-        raise Wrong("has a header that defines words of its own")
+        raise FormatError("has a header that defines words of its own")
     try:
         root = ElementTree.fromstring(text.rstrip(b"\0").decode("utf-8"))
         found = {}
@@ -305,7 +307,7 @@ def _streams(text: bytes) -> dict[int, Stream]:
             name = values.get("originalOutputName", kind)
             found[int(node.get("name", ""))] = Stream(kind, name, size, values.get("source", ""))
     except (ElementTree.ParseError, ValueError) as error:
-        raise Wrong(f"has a header that cannot be read: {error}") from None
+        raise FormatError(f"has a header that cannot be read: {error}") from None
     return found
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head
+from sliplab.storage.exchange.foreign import ForeignTrial, FormatError, event_chunk, read_head
 from sliplab.storage.streams import EventChunk
 
 LIBRARY = "faery"
@@ -42,7 +42,7 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
 
     Raises:
         InputError: faery is not installed.
-        Wrong: the file says no format, or faery cannot read it.
+        FormatError: the file says no format, or faery cannot read it.
     """
     if util.find_spec(LIBRARY) is None:
         raise InputError(
@@ -53,7 +53,7 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
         )
     form = faery_type(read_head(path))
     if form is None:
-        raise Wrong(
+        raise FormatError(
             "gives no format: a .raw file has a line `% evt 3.0` or `% format EVT3` in its header, "
             "a .dat file `% Version 2`, a .es file begins with `Event Stream`"
         )
@@ -91,7 +91,7 @@ def _guarded(step: Callable[[], T], size: tuple[int, int] | None, count: int) ->
         text = re.sub(r'the stream "[^"]*"', "it", text)
         if "overflow" in text and size is not None:
             text += f": an event outside of the {size[0]} x {size[1]} pixels in its header"
-        raise Wrong(
+        raise FormatError(
             "is damaged, cut short or of another format than its header says: after "
             f"{count:,} events faery stops with: {text}"
         ) from None

@@ -17,8 +17,8 @@ import numpy as np
 from sliplab.storage.exchange.foreign import (
     LATEST_US,
     ForeignTrial,
+    FormatError,
     Triggers,
-    Wrong,
     event_chunk,
     rounded_us,
 )
@@ -37,14 +37,14 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
     """A file with ``events/{x,y,p,t}`` in us and an optional ``t_offset``.
 
     Raises:
-        Wrong: it is damaged, or has another layout.
+        FormatError: it is damaged, or has another layout.
     """
     with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in "xypt"}
         _same_length(columns)
         offset = int(_whole(file.rows("t_offset").read())) if file.has("t_offset") else 0
         if not 0 <= offset < LATEST_US:
-            raise Wrong(f"t_offset = {offset}: is no time")
+            raise FormatError(f"t_offset = {offset}: is no time")
         triggers = None
         if file.has("triggers/t"):
             kinds = _whole(rows("triggers/kind").read()).astype(np.uint8)
@@ -70,13 +70,13 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
     """The lab's file with ``events/{ps,ts,xs,ys}``: float seconds, in any order.
 
     Raises:
-        Wrong: it is damaged, or has another layout.
+        FormatError: it is damaged, or has another layout.
     """
     with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in ("xs", "ys", "ps", "ts")}
         _same_length(columns)
         if len(columns["ts"]) > _MOST_UNSORTED:
-            raise Wrong(f"holds {len(columns['ts'])} events, too many to sort")
+            raise FormatError(f"holds {len(columns['ts'])} events, too many to sort")
         size = _resolution(file.integers("sensor_resolution"), columns["xs"], columns["ys"])
 
     def all_events() -> Iterator[EventChunk]:
@@ -85,7 +85,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
         t_us = rounded_us(ts, 1e6)
         low = int(t_us.min()) if len(t_us) else 0
         if low < 0:
-            raise Wrong("holds an event before its own clock began")
+            raise FormatError("holds an event before its own clock began")
         order = np.argsort(t_us, kind="stable")
         polarity = np.asarray(ps) > 0  # the lab's are 0 and 1, or -1 and 1
         yield event_chunk(_pixels(xs)[order], _pixels(ys)[order], polarity[order], t_us[order])
@@ -104,7 +104,7 @@ def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int]
     than high, so the larger number is the columns, unless the events fit only the other way.
 
     Raises:
-        Wrong: the events fit neither way.
+        FormatError: the events fit neither way.
     """
     if stated is None or len(stated) < 2 or min(stated[:2]) <= 0:
         return None
@@ -113,7 +113,7 @@ def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int]
     for size in ((long, short), (short, long)):
         if columns <= size[0] and rows <= size[1]:
             return size
-    raise Wrong(
+    raise FormatError(
         f"holds events up to column {columns - 1} and row {rows - 1}, outside of its "
         f"sensor_resolution {stated[0]} x {stated[1]}"
     )
@@ -131,14 +131,14 @@ def _same_length(columns: Mapping[str, Sized]) -> None:
     lengths = {key: len(column) for key, column in columns.items()}
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{key} {count}" for key, count in lengths.items())
-        raise Wrong(f"its events' columns have different lengths: {stated}")
+        raise FormatError(f"its events' columns have different lengths: {stated}")
 
 
 def is_lab_hdf5(path: Path) -> bool:
     """Whether a file has the lab's names of columns.
 
     Raises:
-        Wrong: it cannot be opened.
+        FormatError: it cannot be opened.
     """
     with _opened(path) as (file, _):
         return bool(file.has("events/ts"))
@@ -178,7 +178,7 @@ def write_dsec(
 
 
 class _opened:
-    """A file and its columns of plain numbers; its faults are said as `Wrong`."""
+    """A file and its columns of plain numbers; its faults are said as `FormatError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -187,30 +187,30 @@ class _opened:
         try:
             self._file = RowFile(self._path)
         except _FAULTS as error:
-            raise Wrong(f"is no HDF5 file, or a damaged one: {error}") from None
+            raise FormatError(f"is no HDF5 file, or a damaged one: {error}") from None
         self._most = self._path.stat().st_size * _MOST_PACKED
         return self._file, self._rows
 
     def __exit__(self, kind: Any, error: BaseException | None, at: Any) -> None:
         self._file.close()
-        if isinstance(error, Wrong):
+        if isinstance(error, FormatError):
             return
         if isinstance(error, _FAULTS):
-            raise Wrong(f"cannot be read: {error}") from None
+            raise FormatError(f"cannot be read: {error}") from None
 
     def _rows(self, name: str) -> Rows:
         if not self._file.has(name):
-            raise Wrong(f"has no column {name}; {_LAYOUTS}")
+            raise FormatError(f"has no column {name}; {_LAYOUTS}")
         found = self._file.rows(name)
         if len(found.shape) != 1 or found.shape[0] > self._most:
-            raise Wrong(f"{name} has the shape {found.shape}")
+            raise FormatError(f"{name} has the shape {found.shape}")
         return found
 
 
 def _whole(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
-        raise Wrong("holds times that are no whole numbers")
+        raise FormatError("holds times that are no whole numbers")
     return found.astype(np.int64)
 
 
@@ -218,13 +218,13 @@ def _rising(found: Triggers) -> None:
     t = found.t_us
     wrong = np.any(t < 0) or np.any(t >= LATEST_US) or np.any(t[1:] < t[:-1])
     if len(t) != len(found.kind) or wrong:
-        raise Wrong("holds triggers whose times run backwards or are none")
+        raise FormatError("holds triggers whose times run backwards or are none")
 
 
 def _pixels(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind == "f":
         if not np.isfinite(found).all() or np.any(found != np.rint(found)):
-            raise Wrong("holds places that are no pixels")
+            raise FormatError("holds places that are no pixels")
         found = np.clip(found, -1, 1 << 20)
     return found.astype(np.int64)

@@ -14,7 +14,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.exchange.aedat4 import LINE
 from sliplab.storage.exchange.by_faery import faery_type, read_by_faery
 from sliplab.storage.exchange.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
-from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, read_head
+from sliplab.storage.exchange.foreign import ForeignTrial, FormatError, read_head
 from sliplab.storage.exchange.lab_pickles import pairs, read_pair
 from sliplab.storage.exchange.manifest import as_it_was, read_manifest
 from sliplab.storage.exchange.read_aedat4 import read_aedat4
@@ -87,7 +87,7 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
 def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
     try:
         return reader(file, name)
-    except Wrong as error:
+    except FormatError as error:
         raise InputError(file, "", None, str(error)) from None
 
 
@@ -132,6 +132,6 @@ def _kind(file: Path) -> str | None:
     if "dsec" in kinds:
         try:
             return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
-        except Wrong as error:
+        except FormatError as error:
             raise InputError(file, "", None, str(error)) from None
     return kinds[0] if kinds else None

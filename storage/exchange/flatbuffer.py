@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from sliplab.storage.exchange.foreign import Wrong
+from sliplab.storage.exchange.foreign import FormatError
 
 
 class Table:
@@ -25,10 +25,10 @@ class Table:
         """The table of a buffer with its length in front and an identifier.
 
         Raises:
-            Wrong: it is another, or none.
+            FormatError: it is another, or none.
         """
         if bytes(data[8:12]) != identifier:
-            raise Wrong(f"holds {bytes(data[8:12])!r} where {identifier!r} belongs")
+            raise FormatError(f"holds {bytes(data[8:12])!r} where {identifier!r} belongs")
         return cls(data, 4 + _number(data, "<I", 4))
 
     def number(self, field: int, form: str, default: int = 0) -> int:
@@ -44,7 +44,7 @@ class Table:
         at += _number(self._data, "<I", at)
         count = _number(self._data, "<I", at)
         if count * size > len(self._data) - at - 4:
-            raise Wrong(f"is damaged: {count} things in too few bytes")
+            raise FormatError(f"is damaged: {count} things in too few bytes")
         return count, self._data[at + 4 : at + 4 + count * size]
 
     def tables(self, field: int) -> list[Table]:
@@ -66,6 +66,6 @@ class Table:
 
 def _number(data: memoryview, form: str, at: int) -> int:
     if not 0 <= at <= len(data) - struct.calcsize(form):
-        raise Wrong("is damaged: a packet leads out of its own bytes")
+        raise FormatError("is damaged: a packet leads out of its own bytes")
     found: Any = struct.unpack_from(form, data, at)[0]
     return int(found)

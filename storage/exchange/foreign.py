@@ -18,7 +18,7 @@ LATEST_US = 1 << 53
 """285 years; what comes later is no time, and would not fit 64 bits of nanoseconds."""
 
 
-class Wrong(ValueError):
+class FormatError(ValueError):
     """A foreign file cannot be right.
 
     Attributes:
@@ -85,13 +85,13 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
     """Columns of a foreign file as a chunk.
 
     Raises:
-        Wrong: they differ in length, a pixel or time is none, or times run backwards.
+        FormatError: they differ in length, a pixel or time is none, or times run backwards.
     """
     columns = [np.asarray(column) for column in (x, y, p, t_us)]
     if any(c.ndim != 1 or len(c) != len(columns[3]) for c in columns):
-        raise Wrong("holds columns of events that differ in length")
+        raise FormatError("holds columns of events that differ in length")
     if any(c.dtype.kind not in "iub" for c in columns):
-        raise Wrong("holds events that are no integers")
+        raise FormatError("holds events that are no integers")
     times = np.ascontiguousarray(columns[3], np.int64)
     ends = times[[0, -1]] if len(times) else times
     limits = (("column", MOST_PX), ("row", MOST_PX), ("polarity", 2), ("time", LATEST_US))
@@ -100,9 +100,9 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
             continue
         negative = column.dtype.kind == "i" and int(column.min()) < 0
         if negative or int(column.max()) >= most:
-            raise Wrong(f"holds an event whose {what} is {column.min()} or {column.max()}")
+            raise FormatError(f"holds an event whose {what} is {column.min()} or {column.max()}")
     if np.any(times[1:] < times[:-1]):
-        raise Wrong("holds events whose times run backwards")
+        raise FormatError("holds events whose times run backwards")
     return EventChunk(
         np.ascontiguousarray(columns[0], np.uint16),
         np.ascontiguousarray(columns[1], np.uint16),
@@ -118,10 +118,10 @@ def rounded_us(times: Any, per_unit: float) -> I64:
         per_unit: microseconds of one unit.
 
     Raises:
-        Wrong: one is no number, or beyond any time.
+        FormatError: one is no number, or beyond any time.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond any number is found below
         found = np.asarray(times, np.float64) * per_unit
     if len(found) and not (np.isfinite(found).all() and float(np.abs(found).max()) < LATEST_US):
-        raise Wrong("holds a time that is no number, or beyond any time")
+        raise FormatError("holds a time that is no number, or beyond any time")
     return np.rint(found).astype(np.int64)

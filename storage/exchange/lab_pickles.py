@@ -19,7 +19,13 @@ from typing import Any
 import numpy as np
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.exchange.foreign import ForeignTrial, Wrong, event_chunk, read_head, rounded_us
+from sliplab.storage.exchange.foreign import (
+    ForeignTrial,
+    FormatError,
+    event_chunk,
+    read_head,
+    rounded_us,
+)
 from sliplab.storage.exchange.pickles import parse_pickle, read_bounded
 from sliplab.storage.streams import EventChunk
 
@@ -84,7 +90,7 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
     """Two files as a trial called `name`; they are read when its events are.
 
     Raises:
-        Wrong: a file cannot be right.
+        FormatError: a file cannot be right.
     """
     sides = [(path, polarity) for path, polarity in ((pair.on, 1), (pair.off, 0)) if path]
     missing = [] if len(sides) == 2 else ["OFF events" if pair.off is None else "ON events"]
@@ -97,12 +103,14 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
         for path, polarity in sides:
             try:
                 shape, *columns = _events(path, polarity)
-            except Wrong as error:
-                raise Wrong(str(error), path) from None
+            except FormatError as error:
+                raise FormatError(str(error), path) from None
             shapes.add(shape)
             parts.append(columns)
         if len(shapes) > 1:
-            raise Wrong(f"are of cameras of different sizes, rows and columns {sorted(shapes)}")
+            raise FormatError(
+                f"are of cameras of different sizes, rows and columns {sorted(shapes)}"
+            )
         x, y, p, t = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.lexsort((p, x, y, t))
         yield event_chunk(x[order], y[order], p[order], t[order])
@@ -126,7 +134,7 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
     if not isinstance(found, np.ndarray):
         found = _as_array(found)
     if found.dtype != object or found.ndim != 2 or not _is_camera(found.shape):
-        raise Wrong(f"holds an array of {found.dtype} of shape {found.shape}; {_RIGHT}")
+        raise FormatError(f"holds an array of {found.dtype} of shape {found.shape}; {_RIGHT}")
     if found.shape not in SIZES:  # columns first
         found = found.T
     cells = found.ravel().tolist()
@@ -135,20 +143,22 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
         if isinstance(cell, np.ndarray) and cell.ndim == 1 and cell.dtype.kind in "iuf":
             cells[index] = cell = cell.tolist()
         if type(cell) not in {list, tuple}:
-            raise Wrong(f"holds a {type(cell).__name__} where a list of times belongs; {_RIGHT}")
+            raise FormatError(
+                f"holds a {type(cell).__name__} where a list of times belongs; {_RIGHT}"
+            )
         counts[index] = len(cell)
     # lists may be told once and meant many times
     if counts.sum() > len(data):
-        raise Wrong(f"holds {counts.sum()} times, more than its bytes can tell")
+        raise FormatError(f"holds {counts.sum()} times, more than its bytes can tell")
     times = [time for cell in cells for time in cell]
     if not {int, float}.issuperset(map(type, times)):
-        raise Wrong(f"holds times that are no numbers; {_RIGHT}")
+        raise FormatError(f"holds times that are no numbers; {_RIGHT}")
     try:
         t_us = rounded_us(times, 1000.0)
     except OverflowError:
-        raise Wrong("holds a time beyond any time") from None
+        raise FormatError("holds a time beyond any time") from None
     if len(t_us) and int(t_us.min()) < 0:
-        raise Wrong(f"holds an event at {t_us.min() / 1000:g} ms, before its own clock began")
+        raise FormatError(f"holds an event at {t_us.min() / 1000:g} ms, before its own clock began")
     place = np.repeat(np.arange(len(cells)), counts)
     shape = (int(found.shape[0]), int(found.shape[1]))
     return shape, place % shape[1], place // shape[1], np.full(len(t_us), polarity), t_us
@@ -163,9 +173,9 @@ def _as_array(found: Any) -> Any:
     rows = found if type(found) in {list, tuple} else []
     width = len(rows[0]) if rows and type(rows[0]) in {list, tuple} else -1
     if any(type(row) not in {list, tuple} or len(row) != width for row in rows) or width < 0:
-        raise Wrong(f"holds a {type(found).__name__}; {_RIGHT}")
+        raise FormatError(f"holds a {type(found).__name__}; {_RIGHT}")
     if not _is_camera((len(rows), width)):
-        raise Wrong(f"holds {len(rows)} x {width} lists; {_RIGHT}")
+        raise FormatError(f"holds {len(rows)} x {width} lists; {_RIGHT}")
     made = np.empty((len(rows), width), object)
     for row, cells in enumerate(rows):
         for column, cell in enumerate(cells):
@@ -180,20 +190,22 @@ def _from_numpy(data: bytes, path: Path) -> Any:
         version = np.lib.format.read_magic(file)
         shape, fortran, dtype = _HEADERS[version](file)
     except _HEADER_FAULTS as error:
-        raise Wrong(f"has a damaged numpy header ({' '.join(str(error).split())})") from None
+        raise FormatError(f"has a damaged numpy header ({' '.join(str(error).split())})") from None
     at = file.tell()
     if dtype.kind == "O":
         found = parse_pickle(data[at:], path, at)
         if not isinstance(found, np.ndarray) or found.shape != shape:
-            raise Wrong(f"holds something else than the array {shape} in its header; {_RIGHT}")
+            raise FormatError(
+                f"holds something else than the array {shape} in its header; {_RIGHT}"
+            )
         return found
     # lists of one length: numpy makes them an array of numbers
     if dtype.kind not in "iuf" or len(shape) != 3 or not _is_camera(shape[:2]):
-        raise Wrong(f"holds an array of {dtype} of shape {shape}; {_RIGHT}")
+        raise FormatError(f"holds an array of {dtype} of shape {shape}; {_RIGHT}")
     if math.prod(shape) > _MOST_EVEN:
-        raise Wrong(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
+        raise FormatError(f"holds {math.prod(shape)} times, as many in every pixel; {_RIGHT}")
     if math.prod(shape) * dtype.itemsize != len(data) - at:
-        raise Wrong(f"is cut short: {len(data) - at} bytes for an array of shape {shape}")
+        raise FormatError(f"is cut short: {len(data) - at} bytes for an array of shape {shape}")
     numbers = np.frombuffer(data, dtype, offset=at).reshape(shape, order="F" if fortran else "C")
     cells = np.empty(shape[:2], object)
     for index in np.ndindex(shape[:2]):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sliplab.storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4File
-from sliplab.storage.exchange.foreign import ForeignTrial, Wrong
+from sliplab.storage.exchange.foreign import ForeignTrial, FormatError
 from sliplab.storage.streams import EventChunk, FrameChunk
 
 SIMULATED = "simulated"
@@ -19,12 +19,12 @@ def read_aedat4(path: Path, name: str) -> ForeignTrial:
     """A file as a trial called `name`: its first streams of events, triggers and frames.
 
     Raises:
-        Wrong: it is damaged.
+        FormatError: it is damaged.
     """
     with Aedat4File(path) as file:
         events, triggers, frames = (file.first(kind) for kind in (EVENTS, TRIGGERS, FRAMES))
         if events is None:
-            raise Wrong("holds no stream of events")
+            raise FormatError("holds no stream of events")
         streams = file.streams
         found = None if triggers is None else file.triggers(triggers)
         frame_px = None

@@ -174,7 +174,7 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
     from sliplab.protocols.errors import InputError
     from sliplab.storage.exchange.find import kind_of, trials_in
-    from sliplab.storage.exchange.foreign import Wrong
+    from sliplab.storage.exchange.foreign import FormatError
 
     folder = box / "foreign"
     shutil.rmtree(folder, ignore_errors=True)
@@ -188,13 +188,13 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
             sum(len(chunk) for chunk in trial.events())
             sum(len(chunk) for chunk in (trial.frames or (lambda: iter(())))())
             json.dumps([trial.about, trial.condition], allow_nan=False)
-    except Wrong as error:
+    except FormatError as error:
         raise InputError(path, "", None, str(error)) from None
 
 
 def make_foreign(folder: Path) -> dict[str, bytes]:
     """One small file of each kind, by name."""
-    from sliplab.storage.exchange.hand_out import hand_out
+    from sliplab.storage.exchange.export_trials import export_trials
     from sliplab.storage.store import Store
     from tests.storage.exchange.files import lab_cells, lab_hdf5
 
@@ -211,7 +211,7 @@ def make_foreign(folder: Path) -> dict[str, bytes]:
     found["b_off.npy"] = (folder / "a_events_on.npy").read_bytes()
     for kind in ("dsec", "aedat4"):  # whose manifest stays
         out = folder / f"box-made-{kind}"
-        hand_out([recording], out, kind, "c")
+        export_trials([recording], out, kind, "c")
         for path in out.iterdir():
             plain = {".json": "sliplab-export.json"}.get(path.suffix, f"t{path.suffix}")
             data = path.read_bytes()

@@ -22,7 +22,7 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.manifest import Manifest, manifest_key, of_trial, parse, read_manifests
 from sliplab.storage.mirror import mirror_folder, open_mirror, place_of, reach
 from sliplab.storage.pull import pull
-from sliplab.storage.push import Wishes, push
+from sliplab.storage.push import PushOptions, push
 from sliplab.storage.remote import Remote, RemoteError, RemoteMissing
 from sliplab.storage.remote_check import verify_remote
 from sliplab.storage.store import Campaign, Store, StoreError
@@ -79,9 +79,9 @@ def test_what_is_pulled_is_what_was_pushed(
         "memory": lambda: f"memory://{uuid4().hex}/lab",
     }[kind]()
     the(store).quarantine(the(store).folder / "trials" / TRIALS[2], "gate: too loud")
-    sent = push(store, Remote(url), wishes=Wishes(quarantine=True))
+    sent = push(store, Remote(url), wishes=PushOptions(quarantine=True))
     assert (sent.trials, sent.pushed, sent.set_aside, sent.problems) == (2, 2, 1, [])
-    twice = push(store, Remote(url), wishes=Wishes(quarantine=True))
+    twice = push(store, Remote(url), wishes=PushOptions(quarantine=True))
     assert (twice.there, twice.pushed, twice.files, twice.bytes) == (2, 0, 0, 0)
     assert verify_remote(Remote(url)) == (2, [])
     back = pull(Remote(url), tmp_path / "back", quarantine=True)
@@ -174,7 +174,7 @@ def test_a_damaged_object_is_named_and_sent_anew(
     assert back.pulled == 3 - len({trial for trial, _ in found})
     assert all("frames.mkv" in text or "record.json" in text for text in back.problems)
     assert push(store, remote).files in {0, 1}  # what is gone shows in the list
-    assert push(store, remote, wishes=Wishes(check=True)).problems == []
+    assert push(store, remote, wishes=PushOptions(check=True)).problems == []
     assert verify_remote(remote) == (3, [])
     assert pull(remote, tmp_path / "back").problems == []
 

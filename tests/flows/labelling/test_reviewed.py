@@ -17,7 +17,7 @@ from sliplab.storage import review
 from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
 from sliplab.storage.exchange.find import trials_in
-from sliplab.storage.exchange.take_in import take_in
+from sliplab.storage.exchange.import_trials import import_trials
 from sliplab.storage.recording import Recording
 from sliplab.storage.review import Onsets, Verdict
 from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
@@ -134,7 +134,7 @@ def test_a_damaged_decision_stops_what_would_use_it(made: Reviewable) -> None:
 def test_imported_campaigns_beside_it_are_left_out(made: Reviewable, tmp_path: Path) -> None:
     path = tmp_path / "slide.h5"
     lab_hdf5(path)
-    take_in(made.store, "theirs", trials_in(path, "lab-hdf5"), path, "lab-hdf5")
+    import_trials(made.store, "theirs", trials_in(path, "lab-hdf5"), path, "lab-hdf5")
     assert [row.trial for row in TrialList(made.store).rows] == made.ids
     with pytest.raises(InputError, match="theirs: was imported"):
         TrialList(made.store, ["theirs"])

@@ -24,12 +24,12 @@ from sliplab.storage.derived import Derived
 from sliplab.storage.exchange import lab_pickles as lab
 from sliplab.storage.exchange.aedat4 import Aedat4File, Aedat4Writer, Stream
 from sliplab.storage.exchange.dv_buffers import events_buffer, frame_buffer
+from sliplab.storage.exchange.export_trials import export_trials
 from sliplab.storage.exchange.find import kind_of, name_of, trials_in
-from sliplab.storage.exchange.foreign import Triggers, Wrong
-from sliplab.storage.exchange.hand_out import hand_out
+from sliplab.storage.exchange.foreign import FormatError, Triggers
+from sliplab.storage.exchange.import_trials import import_trials
 from sliplab.storage.exchange.manifest import MANIFEST
 from sliplab.storage.exchange.tables import label_table, write_table
-from sliplab.storage.exchange.take_in import take_in
 from sliplab.storage.files import read_json
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store
@@ -52,7 +52,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def _import(folder: Path, path: Path, kind: str = "", name: str = "theirs") -> Store:
     made = Store.create(folder)
     kind = kind or kind_of(path)
-    take_in(made, name, trials_in(path, kind), path, kind)
+    import_trials(made, name, trials_in(path, kind), path, kind)
     return made
 
 
@@ -69,7 +69,7 @@ def _same(one: EventChunk, other: EventChunk) -> None:
 @pytest.mark.parametrize("kind", ["aedat4", "dsec"])
 def test_a_campaign_goes_out_and_comes_back(store: Store, tmp_path: Path, kind: str) -> None:
     ours = store.campaign("c")
-    result = hand_out(list(ours.recordings()), tmp_path / "out", kind, "c")
+    result = export_trials(list(ours.recordings()), tmp_path / "out", kind, "c")
     assert (result["trials"], result["events"], result["triggers"]) == (2, 2000, 20)
     made = _import(tmp_path / "store", tmp_path / "out")
     assert verify(made) == []
@@ -87,7 +87,7 @@ def test_a_campaign_goes_out_and_comes_back(store: Store, tmp_path: Path, kind: 
                 np.testing.assert_array_equal(mine, yours)
     table = catalogue(made)
     assert table["sync_uncertainty_us"].isna().all()
-    again = take_in(made, "theirs", trials_in(tmp_path / "out", kind), tmp_path / "out", kind)
+    again = import_trials(made, "theirs", trials_in(tmp_path / "out", kind), tmp_path / "out", kind)
     assert (again["imported"], len(again["there"])) == ([], 2)
 
 
@@ -280,7 +280,7 @@ def test_one_wrong_event_in_any_packet_is_found(
     events, _ = _aedat4(tmp_path / "a.aedat4")
     getattr(events, column)[at : at + 1] = np.array([value]).astype(getattr(events, column).dtype)
     _packets(tmp_path / "b.aedat4", events, [300] * 233 + [100])
-    with Aedat4File(tmp_path / "b.aedat4") as file, pytest.raises(Wrong, match=says):
+    with Aedat4File(tmp_path / "b.aedat4") as file, pytest.raises(FormatError, match=says):
         list(file.events(0))
 
 
@@ -295,7 +295,7 @@ def test_zstd_frames_that_say_a_wrong_size(tmp_path: Path, size: int) -> None:
     at = frame + 6 - (data[frame + 4] >> 5 & 1)
     data[at : at + 4] = struct.pack("<I", size)
     path.write_bytes(data)
-    with Aedat4File(path) as file, pytest.raises(Wrong, match="unpacked"):
+    with Aedat4File(path) as file, pytest.raises(FormatError, match="unpacked"):
         list(file.events(0))
 
 
@@ -308,7 +308,7 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
         file.events(0, whole)
     made = Store.create(tmp_path / "store")
     path = tmp_path / "a.aedat4"
-    result = take_in(made, "theirs", trials_in(path, "aedat4"), path, "aedat4")
+    result = import_trials(made, "theirs", trials_in(path, "aedat4"), path, "aedat4")
     (text,) = result["warnings"]
     assert text.startswith("a.aedat4: ")
     assert f"between 0 and {later} us" in text
@@ -316,7 +316,7 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
     assert [f"a.aedat4: {one}" for one in found.record["imported"]["warnings"]] == [text]
     _same(_events(found), whole)
     assert verify(made) == []
-    hand_out([found], tmp_path / "out", "aedat4", "theirs")
+    export_trials([found], tmp_path / "out", "aedat4", "theirs")
     with Aedat4File(tmp_path / "out" / "a.aedat4") as again:
         back = [chunk.t_us for chunk in again.events(0)]
     np.testing.assert_array_equal(np.concatenate(back), times)
@@ -325,7 +325,7 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
 def test_aedat4_goes_round_with_every_trigger(tmp_path: Path) -> None:
     events, triggers = _aedat4(tmp_path / "a.aedat4")
     made = _import(tmp_path / "store", tmp_path / "a.aedat4")
-    hand_out(list(made.campaign("theirs").recordings()), tmp_path / "out", "aedat4", "theirs")
+    export_trials(list(made.campaign("theirs").recordings()), tmp_path / "out", "aedat4", "theirs")
     with (
         Aedat4File(tmp_path / "out" / "a.aedat4") as file,
         Aedat4File(tmp_path / "a.aedat4") as was,
@@ -531,7 +531,7 @@ def test_what_was_whole_before_a_damaged_file_stays(tmp_path: Path) -> None:
 @pytest.mark.parametrize("file", ["../t.h5", "/etc/passwd", "t\0.h5", "", "gone.h5", "link.h5"])
 def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> None:
     out = tmp_path / "out"
-    hand_out([store.campaign("c").recording("depth=2.4mm,r=1")], out, "dsec", "c")
+    export_trials([store.campaign("c").recording("depth=2.4mm,r=1")], out, "dsec", "c")
     (tmp_path / "t.h5").write_bytes((out / "depth=2.4mm,r=1.h5").read_bytes())
     os.symlink(tmp_path / "t.h5", out / "link.h5")
     told = read_json(out / MANIFEST)
@@ -551,7 +551,9 @@ def test_names_become_plain() -> None:
 def test_a_collected_campaign_is_left_alone(store: Store, tmp_path: Path) -> None:
     lab_hdf5(tmp_path / "a.h5")
     with pytest.raises(InputError, match="was collected"):
-        take_in(store, "c", trials_in(tmp_path / "a.h5", "lab-hdf5"), tmp_path / "a.h5", "lab-hdf5")
+        import_trials(
+            store, "c", trials_in(tmp_path / "a.h5", "lab-hdf5"), tmp_path / "a.h5", "lab-hdf5"
+        )
 
 
 def test_without_faery_its_files_are_refused_by_name(

@@ -16,7 +16,7 @@ import pytest
 from sliplab.protocols.errors import InputError
 from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.exchange.find import kind_of, trials_in
-from sliplab.storage.exchange.take_in import take_in
+from sliplab.storage.exchange.import_trials import import_trials
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store
 from sliplab.storage.streams import EventChunk
@@ -29,7 +29,7 @@ SIZE = SMALL[::-1]
 def _import(folder: Path, path: Path, kind: str = "") -> list[Recording]:
     made = Store.create(folder)
     kind = kind or kind_of(path)
-    take_in(made, "theirs", trials_in(path, kind), path, kind)
+    import_trials(made, "theirs", trials_in(path, kind), path, kind)
     assert verify(made) == []
     return list(made.campaign("theirs").recordings())
 

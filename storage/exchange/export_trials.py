@@ -1,4 +1,4 @@
-"""Committed trials into files of other formats, one a trial; the store is only read."""
+"""Export of committed trials to files of other formats, one a trial; the store is only read."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.exchange.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.exchange.dsec import write_dsec
 from sliplab.storage.exchange.foreign import Triggers
+from sliplab.storage.exchange.import_trials import RISING
 from sliplab.storage.exchange.manifest import FORMAT, MANIFEST
 from sliplab.storage.exchange.read_aedat4 import SIMULATED
-from sliplab.storage.exchange.take_in import RISING
 from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
 from sliplab.storage.recording import Recording
 from sliplab.storage.streams import I64, EventChunk, Json
@@ -24,14 +24,14 @@ SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
 _PIECE = 1 << 20
 
 
-def hand_out(
+def export_trials(
     recordings: list[Recording],
     folder: Path,
     kind: str,
     campaign: str,
     on_trial: Callable[[str], None] = lambda name: None,
 ) -> Json:
-    """Write trials into `folder`, each file whole or not at all, and a manifest last.
+    """Export trials to `folder`, each file whole or not at all, and a manifest last.
 
     Returns:
         ``trials``, ``events``, ``frames`` and ``triggers`` written, and ``files``.
@@ -45,15 +45,15 @@ def hand_out(
     for recording in recordings:
         on_trial(recording.trial_id)
         path = folder / f"{recording.trial_id}{SUFFIXES[kind]}"
-        aside = path.with_name(f".{path.name[:200]}.{os.getpid()}.tmp")
+        temporary = path.with_name(f".{path.name[:200]}.{os.getpid()}.tmp")
         try:
-            counts = _WRITERS[kind](recording, aside)
-            sync_file(aside)
-            os.replace(aside, path)
+            counts = _WRITERS[kind](recording, temporary)
+            sync_file(temporary)
+            os.replace(temporary, path)
         except ValueError as error:
             raise InputError("--format", "", kind, f"trial {recording.trial_id} {error}") from None
         finally:
-            aside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
         listed.append(_listed(recording, path.name, counts))
     sync_folder(folder)
     simulated = any(recording.simulated for recording in recordings)

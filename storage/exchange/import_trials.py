@@ -1,4 +1,4 @@
-"""Foreign trials into a campaign of their own: each one whole or not at all.
+"""Import of foreign trials into a campaign of their own: each one whole or not at all.
 
 A trial is committed by the store's own rename after all of it was read and found right. What nobody
 knows of it (clocks against one another, poses, what was asked for) is said to be unknown and not
@@ -15,7 +15,7 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.exchange.foreign import ForeignTrial, Wrong
+from sliplab.storage.exchange.foreign import ForeignTrial, FormatError
 from sliplab.storage.files import json_text
 from sliplab.storage.names import safe_name
 from sliplab.storage.process import now
@@ -31,7 +31,7 @@ _FRAME_RATE = 100
 """Of the video's own time base only; when frames were taken stands in their times."""
 
 
-def take_in(
+def import_trials(
     store: Store,
     name: str,
     trials: Iterable[ForeignTrial],
@@ -39,7 +39,7 @@ def take_in(
     kind: str,
     on_trial: Callable[[str], None] = lambda name: None,
 ) -> Json:
-    """Commit trials that are not there yet; whoever calls holds the store's lock.
+    """Import trials that do not exist yet; the caller holds the store's lock.
 
     Args:
         name: the campaign's, which is made.
@@ -47,8 +47,8 @@ def take_in(
         kind: the format's name.
 
     Returns:
-        ``imported`` and ``there`` (already) with ids, ``events`` and ``frames`` imported, and
-        ``warnings`` for people where there are any.
+        ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
+        and ``warnings`` for people where there are any.
 
     Raises:
         InputError: a file is damaged or cannot be right. Trials before it stay committed; of this
@@ -58,18 +58,18 @@ def take_in(
     fresh = not campaign.begun
     if not fresh and IMPORTED not in campaign.info:
         raise InputError("--name", "", name, "is a campaign that was collected; give another name")
-    there = campaign.committed()
-    made: list[str] = []
-    found: list[str] = []
+    existing = campaign.committed()
+    imported: list[str] = []
+    skipped: list[str] = []
     counts = {"events": 0, "frames": 0}
     warnings: list[str] = []
     try:
         for trial in trials:
             on_trial(trial.name)
-            if trial.name in there:
-                found.append(trial.name)
+            if trial.name in existing:
+                skipped.append(trial.name)
                 continue
-            if trial.name in made:
+            if trial.name in imported:
                 raise InputError(
                     origin, "", None,
                     f"holds two files for the trial {trial.name}; import them one by one",
@@ -78,16 +78,16 @@ def take_in(
                 _describe(campaign, trial, origin, kind)
             try:
                 taken, warned = _take(campaign, trial, kind)
-            except Wrong as error:
+            except FormatError as error:
                 file = error.file or (origin if origin.is_file() else origin / trial.source)
                 raise InputError(file, "", None, str(error)) from None
-            made.append(trial.name)
+            imported.append(trial.name)
             warnings += [f"{trial.source}: {text}" for text in warned]
             counts = {key: counts[key] + taken[key] for key in counts}
     finally:
-        if fresh and not made and campaign.folder.exists():
+        if fresh and not imported and campaign.folder.exists():
             shutil.rmtree(campaign.folder)
-    result = {"campaign": name, "imported": made, "there": found, **counts}
+    result = {"campaign": name, "imported": imported, "there": skipped, **counts}
     return {**result, "warnings": warnings} if warnings else result
 
 
@@ -124,7 +124,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
     """All streams into the trial; the times of the first and the last event, us, and warnings.
 
     Raises:
-        Wrong: there is no event, one lies outside of the camera's pixels, or times run backwards.
+        FormatError: there is no event, one lies outside of the camera's pixels, or times run backwards.
     """
     first_us = last_us = None
     gap_us = gap_end_us = 0
@@ -132,7 +132,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         if not len(chunk):
             continue
         if last_us is not None and int(chunk.t_us[0]) < last_us:
-            raise Wrong("holds events whose times run backwards")
+            raise FormatError("holds events whose times run backwards")
         first_us = int(chunk.t_us[0]) if first_us is None else first_us
         steps = np.diff(chunk.t_us, prepend=first_us if last_us is None else last_us)
         widest = int(steps.argmax())
@@ -142,7 +142,7 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
         _check_pixels(chunk, trial.event_px())
         writer.add_events(chunk)
     if first_us is None or last_us is None:
-        raise Wrong("holds no events, so there is nothing to import; leave it out")
+        raise FormatError("holds no events, so there is nothing to import; leave it out")
     if trial.triggers is not None:
         t_ns = trial.triggers.t_us * 1000
         writer.add_triggers(t_ns, trial.triggers.kind)
@@ -150,7 +150,9 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
     for frames in trial.frames() if trial.frames is not None else ():
         height, width = frames.images.shape[1:]
         if (width, height) != trial.frame_px:
-            raise Wrong(f"holds a frame of {width} x {height} among others of {trial.frame_px}")
+            raise FormatError(
+                f"holds a frame of {width} x {height} among others of {trial.frame_px}"
+            )
         writer.add_frames(frames)
     return (first_us, last_us), _gap_warnings(gap_us, gap_end_us)
 
@@ -160,7 +162,7 @@ def _check_pixels(chunk: EventChunk, size: tuple[int, int] | None) -> None:
         return
     x, y = int(chunk.x.max()), int(chunk.y.max())
     if x >= size[0] or y >= size[1]:
-        raise Wrong(
+        raise FormatError(
             f"holds events up to column {x} and row {y}, outside of the {size[0]} x {size[1]} "
             "pixels that it gives its camera"
         )
