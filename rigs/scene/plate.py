@@ -6,6 +6,8 @@ and the mean force of both ends, so that onsets are of second order in the step.
 that its own swing is faster than the steps takes speed and force of the end alone: of first order,
 but without ringing. Forces fall monotonically with the plate's speed, so one scalar equation with a
 bracket round its root decides the step, however many tips change between stick and slip in it.
+Where static friction exceeds kinetic, a tip that lets go makes the plate faster at once, so a step
+ends where the first one does, were all held, and what is left of it is a step of its own.
 Regularised friction would let a held plate creep.
 """
 
@@ -17,15 +19,33 @@ from numba import njit
 from sliplab.rigs.scene.column import relaxing
 from sliplab.rigs.scene.contact import move_tips, record
 from sliplab.rigs.scene.lanes import respond
-from sliplab.rigs.scene.rows import END_FORCE_Y, LANES, block_of, gather, spread
-from sliplab.rigs.scene.springs import ACROSS, FORCE_Y
+from sliplab.rigs.scene.rows import END_FORCE_Y, KICK, LANES, SHARE, TABLE, block_of, gather, spread
+from sliplab.rigs.scene.springs import (
+    ACROSS,
+    BASE_X,
+    BASE_Y,
+    FORCE_Y,
+    GAP,
+    INDENTATION,
+    LAYOUT_X,
+    LAYOUT_Y,
+    MODE,
+    STUCK,
+    Law,
+)
 
 _ITERATIONS = 200
+_NEVER = 1e9
+"""An excess of static friction that holds every tip."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pull(lanes, n, field, law, sensor, plate_y, swerve, h, decay, gain):  # type: ignore[no-untyped-def]
-    """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N."""
+def _pull(lanes, n, field, law, sensor, plate_y, swerve, h, decay, gain, new):  # type: ignore[no-untyped-def]
+    """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
+
+    It is what must stand for the end of the step, so that its mean with the beginning (`new`) is
+    that over the step: the force of a tip that lets go falls in no time.
+    """
     total = 0.0
     for k in range(lanes.shape[0]):
         first = k * LANES
@@ -34,6 +54,8 @@ def _pull(lanes, n, field, law, sensor, plate_y, swerve, h, decay, gain):  # typ
         w = block_of(lanes[k])
         for j in range(count):
             total += w[END_FORCE_Y, j]
+            if new < 1.0 and w[SHARE, j] >= 0.0:
+                total += w[KICK, j]
     return total
 
 
@@ -52,7 +74,7 @@ def _solve(  # type: ignore[no-untyped-def]
     plate_y, speed = motion[0] + (1.0 - new) * motion[1] * h, motion[1]
     weight -= (1.0 - new) * pulls
     rest = _pull(
-        lanes, n, field, law, sensor, plate_y, (1.0 - new) * speed, h, decay, gain
+        lanes, n, field, law, sensor, plate_y, (1.0 - new) * speed, h, decay, gain, new
     )  # fmt: skip
     push = new * rest - weight + inertia * speed
     if abs(push) <= stiction:
@@ -67,7 +89,7 @@ def _solve(  # type: ignore[no-untyped-def]
         f = inertia * (v - speed) + weight + drag
         f -= new * _pull(
             lanes, n, field, law, sensor, plate_y + new * v * h, (1.0 - new) * (speed - v), h,
-            decay, gain,
+            decay, gain, new,
         )  # fmt: skip
         if f == 0.0:
             return v
@@ -109,40 +131,76 @@ def advance_free(  # type: ignore[no-untyped-def]
         steps taken, and whether the plate came to rest on its stop in the last of them.
     """
     n, lanes = state.shape[0], spread(table, field, state)
+    holding = Law(
+        _NEVER, law.strengthening, law.weak_mm_s, law.maxwell, law.relaxation_s, law.damping_s,
+        law.exact_turns,
+    )  # fmt: skip
     step_ns, h, decay, gain, new, stiffness = np.int64(0), 0.0, 1.0, 1.0, 0.5, 0.0
     for i in range(n):
         stiffness += table[i, ACROSS]
     for k in range(sensor.shape[0]):
-        if t_ns[k + 1] - t_ns[k] != step_ns:
-            step_ns = t_ns[k + 1] - t_ns[k]
-            h = step_ns * 1e-9
-            decay, gain = relaxing(h, law.relaxation_s)
-            new = 0.5 if 1e3 * stiffness * h * h <= mass else 1.0
-        pulls = 0.0
-        for i in range(n):
-            pulls += block_of(lanes[i // LANES])[FORCE_Y, i % LANES]
-        before = motion[1]
-        speed = _solve(
-            lanes, n, field, law, sensor[k], motion, h, decay, gain, mass,
-            new * weight[k + 1] + (1.0 - new) * weight[k], stiction, new, pulls,
-        )  # fmt: skip
+        begin_ns, begin_weight = t_ns[k], weight[k]
+        while True:
+            if t_ns[k + 1] - begin_ns != step_ns:
+                step_ns = t_ns[k + 1] - begin_ns
+                h = step_ns * 1e-9
+                decay, gain = relaxing(h, law.relaxation_s)
+                new = 0.5 if 1e3 * stiffness * h * h <= mass else 1.0
+            mean_weight = new * weight[k + 1] + (1.0 - new) * begin_weight
+            pulls = 0.0
+            for i in range(n):
+                pulls += block_of(lanes[i // LANES])[FORCE_Y, i % LANES]
+            before = motion[1]
+            speed = _solve(
+                lanes, n, field, law, sensor[k], motion, h, decay, gain, mass, mean_weight,
+                stiction, new, pulls,
+            )  # fmt: skip
+            if new == 1.0 or law.static_excess == 0.0 or _lets_go_first(lanes, n) > 1.0:
+                break
+            # a tip that lets go makes the plate faster, which may not have made it let go
+            held = _solve(
+                lanes, n, field, holding, sensor[k], motion, h, decay, gain, mass, mean_weight,
+                stiction, new, pulls,
+            )  # fmt: skip
+            _pull(
+                lanes, n, field, law, sensor[k], motion[0] + 0.5 * (before + held) * h,
+                0.5 * (before - held), h, decay, gain, new,
+            )  # fmt: skip
+            share = _lets_go_first(lanes, n)
+            if share > 1.0:
+                speed = held
+                break
+            ns = np.int64(share * step_ns)
+            share = ns / step_ns
+            height = motion[0] + h * share * (before + 0.5 * share * (held - before))
+            if ns < 1 or ns == step_ns or height <= stop:
+                break
+            # the step ends where the first tip lets go, and what is left of it is another
+            at = _between(lanes[0], motion[0], sensor[k], share)
+            part = ns * 1e-9
+            decay, gain = relaxing(part, law.relaxation_s)
+            move_tips(
+                lanes, n, field, holding, at, height, 0.5 * share * (before - held),
+                begin_ns * 1e-9, part, decay, gain,
+            )  # fmt: skip
+            motion[0], motion[1] = height, before + share * (held - before)
+            begin_weight += share * (weight[k + 1] - begin_weight)
+            begin_ns += ns
         mean = new * speed + (1.0 - new) * before
         height = motion[0] + mean * h
         landed = height <= stop
         if landed:
-            at = sensor[k].copy()
             share = _lands_at(motion[0] - stop, mean * h, (mean - speed) * h)
             ns = min(max(np.int64(np.ceil(share * step_ns)), np.int64(1)), step_ns)
             share = ns / step_ns
-            if k > 0:
-                at[:] = sensor[k - 1] + share * (sensor[k] - sensor[k - 1])
-            t_ns[k + 1] = t_ns[k] + ns
+            at = _between(lanes[0], motion[0], sensor[k], share)
+            t_ns[k + 1] = begin_ns + ns
             h = ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
             height, swerve, motion[1] = stop, (mean - speed) * share, 0.0
         else:
             at, swerve, motion[1] = sensor[k], mean - speed, speed
-        move_tips(lanes, n, field, law, at, height, swerve, t_ns[k] * 1e-9, h, decay, gain)
+        move_tips(lanes, n, field, law, at, height, swerve, begin_ns * 1e-9, h, decay, gain)
         motion[0] = height
         record(lanes, n, height, track[k], load[k])
         if landed:
@@ -150,6 +208,31 @@ def advance_free(  # type: ignore[no-untyped-def]
             return k + 1, True
     gather(lanes, state)
     return sensor.shape[0], False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lets_go_first(lanes, n):  # type: ignore[no-untyped-def]
+    """Share of a step at which the first of the tips that stuck lets go; above 1: none does."""
+    first = 2.0
+    for i in range(n):
+        w, j = block_of(lanes[i // LANES]), i % LANES
+        if w[MODE, j] == STUCK and w[SHARE, j] >= 0.0:
+            first = min(first, w[SHARE, j])
+    return first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _between(flat, plate_y, sensor, share):  # type: ignore[no-untyped-def]
+    """The sensor's pose at a share of a step, from where the first tip's base was; (5,)."""
+    w, at = block_of(flat), sensor.copy()
+    x, y = w[TABLE + LAYOUT_X, 0], w[TABLE + LAYOUT_Y, 0]
+    left = 1.0 - share
+    at[0] -= left * (sensor[0] - (w[BASE_X, 0] - x))
+    at[1] -= left * (sensor[1] - (w[BASE_Y, 0] - y + plate_y))
+    deep = sensor[2] + sensor[3] * x + sensor[4] * y - w[TABLE + GAP, 0]
+    # a tip that was never moved does not know how deep it was
+    at[2] -= left * (deep - w[INDENTATION, 0]) if w[INDENTATION, 0] == w[INDENTATION, 0] else 0.0
+    return at
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -32,8 +32,10 @@ TABLE = STATES
     # of a tip that seeks its bend, and of one that seeks its slip (`rigs.scene.sliding`)
     LOW, HIGH, SEEKS, STRETCH, BEFORE, AFTER, UNIT_X, UNIT_Y, TOP, BOTTOM, WAY,
     AHEAD, ASIDE, REST_X, REST_Y, SOFT_X, SOFT_Y, QUICK, LAG, GRIP, GRIP_SLOPE, FAR,
-) = range(STATES + CONSTANTS, STATES + CONSTANTS + 43)  # fmt: skip
-ROWS = STATES + CONSTANTS + 43
+    # of a tip that lets go (`rigs.scene.tip`)
+    KICK,
+) = range(STATES + CONSTANTS, STATES + CONSTANTS + 44)  # fmt: skip
+ROWS = STATES + CONSTANTS + 44
 
 ALONE = 3.0
 """END_MODE of a tip that must be computed alone."""

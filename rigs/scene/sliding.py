@@ -270,6 +270,31 @@ def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # 
     return max(law.weak_mm_s * (1.0 / slow - 1.0), 0.0) if b > 0.0 else -1.0
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def given_way(force, cone, damp, law):  # type: ignore[no-untyped-def]
+    """Share of its force that a tip keeps in the moment in which it lets go.
+
+    It slides at once at the speed w at which the damper and friction together hold the force:
+    `damp` w + cone (1 + strengthening ln(1 + w / weak)) = force, all in N and mm/s.
+    """
+    over = force - cone
+    if over <= 0.0 or (damp == 0.0 and law.strengthening > 0.0):
+        return 1.0
+    if law.strengthening == 0.0:
+        return cone / force
+    speed = 0.0
+    for _ in range(ITERATIONS):
+        # the sum is concave: Newton's steps from below never pass the root
+        whole = 1.0 + speed / law.weak_mm_s
+        rise = cone * law.strengthening
+        miss = over - damp * speed - rise * np.log(whole)
+        change = miss / (damp + rise / (law.weak_mm_s * whole))
+        speed += change
+        if change <= 1e-12 * speed:
+            break
+    return 1.0 - damp * speed / force
+
+
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def foreseen(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
     """Speed at the end of a step from the slip in it and the mean speeds of the steps before.

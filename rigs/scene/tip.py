@@ -28,6 +28,7 @@ from sliplab.rigs.scene.rows import (
     END_X,
     END_Y,
     GAIN,
+    KICK,
     SHARE,
     SLIP,
     TABLE,
@@ -39,6 +40,7 @@ from sliplab.rigs.scene.sliding import (
     along_slip,
     begun,
     foreseen,
+    given_way,
     onto_cone,
     pulled,
     relaxed_speed,
@@ -204,7 +206,7 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
     if size <= limit * ROUNDING:
         _end(w, j, STUCK, place_x, place_y, trial_x, trial_y, normal, bent, 0.0, -1.0, gain)
         return
-    share, left = -1.0, 1.0
+    share, left, held, sinks = -1.0, 1.0, 0.0, 0.0
     if not keeps_on:
         share = leaves_at(from_x, from_y, drive_x, drive_y, static * before, limit)
         if mode == STUCK and w[INDENTATION, j] > 0.0 and 0.0 < share < 1.0:
@@ -212,6 +214,8 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
         left = 1.0 - share
         from_x, from_y = from_x + share * drive_x, from_y + share * drive_y
         before += share * (after - before)
+        held = share
+        sinks = given_way(np.sqrt(from_x * from_x + from_y * from_y), before, damp, law)
         share = touched + (1.0 - touched) * share
     if law.exact_turns:
         start, end = raised(from_x, from_y, before, after) if keeps_on else (before, after)
@@ -290,3 +294,6 @@ def tip_step(w, field, law, i, j, h, swerve, decay, gain):  # type: ignore[no-un
         w, j, SLIDING, place_x + slip * unit_x, place_y + slip * unit_y, force_x, force_y, normal,
         bend, slip, share, gain,
     )  # fmt: skip
+    # up to where it lets go the force goes from one end to `from`, then from what is left of that
+    sunk_y = from_y * (held + (1.0 - held) * sinks)
+    w[KICK, j] = sunk_y - (1.0 - held) * w[FORCE_Y, j] - held * w[END_FORCE_Y, j]
