@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from benchmarks import contact_error as rough
+from sliplab.analysis.labels.change_point import change_point, departure
 from sliplab.rigs.scene.springs import NORMAL_BRANCH, SLIPPED, Springs, Tips
 from tests.rigs.scene.reference import Papilla
 from tests.rigs.scene.steps import MU, fall, slid, times
@@ -133,3 +135,25 @@ def test_onsets_with_all_of_l3_are_of_second_order_in_the_step() -> None:
     for coarse, fine in itertools.pairwise(misses):
         assert np.all(fine < coarse / 3)
     assert landings == [pytest.approx(0.0, abs=4e-6)] * 4
+
+
+def narrowest_s() -> float:
+    """Width of the interval of a change point that nothing blurs, from frames at 100 Hz."""
+    since = np.arange(80) - 40.01
+    away = np.maximum(since, 0.0)[:, None] * [12.0, 16.0]
+    frame_ns, sigma = np.arange(80) * 10_000_000, np.full(80, 1e-4)
+    left = departure(away, sigma, 10)
+    assert left is not None
+    found = change_point(frame_ns, away, sigma, left, 2_000_000)
+    assert found is not None
+    return (found.high_ns - found.low_ns) * 1e-9
+
+
+def test_onsets_on_rough_friction_are_off_by_far_less_than_a_label_can_tell() -> None:
+    # the draw of 20 with the largest error, which has no order in the step
+    springs = rough.springs_of(rough.skin_of(18), 0.05, 0.5, 3, seed=20)
+    off = np.abs(rough.fall(springs, 1.0)[0] - rough.fall(springs, rough.FINE_MS)[0])[:-1]
+    assert off.max() < 12e-6
+    assert np.median(off) < 0.5e-6
+    # 95 % of what lies between two neighbours of a single node of the finest grid
+    assert narrowest_s() > 0.105e-3
