@@ -124,7 +124,8 @@ def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], li
     """All streams into the trial; the times of the first and the last event, us, and warnings.
 
     Raises:
-        FormatError: there is no event, one lies outside of the camera's pixels, or times run backwards.
+        FormatError: there is no event, one lies outside of the camera's pixels, or times run
+            backwards.
     """
     first_us = last_us = None
     gap_us = gap_end_us = 0
