@@ -23,7 +23,7 @@ from torch import nn
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.network_rivals import Rival, installed
 from benchmarks.slides import slide_events
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.dataset import SampleSet, TrialId
 from sliplab.analysis.nets.network import (
     build,
     by_class,
@@ -102,7 +102,8 @@ def _training(
     training = Training(epochs=1, batch=BATCH)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "train.arrays"
-        SampleSet(SparseWindows.of(x), y, y, y).save(path)
+        trials = tuple(TrialId("made", str(k)) for k in range(3))
+        SampleSet(SparseWindows.of(x), y, y, y, trials).save(path)
         dense = Path(folder) / "train.npy"
         np.save(dense, x)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,13 @@ from sliplab.storage.recording import Recording
 VERSION = 1
 
 
+class TrialId(NamedTuple):
+    """A trial of a store; campaigns may have trials of the same id."""
+
+    campaign: str
+    trial: str
+
+
 @dataclass(frozen=True)
 class SampleSet:
     """Samples of some trials.
@@ -26,14 +33,16 @@ class SampleSet:
     Attributes:
         windows: event counts (n, steps, channels, cells, cells), sparse.
         y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross.
-        trial: int64 (n,), place of each sample's trial in the list of trials that was asked for.
+        trial: int64 (n,), each sample's trial by its index in `trials`.
         start_ns: int64 (n,), start of each window on its trial's time line.
+        trials: the trials, each once; one may have no samples.
     """
 
     windows: SparseWindows
     y: npt.NDArray[np.int64]
     trial: npt.NDArray[np.int64]
     start_ns: npt.NDArray[np.int64]
+    trials: tuple[TrialId, ...]
 
     def __len__(self) -> int:
         return len(self.y)
@@ -48,11 +57,17 @@ class SampleSet:
         """The samples of all parts in order; works for none."""
         shape = (windows.steps, windows.channels, windows.cells, windows.cells)
         none = np.empty(0, np.int64)
+        index: dict[TrialId, int] = {}
+        trial = [none]
+        for part in parts:
+            there = [index.setdefault(name, len(index)) for name in part.trials]
+            trial.append(np.array(there, np.int64)[part.trial])
         return SampleSet(
             SparseWindows.join([part.windows for part in parts], shape),
             np.concatenate([none, *(part.y for part in parts)]),
-            np.concatenate([none, *(part.trial for part in parts)]),
+            np.concatenate(trial),
             np.concatenate([none, *(part.start_ns for part in parts)]),
+            tuple(index),
         )
 
     def save(self, path: Path) -> None:
@@ -66,6 +81,7 @@ class SampleSet:
             "y": self.y,
             "trial": self.trial,
             "start_ns": self.start_ns,
+            "trials": np.array(self.trials, np.str_).reshape(-1, 2),
         }
         write_arrays(path, arrays)
 
@@ -81,7 +97,8 @@ class SampleSet:
         try:
             shape = tuple(arrays["shape"].tolist())
             windows = SparseWindows(shape, arrays["offsets"], arrays["cell"], arrays["count"])
-            return SampleSet(windows, arrays["y"], arrays["trial"], arrays["start_ns"])
+            trials = tuple(TrialId(*names) for names in arrays["trials"].tolist())
+            return SampleSet(windows, arrays["y"], arrays["trial"], arrays["start_ns"], trials)
         except KeyError as error:
             raise ValueError(f"{path}: holds no samples: {error} is missing") from error
 
@@ -121,7 +138,7 @@ def recorded_span(recording: Recording) -> tuple[int, int]:
 def trial_samples(
     recording: Recording,
     label: dict[str, Any],
-    number: int,
+    trial: TrialId,
     windows: Windows,
     samples: Samples,
     seed: int,
@@ -130,7 +147,7 @@ def trial_samples(
 
     Args:
         label: the trial's label (`incipient_ns`, `gross_ns`).
-        number: what `SampleSet.trial` says for them.
+        trial: what the samples carry.
         seed: of the random windows within incipient slip.
     """
     start, end = recorded_span(recording)
@@ -148,8 +165,9 @@ def trial_samples(
     return SampleSet(
         cut_windows(recording, starts, windows),
         classes,
-        np.full(len(starts), number, np.int64),
+        np.zeros(len(starts), np.int64),
         starts,
+        (trial,),
     )
 
 

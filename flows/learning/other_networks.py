@@ -347,8 +347,9 @@ def _count(recording: Recording, judging: _Judging) -> tuple[Json, dict[str, npt
         "end_ns": starts + length_ns,
     }
     if judging.label is not None:
+        trial = dataset.TrialId(recording.folder.parents[1].name, recording.folder.name)
         samples = dataset.trial_samples(
-            recording, judging.label, 0, network.windows, judging.samples, judging.seed
+            recording, judging.label, trial, network.windows, judging.samples, judging.seed
         )
         found |= {"sample_counts": counts(samples.windows), "y": samples.y}
     return {}, found

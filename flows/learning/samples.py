@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sliplab.analysis.nets import dataset
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.dataset import SampleSet, TrialId
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.trial_work import TrialWork, each_trial
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
 STEP = "samples"
-_FORMAT = "numbered by place"
-"""Samples once had their trial's number in its campaign, which another campaign has, too."""
+_FORMAT = "trials by name"
+_BY_PLACE = "numbered by place"
+"""In keys of what was made of several campaigns since windows are told apart by their trial."""
 
 TrialRef = tuple[Collected, Trial, Recording]
 """A trial with its campaign and its recording."""
@@ -36,17 +37,14 @@ class _Wanted:
     """What a trial's samples depend on besides the trial: see `dataset.trial_samples`."""
 
     label: dict[str, Any]
-    number: int
+    trial: TrialId
     windows: Windows
     samples: Samples
     seed: int
 
 
 def split_trials(campaigns: list[Collected], split: str) -> list[TrialRef]:
-    """Return the trials of a split; `SampleSet.trial` of `load_samples` is the place in this list.
-
-    A trial without an onset gives no samples, and keeps its place.
-    """
+    """Return the trials of a split, whose samples `load_samples` returns."""
     return [
         (item, trial, found)
         for item in training_campaigns(campaigns)
@@ -54,12 +52,17 @@ def split_trials(campaigns: list[Collected], split: str) -> list[TrialRef]:
     ]
 
 
+def by_id(trials: list[TrialRef]) -> dict[TrialId, TrialRef]:
+    """Return trials by what their samples carry."""
+    return {TrialId(item.name, trial.id): (item, trial, found) for item, trial, found in trials}
+
+
 def several(campaigns: list[Collected]) -> list[str]:
     """Return an extra input for the key of a result that tells windows apart by their trial.
 
     Empty for one campaign: only with several was a window ever given to the wrong trial.
     """
-    return [_FORMAT] if len(training_campaigns(campaigns)) > 1 else []
+    return [_BY_PLACE] if len(training_campaigns(campaigns)) > 1 else []
 
 
 def load_samples(
@@ -103,11 +106,11 @@ def _make(
         TrialWork(
             recording, item.name, "",
             _Wanted(
-                labels.read(item, recording), place, windows,
+                labels.read(item, recording), TrialId(item.name, trial.id), windows,
                 item.settings.samples, hash_integer("samples", trial.id),
             ),
         )
-        for place, (item, trial, recording) in enumerate(trials)
+        for item, trial, recording in trials
     ]  # fmt: skip
     parts: dict[int, SampleSet] = {}
     each_trial(
@@ -124,5 +127,5 @@ def _make(
 
 def _samples(recording: Recording, wanted: _Wanted) -> SampleSet:
     return dataset.trial_samples(
-        recording, wanted.label, wanted.number, wanted.windows, wanted.samples, wanted.seed
+        recording, wanted.label, wanted.trial, wanted.windows, wanted.samples, wanted.seed
     )

@@ -19,7 +19,13 @@ from sliplab.analysis.nets import metrics, model_file, synaptic, training
 from sliplab.analysis.nets.baselines import evaluate_baselines
 from sliplab.analysis.nets.dataset import SampleSet, recorded_span
 from sliplab.analysis.statistics import reliability, window_groups
-from sliplab.flows.learning.samples import TrialRef, load_samples, several, split_trials
+from sliplab.flows.learning.samples import (
+    TrialRef,
+    by_id,
+    load_samples,
+    several,
+    split_trials,
+)
 from sliplab.flows.learning.train import Model, training_settings
 from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
@@ -46,11 +52,16 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) ->
     fitted = model_file.load(job.model.path)
     validation = load_samples(job.labels, job.campaigns, "validation")
     counts = training.predict_counts(fitted, test.windows)
-    known, trial = split_trials(job.campaigns, "test"), test.trial
+    found, trial = by_id(split_trials(job.campaigns, "test")), test.trial
+    known = [found[name] for name in test.trials]
     hits = window_groups.strict_hits(counts, test.y)
     Derived.of(job.store, STEP).write(
-        NAME, job.key, {}, {"counts": counts, "y": test.y, "trial": trial}
-    )
+        NAME, job.key, {},
+        {
+            "counts": counts, "y": test.y, "trial": trial,
+            "trials": np.array(test.trials, np.str_).reshape(-1, 2),
+        },
+    )  # fmt: skip
     cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
     work = synaptic.count_work(fitted, test.windows)
     return {

@@ -141,7 +141,7 @@ class Data:
         """Windows of trials by the 50/50/50 rule, as many of each trial as of any other.
 
         Args:
-            most: windows in all; `trial` in what is returned counts the trials of `part`.
+            most: windows in all.
         """
         windows = setting.windows(self.settings.windows)
         own = self.settings.windows.length_ms * self.settings.samples.per_class
@@ -152,8 +152,9 @@ class Data:
             if not share:
                 break
             seed = hash_integer("tradeoff samples", used.trial.id)
+            trial = dataset.TrialId(used.item.name, used.trial.id)
             found = dataset.trial_samples(
-                used.recording, used.label, number, windows, per_class, seed
+                used.recording, used.label, trial, windows, per_class, seed
             )
             rows = np.sort(np.random.default_rng(seed).permutation(len(found))[:share])
             parts.append(
@@ -162,6 +163,7 @@ class Data:
                     found.y[rows],
                     found.trial[rows],
                     found.start_ns[rows],
+                    found.trials,
                 )
             )
         return SampleSet.join(parts, windows)

@@ -25,7 +25,13 @@ from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import choose_model
-from sliplab.flows.learning.samples import load_samples, several, split_trials
+from sliplab.flows.learning.samples import (
+    TrialRef,
+    by_id,
+    load_samples,
+    several,
+    split_trials,
+)
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
@@ -199,17 +205,15 @@ class Generalisation:
 
 
 def all_samples(store: Store, campaigns: list[Collected]) -> tuple[SampleSet, I64, list[Any]]:
-    """Samples of all parts of the split, the place of each one's trial, and the trials."""
+    """Samples of all parts of the split, the index of each one's trial, and the trials."""
     labels = Labels(store)
-    parts, places = [], []
-    known: list[Any] = []
+    parts = []
+    known: list[TrialRef] = []
     for split in ("train", "validation", "test"):
-        part, of = load_samples(labels, campaigns, split), split_trials(campaigns, split)
-        parts.append(part)
-        places.append(part.trial + len(known))
-        known += of
-    windows = campaigns[0].settings.windows
-    return SampleSet.join(parts, windows), np.concatenate(places), known
+        parts.append(load_samples(labels, campaigns, split))
+        known += split_trials(campaigns, split)
+    joined, found = SampleSet.join(parts, campaigns[0].settings.windows), by_id(known)
+    return joined, joined.trial, [found[name] for name in joined.trials]
 
 
 def scored(counts: I64, y: I64, trial: I64) -> Result:

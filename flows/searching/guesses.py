@@ -25,7 +25,7 @@ from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning import evaluate
 from sliplab.flows.learning.evaluate import choose_model
-from sliplab.flows.learning.samples import several, split_trials
+from sliplab.flows.learning.samples import several
 from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
 from sliplab.flows.planning.orders import Order
@@ -191,12 +191,12 @@ class Guesses:
             for row, recording in judged.trials
         ]
         used = training_campaigns(campaigns)
-        known = split_trials(used, "test")
         names = [
-            f"{item.name}/{trial.id}" if several(used) else trial.id for item, trial, _ in known
+            f"{campaign}/{trial}" if several(used) else trial
+            for campaign, trial in judged.samples.trials
         ]
-        hits = window_groups.strict_hits(judged.counts, judged.y)
-        windows = _by_trial(hits, judged.trial, names)
+        hits = window_groups.strict_hits(judged.counts, judged.samples.y)
+        windows = _by_trial(hits, judged.samples.trial, names)
         return {"windows": windows, "trials": rows, "experiments": summaries(rows)}
 
 

@@ -112,7 +112,7 @@ class Holdout:
         fitted = model_file.load(self.model.path)
         judged = judge(fitted, {order.campaign: self.detection}, store, campaigns)
         rows = [row for row, _ in judged.trials]
-        windows = metrics.score(judged.counts, judged.y, self.detection.margin)
+        windows = metrics.score(judged.counts, judged.samples.y, self.detection.margin)
         before = self.kept()
         now = {
             "version": version("sliplab"),
@@ -130,10 +130,10 @@ class Holdout:
             "windows": {
                 **windows.as_dict(),
                 "strict": window_groups.share(
-                    window_groups.strict_hits(judged.counts, judged.y), judged.trial
+                    window_groups.strict_hits(judged.counts, judged.samples.y), judged.samples.trial
                 ),
                 "argmax": window_groups.share(
-                    window_groups.credit(judged.counts, judged.y), judged.trial
+                    window_groups.credit(judged.counts, judged.samples.y), judged.samples.trial
                 ),
             },
             "rows": rows,

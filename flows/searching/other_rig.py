@@ -72,14 +72,13 @@ class Judged:
     """Outputs of a network and a rule on a store's test trials.
 
     Attributes:
-        counts, y, trial: of the chosen windows: spikes int64 (n, 3), classes int64 (n,), and the
-            place of each one's trial among the kinematic test trials, int64 (n,).
+        counts: spikes of each class in each sample, int64 (n, 3).
+        samples: of the kinematic test trials.
         trials: a row of `flows.learning.trial_scores.score_row` for each, and its recording.
     """
 
     counts: npt.NDArray[np.int64]
-    y: npt.NDArray[np.int64]
-    trial: npt.NDArray[np.int64]
+    samples: dataset.SampleSet
     trials: list[tuple[dict[str, Any], Recording]]
 
 
@@ -103,7 +102,7 @@ def judge(
             rows.append((score_row(item, trial, label, counts, end_ns, settings), recording))
     samples = load_samples(labels, training_campaigns(campaigns), "test")
     counts = training.predict_counts(fitted, samples.windows)
-    return Judged(counts, samples.y, samples.trial, rows)
+    return Judged(counts, samples, rows)
 
 
 def _counts(

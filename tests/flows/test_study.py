@@ -22,7 +22,7 @@ from sliplab.flows.labelling.label_errors import read_check
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_baselines, window_checks
 from sliplab.flows.learning.evaluate import evaluate
-from sliplab.flows.learning.samples import load_samples, split_trials
+from sliplab.flows.learning.samples import by_id, load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.orders import Order, make_order
 from sliplab.flows.reporting.report import read_summary, report
@@ -202,9 +202,9 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(
     found: dict[str, set[tuple[str, str]]] = {}
     for split in ("train", "validation", "test"):
         samples = load_samples(Labels(store), used, split)
-        known, of = split_trials(used, split), samples.trial
+        known, of = by_id(split_trials(used, split)), samples.trial
         for k in np.unique(of).tolist():
-            item, trial, recording = known[k]
+            item, trial, recording = known[samples.trials[k]]
             start, end = recorded_span(recording)
             times = samples.start_ns[of == k]
             assert start <= times.min()

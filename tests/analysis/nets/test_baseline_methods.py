@@ -6,7 +6,7 @@ import torch
 
 from sliplab.analysis.nets.baseline_nets import KINDS, multiply_adds, trained_net
 from sliplab.analysis.nets.baseline_trees import boosted
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.dataset import SampleSet, TrialId
 from sliplab.analysis.nets.metrics import accuracy
 from sliplab.analysis.nets.sparse import SparseWindows
 
@@ -22,7 +22,9 @@ def events(n: int, seed: int) -> SampleSet:
     x = rng.poisson(0.05, (n, *SHAPE)).astype(np.uint8)
     x[y == 1, :3, 0, :3] += rng.poisson(0.8, (int((y == 1).sum()), 3, 3, 5)).astype(np.uint8)
     x[y == 2, 3:, 0, :3] += rng.poisson(0.8, (int((y == 2).sum()), 3, 3, 5)).astype(np.uint8)
-    return SampleSet(SparseWindows.of(x), y, np.zeros(n, np.int64), np.arange(n))
+    return SampleSet(
+        SparseWindows.of(x), y, np.zeros(n, np.int64), np.arange(n), (TrialId("made", "one"),)
+    )
 
 
 TRAIN, VALIDATION, TEST = events(240, 0), events(60, 1), events(90, 2)
@@ -73,7 +75,8 @@ def test_boosting_learns_and_repeats() -> None:
 
 
 def test_wrong_input_is_named() -> None:
-    none = SampleSet(TRAIN.windows.take(np.arange(0)), TRAIN.y[:0], TRAIN.trial[:0], TRAIN.y[:0])
+    no = TRAIN.y[:0]
+    none = SampleSet(TRAIN.windows.take(np.arange(0)), no, no, no, ())
     with pytest.raises(ValueError, match="gru: 0 training"):
         trained_net("gru", none, VALIDATION, TEST.windows)
     with pytest.raises(ValueError, match="gru: 0 epochs"):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.nets.dataset import SampleSet, TrialId
 from sliplab.analysis.nets.sparse import SparseWindows
 from sliplab.analysis.nets.windows import bin_events, list_events
 from sliplab.protocols.settings import Windows
@@ -95,15 +95,39 @@ def test_events_are_listed_as_they_are_binned(seed: int, how: Windows, events: i
 def test_samples_are_kept_in_a_file_that_maps(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     x = rng.poisson(0.05, (7, 30, 1, 20, 20)).astype(np.uint8)
-    made = SampleSet(SparseWindows.of(x), np.arange(7) % 3, np.arange(7), np.arange(7) * 10**9)
+    trials = tuple(TrialId("täglich", f"depth=2.4mm,r={k}") for k in range(7))
+    made = SampleSet(
+        SparseWindows.of(x), np.arange(7) % 3, np.arange(7), np.arange(7) * 10**9, trials
+    )
     made.save(tmp_path / "train.arrays")
     found = SampleSet.load(tmp_path / "train.arrays")
     np.testing.assert_array_equal(found.x, x)
     for name in ("y", "trial", "start_ns"):
         np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+    assert found.trials == trials
     assert isinstance(found.windows.cell.base, np.memmap)
     found.windows.count[:] = 9  # changes this process' memory and not the file
     np.testing.assert_array_equal(SampleSet.load(tmp_path / "train.arrays").x, x)
+
+
+def test_joined_samples_keep_their_trials() -> None:
+    """Two campaigns with a trial of the same id, one trial without samples, one trial twice."""
+
+    def part(campaign: str, trial: str, n: int, start_ns: int) -> SampleSet:
+        x = np.ones((n, 3, 1, 2, 2), np.uint8)
+        starts = start_ns + np.arange(n)
+        zeros = np.zeros(n, np.int64)
+        return SampleSet(SparseWindows.of(x), zeros, zeros, starts, (TrialId(campaign, trial),))
+
+    windows = Windows(length_ms=3, crop_px=40)
+    parts = [part("a", "1", 2, 0), part("a", "2", 0, 10), part("b", "1", 1, 20)]
+    half = SampleSet.join(parts, windows)
+    found = SampleSet.join([half, part("a", "1", 1, 30)], windows)
+    assert found.trials == (TrialId("a", "1"), TrialId("a", "2"), TrialId("b", "1"))
+    carried = [found.trials[k] for k in found.trial.tolist()]
+    assert carried == [("a", "1"), ("a", "1"), ("b", "1"), ("a", "1")]
+    assert found.start_ns.tolist() == [0, 1, 20, 30]
+    assert SampleSet.join([], windows).trials == ()
 
 
 @pytest.mark.parametrize("kind", ["cut", "header", "other", "missing"])
@@ -111,7 +135,7 @@ def test_a_damaged_file_of_samples_is_named(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "train.arrays"
     none = np.empty(0, np.int64)
     windows = SparseWindows.of(np.ones((2, 3, 1, 2, 2), np.uint8))
-    SampleSet(windows, none, none, none).save(path)
+    SampleSet(windows, none, none, none, ()).save(path)
     data = path.read_bytes()
     path.write_bytes(
         {

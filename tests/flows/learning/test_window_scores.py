@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.nets import metrics
+from sliplab.analysis.nets.dataset import TrialId
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
@@ -62,8 +63,9 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
     kept = kept_counts(two, key)
     assert kept is not None
     labels = Labels(two, reviewed=True)
-    for place, (item, trial, recording) in enumerate(split_trials(campaigns, "test")):
-        ours = int(np.count_nonzero(kept["trial"] == place))
+    trials = [tuple(names) for names in kept["trials"].tolist()]
+    for item, trial, recording in split_trials(campaigns, "test"):
+        ours = int(np.count_nonzero(kept["trial"] == trials.index((item.name, trial.id))))
         assert ours == rows.get((item.name, trial.id), 0)
         onset = labels.read(item, recording)["incipient_ns"]
         assert (onset is None) == (ours == 0)
@@ -91,9 +93,10 @@ def test_each_sample_says_its_trial(two: Store) -> None:
     for split in ("train", "validation", "test"):
         samples = load_samples(labels, campaigns, split)
         length_ns = campaigns[0].settings.windows.length_ms * 1_000_000
-        for place, (item, _, recording) in enumerate(split_trials(campaigns, split)):
+        for item, trial, recording in split_trials(campaigns, split):
+            index = samples.trials.index(TrialId(item.name, trial.id))
             onset = labels.read(item, recording)["incipient_ns"]
-            still = samples.start_ns[(samples.trial == place) & (samples.y == 0)]
+            still = samples.start_ns[(samples.trial == index) & (samples.y == 0)]
             if onset is None:
                 assert not len(still)
             else:
