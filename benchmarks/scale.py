@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
-from benchmarks.trials import stretch
+from benchmarks.trials import run_session
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.nets import dataset, training
 from sliplab.analysis.nets.network import build, weights
@@ -42,7 +42,7 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
     )
     figures: Figures = {}
     for rig, prefix in (("rehearsal", "tracks_"), ("mock", "video_")):
-        with stretch(rig, trials) as taking:
+        with run_session(rig, trials) as taking:
             taking.take()
             campaign = taking.session.campaign
             store = Store.open(campaign.folder.parent.parent)

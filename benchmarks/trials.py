@@ -18,7 +18,7 @@ import yaml
 
 from benchmarks.measure import SEED, peak_mb
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
 from sliplab.storage.store import Store
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RunSession:
     """A session at a simulated rig with its store, ready to take trials."""
 
     session: Session
@@ -45,7 +45,7 @@ class Stretch:
 
 
 @contextmanager
-def stretch(rig: str, count: int, protocol: str = "kinematic") -> Iterator[Stretch]:
+def run_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[RunSession]:
     """A session that can take `count` random trials of a protocol's grid."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         text = yaml.safe_load((ROOT / "protocols" / f"{protocol}.yaml").read_text("utf-8"))
@@ -53,23 +53,23 @@ def stretch(rig: str, count: int, protocol: str = "kinematic") -> Iterator[Stret
         del text["collection"]["maintenance"]
         file = Path(folder) / f"{protocol}.yaml"
         file.write_text(yaml.safe_dump(text, sort_keys=False), "utf-8")
-        order = make_order(file, ROOT / "rigs" / f"{rig}.yaml", Path(folder) / "store")
-        store = Store.create(order.store)
-        campaign = describe_campaign(store, order)
-        device = build_rig(order.rig)
+        run_request = make_request(file, ROOT / "rigs" / f"{rig}.yaml", Path(folder) / "store")
+        store = Store.create(run_request.store)
+        campaign = describe_campaign(store, run_request)
+        device = build_rig(run_request.rig)
         device.connect()
-        every = list(order.plan)
+        every = list(run_request.plan)
         chosen = np.random.default_rng(SEED).choice(len(every), count, replace=False)
-        session = Session(order.plan, order.rig, device, campaign)
+        session = Session(run_request.plan, run_request.rig, device, campaign)
         try:
-            yield Stretch(session, [every[index] for index in sorted(chosen)])
+            yield RunSession(session, [every[index] for index in sorted(chosen)])
         finally:
             device.close()
 
 
 def main(rig: str) -> None:
     """One trial, and what it took."""
-    with stretch(rig, 1) as work:
+    with run_session(rig, 1) as work:
         work.take()
     print(f"{peak_mb():.1f}")
 

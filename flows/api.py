@@ -433,19 +433,19 @@ def collect(
         StoreError: the store cannot be used.
         CampaignStopped: collection cannot go on; the message says why.
     """
-    from sliplab.flows.planning.orders import make_order
+    from sliplab.flows.planning.run_request import make_request
     from sliplab.flows.running import stopping
     from sliplab.flows.steps import prepare_store
 
     if trials is not None and trials < 1:
         raise InputError("trials", "", trials, "must be 1 or more")
-    order = make_order(
+    run_request = make_request(
         Path(protocol), Path(rig), Path(store), enable=tuple(enable), campaign=campaign,
         most=trials,
     )  # fmt: skip
-    prepare_store(order.store)
+    prepare_store(run_request.store)
     from sliplab.flows.collecting.collect import collect as take
 
     with stopping.signals():
-        take(order)
-    return open_store(order.store)
+        take(run_request)
+    return open_store(run_request.store)

@@ -17,7 +17,7 @@ from sliplab.flows.labelling.label_check import check_labels
 from sliplab.flows.labelling.label_errors import CHECK
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import report
 from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching.holdout import STEP, measure_holdout
@@ -47,7 +47,7 @@ class Outcome:
 
 
 def study(
-    orders: list[Order], check: int = 0, more: Sequence[Search] = (), holdout: int = 0
+    run_requests: list[RunRequest], check: int = 0, more: Sequence[Search] = (), holdout: int = 0
 ) -> Outcome:
     """Run what is missing or stale, step by step; a step with nothing to do says so.
 
@@ -56,19 +56,19 @@ def study(
         more: what is searched before the report.
         holdout: trials of the campaign that chooses nothing, where slides are simulated.
     """
-    Store.create(orders[0].store)
-    check = check if label_check.wanted(orders[0]) else 0
-    slides = [o for o in orders if o.plan.protocol.collection.experiment == "kinematic"]
+    Store.create(run_requests[0].store)
+    check = check if label_check.wanted(run_requests[0]) else 0
+    slides = [o for o in run_requests if o.plan.protocol.collection.experiment == "kinematic"]
     holdout = holdout if slides and slides[0].rig.simulated else 0
-    ledger = Ledger(orders[0].store, expected(orders, check, more, holdout))
+    ledger = Ledger(run_requests[0].store, expected(run_requests, check, more, holdout))
     done = []
-    for order in orders:
-        with ledger.step(f"collect {order.campaign}") as on_done:
-            result = collect(order)
+    for run_request in run_requests:
+        with ledger.step(f"collect {run_request.campaign}") as on_done:
+            result = collect(run_request)
             done.append(result)
             _report_done(on_done, result["taken"], "trials taken")
-    store = Store.open(orders[0].store)
-    campaigns = collected(store, [order.campaign for order in orders])
+    store = Store.open(run_requests[0].store)
+    campaigns = collected(store, [run_request.campaign for run_request in run_requests])
     steps = []
 
     def run(name: str, work: Callable[[], dict[str, Any]], of: str) -> None:
@@ -80,7 +80,7 @@ def study(
     run("sync", lambda: sync(store, campaigns), "trials")
     run("label", lambda: label(store, campaigns), "trials")
     if check:
-        run(CHECK, lambda: check_labels(orders[0], check), "trials")
+        run(CHECK, lambda: check_labels(run_requests[0], check), "trials")
     run("train", lambda: train(store, campaigns), "networks")
     run("evaluate", lambda: evaluate(store, campaigns), "evaluations")
     if holdout:
@@ -92,33 +92,37 @@ def study(
 
 
 def expected(
-    orders: list[Order], check: int, more: Sequence[Search] = (), holdout: int = 0
+    run_requests: list[RunRequest], check: int, more: Sequence[Search] = (), holdout: int = 0
 ) -> dict[str, float]:
     """Seconds that each step is expected to take from nothing."""
     seconds: dict[str, float] = {}
     labelled, trials = 0.0, 0
-    for order in orders:
-        plan, source = order.plan, order.rig.frame_source
+    for run_request in run_requests:
+        plan, source = run_request.plan, run_request.rig.frame_source
         count = len(plan.trials)
         trials += count
         labelled += LABEL_S[source] * count
         simulated = COLLECT_S[source] * count
-        taken = simulated if order.rig.in_virtual_time else plan.total_seconds
-        seconds[f"collect {order.campaign}"] = taken
+        taken = simulated if run_request.rig.in_virtual_time else plan.total_seconds
+        seconds[f"collect {run_request.campaign}"] = taken
     seconds["sync"], seconds["label"] = SYNC_S * trials, labelled
     if check:
         seconds[CHECK] = (COLLECT_S["video"] + LABEL_S["video"]) * check
-    seconds["train"] = _training_s(orders)
+    seconds["train"] = _training_s(run_requests)
     seconds["evaluate"] = EVALUATE_S * trials
     if holdout:
-        source = orders[0].rig.frame_source
+        source = run_requests[0].rig.frame_source
         seconds[STEP] = (COLLECT_S[source] + LABEL_S[source] + EVALUATE_S) * holdout
     seconds = {**seconds, **{search.name: search.seconds for search in more}, "report": 0.0}
     return {name: START_S + each for name, each in seconds.items()}
 
 
-def _training_s(orders: list[Order]) -> float:
-    found = [order for order in orders if order.plan.protocol.collection.experiment == "kinematic"]
+def _training_s(run_requests: list[RunRequest]) -> float:
+    found = [
+        run_request
+        for run_request in run_requests
+        if run_request.plan.protocol.collection.experiment == "kinematic"
+    ]
     if not found:
         return 0.0
     settings = found[0].plan.protocol.analysis

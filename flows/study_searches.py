@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from sliplab.flows.learning.window_baselines import window_baselines
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import FILES
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.searching.detector_tradeoff import detector_tradeoff
@@ -54,14 +54,14 @@ class Search:
     work: Callable[[Store, list[Collected]], dict[str, Any]]
 
 
-def searches(orders: list[Order]) -> list[Search]:
+def searches(run_requests: list[RunRequest]) -> list[Search]:
     """Those that a study can have: most need slides, and two a simulated scene.
 
     Raises:
         InputError: none; there is no kinematic protocol and nothing is simulated.
     """
-    slides = [o for o in orders if o.plan.protocol.collection.experiment == "kinematic"]
-    simulated = all(order.rig.simulated for order in orders)
+    slides = [o for o in run_requests if o.plan.protocol.collection.experiment == "kinematic"]
+    simulated = all(run_request.rig.simulated for run_request in run_requests)
     found = []
     if slides:
         windows = training_windows(slides)
@@ -71,7 +71,9 @@ def searches(orders: list[Order]) -> list[Search]:
         seconds = LEVEL_S * windows * epochs * factors + SKIN_S * SKINS
         found.append(Search("generalisation", "results", seconds, _generalisation))
     if simulated:
-        names = tuple(name for name in GUESSES if all(_has(order, name) for order in orders))
+        names = tuple(
+            name for name in GUESSES if all(_has(run_request, name) for run_request in run_requests)
+        )
         work = partial(_guesses, names=names)
         found.append(Search("guesses", "settings", GUESS_S * (1 + 2 * len(names)), work))
     if slides and simulated:
@@ -85,19 +87,19 @@ def searches(orders: list[Order]) -> list[Search]:
     return found
 
 
-def training_windows(slides: list[Order]) -> int:
+def training_windows(slides: list[RunRequest]) -> int:
     """Windows that a network learns from, as planned."""
     return sum(
-        3 * order.plan.protocol.analysis.samples.per_class
-        for order in slides
-        for trial in order.plan
+        3 * run_request.plan.protocol.analysis.samples.per_class
+        for run_request in slides
+        for trial in run_request.plan
         if trial.split == "train"
     )
 
 
-def _has(order: Order, name: str) -> bool:
+def _has(run_request: RunRequest, name: str) -> bool:
     try:
-        return bool(value_of(order.rig.scene, name))
+        return bool(value_of(run_request.rig.scene, name))
     except (AttributeError, TypeError, ValueError):
         return False
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measuring import Bench, Finding, px
+from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, px
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.capabilities import RigError
@@ -25,14 +25,14 @@ MOST_CROP_PX = 5.0
 STIR_MM_S = 1.0
 
 
-def see_boards(bench: Bench, views: int) -> list[npt.NDArray[np.uint8]]:
+def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.uint8]]:
     """Pictures of a board that a person holds before the outside camera.
 
     Raises:
         StopRequested: the person said stop.
         RigError: the camera hands over tracks, or no frame came.
     """
-    rig, camera = bench.rig, bench.file.frame_camera
+    rig, camera = session.rig, session.file.frame_camera
     rig.frames.set_region(camera.width_px, camera.height_px)
     pictures = []
     for number in range(views):
@@ -133,7 +133,7 @@ def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today:
     return Finding(changes, figures)
 
 
-def calibrate_crop(bench: Bench, depth_mm: float, radius_mm: float) -> Finding:
+def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: float) -> Finding:
     """Where the skin is in the event camera's picture.
 
     Raises:
@@ -141,8 +141,8 @@ def calibrate_crop(bench: Bench, depth_mm: float, radius_mm: float) -> Finding:
     """
     from sliplab.analysis.calibration.crop import CropError, find_crop
 
-    rig = bench.rig
-    with console.bar(f"{bench.simulated}rounds", 1) as bar:
+    rig = session.rig
+    with console.bar(f"{session.simulated}rounds", 1) as bar:
         counts = stir(rig, depth_mm, radius_mm, STIR_MM_S, 3000)
         bar.advance(1, f"{int(counts.sum())} events")
     try:
@@ -159,7 +159,7 @@ def calibrate_crop(bench: Bench, depth_mm: float, radius_mm: float) -> Finding:
     entry = {
         "centre": [px(v) for v in crop.centre_px],
         "size": f"{crop.size_px} px",
-        "measured": bench.today,
+        "measured": session.today,
         "residual": px(crop.residual_px),
         "method": f"smallest circle round {int(counts.sum())} events of the pressed, moved skin",
     }

@@ -51,7 +51,7 @@ class Planned:
 
 
 @dataclass
-class Bench:
+class CalibrationSession:
     """The rig at hand.
 
     Attributes:
@@ -95,7 +95,7 @@ class Measurement:
         moves: Sequence[Planned],
         yes: bool,
         dry_run: bool,
-        measure: Callable[[Bench], Finding],
+        measure: Callable[[CalibrationSession], Finding],
         who: str = "",
         *,
         with_arm: bool = True,
@@ -115,7 +115,7 @@ class Measurement:
             try:
                 if with_arm:
                     rig.connect()
-                finding = measure(Bench(self.file, rig, today))
+                finding = measure(CalibrationSession(self.file, rig, today))
             except StopRequested:
                 console.say("stopped: the arm stands still, nothing was written")
                 raise KeyboardInterrupt from None

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measuring import Bench, Finding, Planned, mm
+from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Planned, mm
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
@@ -75,17 +75,17 @@ def check_touches(file: RigFile, name: str, span_mm: float, creep: Creep) -> Non
         raise InputError("--span", "", f"{span_mm:g} mm", "must be at least 5 mm")
 
 
-def teach_plane(bench: Bench, span_mm: float, creep: Creep, repeats: int) -> Finding:
+def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repeats: int) -> Finding:
     """The contact plane from three touches, and a fourth that checks them.
 
     Raises:
         RigError: a touch never came, or the fourth is off the plane by more than 0.1 mm.
     """
-    rig = bench.rig
+    rig = session.rig
     rig.frame = rig.frame.with_zero(0.0)
     places = plane_places(span_mm)
     found: dict[str, list[Touch]] = {name: [] for name in places}
-    with console.bar(f"{bench.simulated}touches", repeats * len(places)) as bar:
+    with console.bar(f"{session.simulated}touches", repeats * len(places)) as bar:
         for number in range(repeats):
             for index, (name, xy) in enumerate(places.items()):
                 seed = 1000 * (number + 1) + index
@@ -98,10 +98,10 @@ def teach_plane(bench: Bench, span_mm: float, creep: Creep, repeats: int) -> Fin
     }
     scatter = max(float(np.ptp(values)) / 2 for values in depths.values())
     method = f"touches by event rate at {creep.speed_mm_s:g} mm/s, {repeats} a point"
-    return _plane_found(bench, points, scatter, method, depths)
+    return _plane_found(session, points, scatter, method, depths)
 
 
-def teach_plane_by_hand(bench: Bench) -> Finding:
+def teach_plane_by_hand(session: CalibrationSession) -> Finding:
     """The contact plane from four points to which a person jogs the arm.
 
     Raises:
@@ -119,13 +119,13 @@ def teach_plane_by_hand(bench: Bench) -> Finding:
         (f"jog the arm until the centre papilla just touches {text}", f"touched {name}")
         for name, text in where.items()
     ]
-    poses = jogged(bench.rig, prompts)
+    poses = jogged(session.rig, prompts)
     points = {name: pose.xyz_mm for name, pose in zip(where, poses, strict=True)}
-    return _plane_found(bench, points, 0.0, "jogged by hand and confirmed", None)
+    return _plane_found(session, points, 0.0, "jogged by hand and confirmed", None)
 
 
 def _plane_found(
-    bench: Bench,
+    session: CalibrationSession,
     points: dict[str, tuple[float, float, float]],
     scatter_mm: float,
     method: str,
@@ -144,12 +144,12 @@ def _plane_found(
             f"within {scatter_mm:.3f} mm: at most {MOST_PLANE_MM:g} mm is good. Is something "
             "loose, or the skin dirty? Nothing was written",
         )
-    before = bench.rig.frame
+    before = session.rig.frame
     turned = np.degrees(np.arccos(np.clip(float(before.axes[2] @ frame.axes[2]), -1.0, 1.0)))
     moved = float(before.axes[2] @ (frame.origin - before.origin))
     entry = {
         **{name: [mm(v) for v in points[name]] for name in ("centre", "right", "above")},
-        "taught": bench.today,
+        "taught": session.today,
         "residual": mm(residual),
         "method": method,
     }
@@ -167,11 +167,11 @@ def _plane_found(
     return Finding({"calibration.contact_plane": entry}, figures, ("calibration.depth_zero",))
 
 
-def marker_finder(bench: Bench) -> MarkerFinder:
+def marker_finder(session: CalibrationSession) -> MarkerFinder:
     """Finds the markers in what the rig's outside camera hands over, from the first frame on."""
     from sliplab.analysis.labels.markers import MarkerTracker
 
-    layout = np.array(bench.file.skin.layout_mm()) * bench.file.frame_camera.scale_px_per_mm
+    layout = np.array(session.file.skin.layout_mm()) * session.file.frame_camera.scale_px_per_mm
     tracker = MarkerTracker(layout)
 
     def find(chunk: FrameChunk) -> F64:
@@ -182,23 +182,25 @@ def marker_finder(bench: Bench) -> MarkerFinder:
     return find
 
 
-def teach_zero(bench: Bench, creep: Creep, repeats: int, with_markers: bool) -> Finding:
+def teach_zero(
+    session: CalibrationSession, creep: Creep, repeats: int, with_markers: bool
+) -> Finding:
     """Depth zero at the plate's centre, by event rate and by the markers' motion.
 
     Raises:
         RigError: a touch never came, or the two differ by more than 0.15 mm.
     """
-    rig, camera = bench.rig, bench.file.frame_camera
+    rig, camera = session.rig, session.file.frame_camera
     rig.frame = rig.frame.with_zero(0.0)
     if with_markers:
         side = max(16, round(REGION_MM * camera.scale_px_per_mm / 16) * 16)
         rig.frames.set_region(min(side, camera.width_px), min(side, camera.height_px))
     ways = ("events", "markers") if with_markers else ("events",)
     depths: dict[str, list[float]] = {way: [] for way in ways}
-    with console.bar(f"{bench.simulated}touches", repeats * len(ways)) as bar:
+    with console.bar(f"{session.simulated}touches", repeats * len(ways)) as bar:
         for number in range(repeats):
             for way in ways:
-                find = marker_finder(bench) if way == "markers" else None
+                find = marker_finder(session) if way == "markers" else None
                 depths[way].append(touch(rig, 0.0, 0.0, creep, 2000 + number, find).depth_mm)
                 bar.advance(1, f"by {way} {depths[way][-1]:+.3f} mm")
     events = np.array(depths["events"])
@@ -225,12 +227,12 @@ def teach_zero(bench: Bench, creep: Creep, repeats: int, with_markers: bool) -> 
                 f"more than {MOST_DIFFERENCE_MM:g} mm apart. Is calibration.touch_depth = "
                 f"{rig.touch_mm:g} mm right? Nothing was written",
             )
-    entry |= {"taught": bench.today, "residual": mm(residual), "method": method}
+    entry |= {"taught": session.today, "residual": mm(residual), "method": method}
     figures["residual_mm"] = residual
     return Finding({"calibration.depth_zero": entry}, figures)
 
 
-def teach_tool(bench: Bench, poses: int, tool: Pose) -> Finding:
+def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
     """The tool centre point: a person brings the tip onto one fixed point in many ways.
 
     Args:
@@ -252,7 +254,7 @@ def teach_tool(bench: Bench, poses: int, tool: Pose) -> Finding:
         )
         for number in range(1, poses + 1)
     ]
-    found = jogged(bench.rig, prompts)
+    found = jogged(session.rig, prompts)
     turns = Rotation.from_rotvec(np.radians([pose.rotvec_deg for pose in found]))
     flange = turns * Rotation.from_rotvec(np.radians(tool.rotvec_deg)).inv()
     xyz = np.array([pose.xyz_mm for pose in found]) - flange.apply(np.array(tool.xyz_mm))
@@ -272,7 +274,7 @@ def teach_tool(bench: Bench, poses: int, tool: Pose) -> Finding:
         "offset": [mm(v) for v in pivot.tip_mm],
         "pivot": [mm(v) for v in pivot.point_mm],
         "poses": poses,
-        "taught": bench.today,
+        "taught": session.today,
         "residual": mm(pivot.residual_mm),
         "method": "pivoting about a fixed point, least squares",
     }

@@ -141,28 +141,28 @@ def collect(
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    from sliplab.flows.planning.orders import Bench, check_disk, make_order
+    from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
     from sliplab.flows.running import orchestration
     from sliplab.storage.store import Store
 
-    order = make_order(
+    run_request = make_request(
         protocol,
         rig,
         store,
         enable=tuple(enable or ()),
         campaign=campaign,
-        bench=Bench(operator, temperature, humidity, note),
+        metadata=SessionMetadata(operator, temperature, humidity, note),
         most=trials,
     )
-    for warning in order.plan.warnings():
+    for warning in run_request.plan.warnings():
         console.say(f"note: {warning}")
-    check_disk([order])
+    check_disk([run_request])
     prepare_store(store)
-    if order.wanted(Store(store).campaign(order.campaign)):
+    if run_request.wanted(Store(store).campaign(run_request.campaign)):
         orchestration.begin()  # starts beside all that is imported below
     from sliplab.flows.collecting.collect import collect as run
 
-    result = run(order)
+    result = run(run_request)
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
     if not as_json:

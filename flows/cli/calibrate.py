@@ -12,7 +12,7 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplab.flows.calibrating.measuring import Bench, Finding
+    from sliplab.flows.calibrating.measuring import CalibrationSession, Finding
     from sliplab.rigs.teaching import Creep
 
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
@@ -93,7 +93,9 @@ def teach_plane(
     steps.check_touches(command.file, "plane", span, creep)
     places = list(steps.plane_places(span).items())
     moves = steps.planned_touches(places, creep)
-    command.run(moves, yes, dry_run, lambda bench: steps.teach_plane(bench, span, creep, repeats))
+    command.run(
+        moves, yes, dry_run, lambda session: steps.teach_plane(session, span, creep, repeats)
+    )
 
 
 @teach_app.command("zero")
@@ -120,7 +122,9 @@ def teach_zero(
     steps.check_touches(command.file, "zero", 0.0, creep)
     both = by is ZeroBy.BOTH
     moves = steps.planned_zero(creep, both)
-    command.run(moves, yes, dry_run, lambda bench: steps.teach_zero(bench, creep, repeats, both))
+    command.run(
+        moves, yes, dry_run, lambda session: steps.teach_zero(session, creep, repeats, both)
+    )
 
 
 @teach_app.command("tool")
@@ -148,7 +152,7 @@ def teach_tool(
     set_now = None if tool is None else _tool(tool)
     command.run(
         [], yes, dry_run,
-        lambda bench: steps.teach_tool(bench, poses, set_now or tool_of(bench.file)),
+        lambda session: steps.teach_tool(session, poses, set_now or tool_of(session.file)),
         "a person jogs the arm",
     )  # fmt: skip
 
@@ -175,12 +179,12 @@ def calibrate_lens(
     board = _board(columns, rows, square)
     command = Measurement(rig, out, "lens", as_json)
 
-    def measure(bench: Bench) -> Finding:
+    def measure(session: CalibrationSession) -> Finding:
         if images is not None:
             pictures = steps.read_pictures(images)
         else:
-            pictures = steps.see_boards(bench, views)
-        return steps.calibrate_lens(pictures, board, bench.today)
+            pictures = steps.see_boards(session, views)
+        return steps.calibrate_lens(pictures, board, session.today)
 
     command.run([], True, dry_run, measure, "nothing moves", with_arm=False)
 
@@ -210,7 +214,7 @@ def calibrate_crop(
         Planned("press", 0.0, 0.0, -5.0, depth, 2.0),
         Planned(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
     ]
-    command.run(moves, yes, dry_run, lambda bench: steps.calibrate_crop(bench, depth, radius))
+    command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
 
 
 @calibrate_app.command("board")

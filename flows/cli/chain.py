@@ -102,17 +102,17 @@ def _chain(
     holdout: int = 0,
 ) -> None:
     """Run the whole chain and print what came out."""
-    from sliplab.flows.planning.orders import check_disk, make_order
+    from sliplab.flows.planning.run_request import check_disk, make_request
 
-    orders = [make_order(file, rig, folder, enable=on) for file, on in protocols.items()]
-    check_disk(orders)
+    run_requests = [make_request(file, rig, folder, enable=on) for file, on in protocols.items()]
+    check_disk(run_requests)
     prepare_store(folder)
     from sliplab.flows.reporting.report import read_summary
     from sliplab.flows.study import study as run
     from sliplab.flows.study_searches import searches
     from sliplab.storage.store import Store
 
-    outcome = run(orders, check, searches(orders) if more else (), holdout)
+    outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)
     summary = read_summary(Store.open(folder))
     page = folder / "report" / "index.html"
     if as_json:

@@ -30,7 +30,7 @@ def import_(
     """
     from dataclasses import replace
 
-    from sliplab.flows.collecting.stretch import owned
+    from sliplab.flows.collecting.run_session import owned
     from sliplab.storage.exchange.find import KINDS, kind_of, trials_in
     from sliplab.storage.exchange.import_trials import import_trials
     from sliplab.storage.names import safe_name

@@ -97,7 +97,7 @@ def verify(
         problems = look(opened, lambda name: bar.advance(1, name))
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
-        from sliplab.flows.collecting.stretch import owned
+        from sliplab.flows.collecting.run_session import owned
 
         with owned(opened):
             moved = set_aside(opened, problems)

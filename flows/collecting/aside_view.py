@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.flows.planning.orders import set_aside
+from sliplab.flows.planning.run_request import set_aside
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import InputError
@@ -14,7 +14,7 @@ from sliplab.storage.store import IMPORTED, Store, StoreError
 def all_aside(
     store: Store, unreadable: list[str], committed: dict[str, set[str]] | None = None
 ) -> list[dict[str, Any]]:
-    """What was set aside in each campaign, named with it; see `flows.planning.orders.set_aside`.
+    """List set-aside trials of each campaign; see `flows.planning.run_request.set_aside`.
 
     Args:
         unreadable: gets a line for every campaign that cannot be read.

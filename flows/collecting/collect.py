@@ -11,12 +11,12 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.flows.collecting.boundary import carry_out, refuse_paused
 from sliplab.flows.collecting.remaining import Remaining
+from sliplab.flows.collecting.run_session import owned, refresh, run_session
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.collecting.showing import shown
-from sliplab.flows.collecting.stretch import owned, refresh, stretch
-from sliplab.flows.planning.orders import Order, campaign_counts, check_disk
+from sliplab.flows.collecting.trial_gate import carry_out, refuse_paused
+from sliplab.flows.planning.run_request import RunRequest, campaign_counts, check_disk
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
@@ -35,12 +35,12 @@ def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
-def collect_flow(order: Opaque[Order]) -> dict[str, Any]:
-    """Take the trials of an order that its store lacks."""
-    wanted = order.content
+def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
+    """Take the trials of a run request that its store lacks."""
+    wanted = run_request.content
     with (
         shown(wanted) as page,
-        stretch(wanted) as work,
+        run_session(wanted) as work,
         timed(Store(wanted.store), f"collect {wanted.campaign}"),
     ):
         session, trials = work.session, work.trials
@@ -55,14 +55,14 @@ def collect_flow(order: Opaque[Order]) -> dict[str, Any]:
                 page.on_trial_done(trial, outcome)
                 bar.advance(1, f"{trial.id} {outcome}", str(left))
 
-            session.on_trial, work.boundary.on_pause = on_trial_done, left.pause
+            session.on_trial, work.gate.on_pause = on_trial_done, left.pause
             with stopping.signals():  # Prefect has handlers of its own inside a flow
                 session.rig.connect()
                 size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
                 while trials:
                     for start in range(0, len(trials), size):
                         take_trials(Opaque(session), Opaque(trials[start : start + size]))
-                    trials = work.boundary.more() if wanted.most is None else []
+                    trials = work.gate.more() if wanted.most is None else []
                     bar.extend(len(trials))
                     page.more(len(trials))
                     left.add(trials)
@@ -74,19 +74,24 @@ def collect_flow(order: Opaque[Order]) -> dict[str, Any]:
         }
 
 
-def collect(order: Order) -> dict[str, Any]:
+def collect(run_request: RunRequest) -> dict[str, Any]:
     """Run the collection; returns at once when the store lacks nothing that can be taken.
 
     Raises:
         CampaignStopped: the store is paused, the disk has no room for the next trial, or
             reference trials drifted apart.
     """
-    store = Store.create(order.store)
+    store = Store.create(run_request.store)
     refuse_paused(store)
     if control.open_requests(store):  # whoever asked was killed before it was done
         with owned(store):
             carry_out(store)
-    if order.wanted(store.campaign(order.campaign)):
-        check_disk([order])
-        return run(collect_flow, Opaque(order))
-    return {**campaign_counts(order, refresh(order)), "taken": 0, "retaken": 0, "left_out": 0}
+    if run_request.wanted(store.campaign(run_request.campaign)):
+        check_disk([run_request])
+        return run(collect_flow, Opaque(run_request))
+    return {
+        **campaign_counts(run_request, refresh(run_request)),
+        "taken": 0,
+        "retaken": 0,
+        "left_out": 0,
+    }

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from sliplab.flows.collecting.boundary import carry_out
 from sliplab.flows.collecting.halting import halt, holder_of
-from sliplab.flows.collecting.stretch import owned
+from sliplab.flows.collecting.run_session import owned
+from sliplab.flows.collecting.trial_gate import carry_out
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.campaigns import collected
 from sliplab.protocols import InputError

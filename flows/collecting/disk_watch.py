@@ -8,13 +8,13 @@ from pathlib import Path
 
 from sliplab.flows.collecting.stops import CampaignStopped
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running.console import size
 from sliplab.protocols import Trial
 from sliplab.storage.store import Campaign
 
 _LOOK_BACK = 50
-"""Committed trials that a stretch of work learns from when it begins."""
+"""Committed trials that a session learns from when it begins."""
 
 
 class DiskWatch:
@@ -29,26 +29,26 @@ class DiskWatch:
 
     def __init__(
         self,
-        order: Order,
+        run_request: RunRequest,
         campaign: Campaign,
         free: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
     ) -> None:
-        self._order, self._campaign, self._free = order, campaign, free
+        self._run_request, self._campaign, self._free = run_request, campaign, free
         self._ratio: float | None = None
         there = campaign.committed()
-        for trial in [item for item in order.plan if item.id in there][-_LOOK_BACK:]:
+        for trial in [item for item in run_request.plan if item.id in there][-_LOOK_BACK:]:
             self.learn(trial)
 
     def learn(self, trial: Trial) -> None:
         """Take the size of a trial that was just committed into account."""
         folder = self._campaign.folder / "trials" / trial.id
         took = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-        ratio = took / max(trial_bytes(self._order.rig, self._order.plan, trial), 1.0)
+        ratio = took / max(trial_bytes(self._run_request.rig, self._run_request.plan, trial), 1.0)
         self._ratio = max(ratio, self._ratio or 0.0)
 
     def needs(self, trial: Trial) -> float:
         """Bytes that a trial takes while it is written."""
-        rig, plan = self._order.rig, self._order.plan
+        rig, plan = self._run_request.rig, self._run_request.plan
         kept = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
         frame = rig.frame_px(plan)
         if not rig.frame_camera.spool or frame is None:
@@ -66,8 +66,8 @@ class DiskWatch:
         if needed + RESERVE > free:
             known = "by the plan" if self._ratio is None else "by the trials so far"
             raise CampaignStopped(
-                f"{self._order.store}: stopped before its disk is full: {size(free)} are free, "
-                f"the next trial needs {size(needed)} ({known}) and {size(RESERVE)} stay in "
+                f"{self._run_request.store}: stopped before its disk is full: {size(free)} are "
+                f"free, the next trial needs {size(needed)} ({known}) and {size(RESERVE)} stay in "
                 "reserve; make room, then run the same command to go on. Every committed trial "
                 "is kept"
             )

@@ -7,7 +7,7 @@ read from the outside camera's pictures by `sliplab label`.
 from __future__ import annotations
 
 from sliplab.flows.collecting.stops import CampaignStopped
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import Trial
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Campaign
@@ -22,9 +22,9 @@ def hold_rate(recording: Recording) -> float:
 class ReferenceWatch:
     """Holds every reference trial against the campaign's first one."""
 
-    def __init__(self, order: Order, campaign: Campaign) -> None:
-        self._order, self._campaign = order, campaign
-        self._gate = order.plan.protocol.collection.gates.reference
+    def __init__(self, run_request: RunRequest, campaign: Campaign) -> None:
+        self._run_request, self._campaign = run_request, campaign
+        self._gate = run_request.plan.protocol.collection.gates.reference
         self._first: tuple[str, float] | None = None
 
     def begin(self) -> None:
@@ -36,7 +36,7 @@ class ReferenceWatch:
         if self._gate is None:
             return
         there = self._campaign.committed()
-        known = [t for t in self._order.plan if t.role == "reference" and t.id in there]
+        known = [t for t in self._run_request.plan if t.role == "reference" and t.id in there]
         for trial in dict.fromkeys([*known[:1], *known[-1:]]):
             self.look(trial)
 
@@ -57,12 +57,13 @@ class ReferenceWatch:
         bound = float(self._gate.event_rate)
         if abs(drift) <= bound:
             return
-        simulated = "simulated " if self._order.rig.simulated else ""
+        simulated = "simulated " if self._run_request.rig.simulated else ""
         raise CampaignStopped(
             f"campaign {self._campaign.name}: {simulated}reference trials drifted apart: "
             f"{trial.id} has {rate:,.0f} events/s in the hold, {first} had {expected:,.0f} "
             f"({drift:+.1f} %, gates.reference.event_rate = {bound:g} %). Skin, light or lens "
-            f"changed: see to it, then `sliplab again {self._order.store} {trial.id} --why ...` "
-            f"and the same command go on (give {first} as well if the new state is the one to "
-            "compare with). Onsets were not compared: they are known after `sliplab label` only"
+            f"changed: see to it, then `sliplab again {self._run_request.store} {trial.id} "
+            f"--why ...` and the same command go on (give {first} as well if the new state is the "
+            "one to compare with). Onsets were not compared: they are known after `sliplab label` "
+            "only"
         )

@@ -1,4 +1,4 @@
-"""One stretch of work at a rig: takes trials one after the other and commits the good ones.
+"""One session at a rig: takes trials one after the other and commits the good ones.
 
 The session knows nothing of Prefect; `flows.collecting.collect` decides in what pieces it is
 driven. What is done is what the store holds, so a session can die at any instruction and the next
@@ -17,8 +17,8 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 
-from sliplab.flows.collecting.boundary import Boundary
 from sliplab.flows.collecting.quality import Assessment, assess
+from sliplab.flows.collecting.trial_gate import TrialGate
 from sliplab.flows.running import stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
@@ -40,7 +40,7 @@ class Session:
 
     Attributes:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
-        boundary: asked before each attempt and notified of each trial, if there is one.
+        gate: the trial gate, asked before each attempt and notified of each trial, if there is one.
     """
 
     plan: Plan
@@ -49,7 +49,7 @@ class Session:
     campaign: Campaign
     operator: str = ""
     on_trial: Callable[[Trial, str], None] = field(default=lambda trial, outcome: None)
-    boundary: Boundary | None = None
+    gate: TrialGate | None = None
     taken: int = 0
     retaken: int = 0
     _before: Trial | None = None
@@ -78,15 +78,15 @@ class Session:
         self._before, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
-        if self.boundary is None or self.boundary.may_take(trial):
+        if self.gate is None or self.gate.may_take(trial):
             return True
         self.on_trial(trial, "skipped")
         return False
 
     def _over(self, trial: Trial, outcome: str) -> None:
         self.on_trial(trial, outcome)
-        if self.boundary is not None:
-            self.boundary.after(trial, outcome)
+        if self.gate is not None:
+            self.gate.after(trial, outcome)
 
     def _prepare(self, trial: Trial) -> None:
         """What the protocol wants before this trial, given what this session did already."""

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 from uuid import UUID
 
-from sliplab.flows.planning.orders import Order, campaign_counts
+from sliplab.flows.planning.run_request import RunRequest, campaign_counts
 from sliplab.flows.running import orchestration, server_calls, stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_text
@@ -70,7 +70,7 @@ class Show:
 
 
 @contextmanager
-def shown(order: Order) -> Iterator[Show]:
+def shown(run_request: RunRequest) -> Iterator[Show]:
     """Show a collection on the page of the flow run round it while the block runs."""
     from prefect.context import FlowRunContext
 
@@ -78,7 +78,7 @@ def shown(order: Order) -> Iterator[Show]:
     if context is None or context.flow_run is None:
         yield Show()
         return
-    page = _Page(order, context.flow_run.id)
+    page = _Page(run_request, context.flow_run.id)
     try:
         yield page.show
     finally:
@@ -88,8 +88,8 @@ def shown(order: Order) -> Iterator[Show]:
 class _Page:
     """The thread that reports progress to the server."""
 
-    def __init__(self, order: Order, run: UUID) -> None:
-        self._order, self._run = order, run
+    def __init__(self, run_request: RunRequest, run: UUID) -> None:
+        self._run_request, self._run = run_request, run
         self._over = threading.Event()
         self._progress: Any = None
         self._misses = 0
@@ -150,7 +150,7 @@ class _Page:
     def _rig(self, client: Any, busy: bool) -> None:
         """The concurrency limit of the rig's name: a sign on its door, and not its lock."""
         if self._public:
-            sign_rig(client, self._order.rig.name, busy)
+            sign_rig(client, self._run_request.rig.name, busy)
 
     def _report_progress(self, client: Any) -> None:
         from prefect.client.schemas.actions import ArtifactUpdate
@@ -164,8 +164,8 @@ class _Page:
     def _report_table(self, client: Any) -> None:
         import json
 
-        campaign = Store(self._order.store).campaign(self._order.campaign)
-        rows = outcome_rows(campaign_counts(self._order, campaign), self.show.outcomes)
+        campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
+        rows = outcome_rows(campaign_counts(self._run_request, campaign), self.show.outcomes)
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
     def _report_figure(self, client: Any) -> None:
@@ -173,15 +173,15 @@ class _Page:
 
         numbers, rates = self._rates()
         if rates:
-            svg = event_rates(numbers, rates, simulated=self._order.rig.simulated)
+            svg = event_rates(numbers, rates, simulated=self._run_request.rig.simulated)
             data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
             self._make(client, "image", data, self._title("events a second of each trial"))
 
     def _rates(self) -> tuple[list[int], list[float]]:
         """Places in the plan from 1, and events a second, of trials evenly spread over it."""
-        campaign = Store(self._order.store).campaign(self._order.campaign)
+        campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
         there = campaign.committed()
-        wanted = [(n, t) for n, t in enumerate(self._order.plan, 1) if t.id in there]
+        wanted = [(n, t) for n, t in enumerate(self._run_request.plan, 1) if t.id in there]
         numbers, rates = [], []
         for number, trial in wanted[:: -(-len(wanted) // MOST_POINTS) or 1]:
             with suppress(StoreError):
@@ -191,15 +191,15 @@ class _Page:
         return numbers, rates
 
     def _title(self, what: str) -> str:
-        simulated = " (simulated)" if self._order.rig.simulated else ""
-        return f"{self._order.campaign}: {what}{simulated}"
+        simulated = " (simulated)" if self._run_request.rig.simulated else ""
+        return f"{self._run_request.campaign}: {what}{simulated}"
 
     def _make(self, client: Any, kind: str, data: Any, words: str) -> Any:
         from prefect.client.schemas.actions import ArtifactCreate
 
         return client.create_artifact(
             ArtifactCreate(
-                key=artifact_key(self._order.campaign, kind),
+                key=artifact_key(self._run_request.campaign, kind),
                 type=kind,
                 data=data,
                 description=words,

@@ -16,7 +16,7 @@ from sliplab.analysis.labels import labelling
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.label_errors import CHECK, rules_compared
-from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running.campaigns import collected
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
@@ -28,46 +28,46 @@ VERSION = 1
 TRIALS = 60
 
 
-def folder_of(order: Order) -> Path:
+def folder_of(run_request: RunRequest) -> Path:
     """The store with the video."""
-    return order.store / CHECK
+    return run_request.store / CHECK
 
 
-def video_order(order: Order, trials: int) -> Order:
+def video_request(run_request: RunRequest, trials: int) -> RunRequest:
     """The same collection at the level `video`, for the trials that are still missing.
 
     Args:
-        order: the study's own, of which something was collected.
+        run_request: the study's own, of which something was collected.
     """
-    folder = folder_of(order)
-    data = parse_yaml(mask_secrets(order.rig_text), "rig file")
-    data["name"] = f"{order.rig.name}-video"
+    folder = folder_of(run_request)
+    data = parse_yaml(mask_secrets(run_request.rig_text), "rig file")
+    data["name"] = f"{run_request.rig.name}-video"
     data.setdefault("mock", {}).setdefault("frame_camera", {})["level"] = "video"
     rig = folder.with_suffix(".yaml")
     write_text(rig, rig_yaml(data))
-    protocol = Store.open(order.store).campaign(order.campaign).protocol_file
-    wanted = make_order(protocol, rig, folder, campaign=order.campaign)
+    protocol = Store.open(run_request.store).campaign(run_request.campaign).protocol_file
+    wanted = make_request(protocol, rig, folder, campaign=run_request.campaign)
     there = 0
     if (folder / "store.json").exists():
-        there = len(Store.open(folder).campaign(order.campaign).committed())
+        there = len(Store.open(folder).campaign(run_request.campaign).committed())
     return replace(wanted, most=max(trials - there, 0))
 
 
-def wanted(order: Order) -> bool:
+def wanted(run_request: RunRequest) -> bool:
     """Whether there is anything to check: a simulated rig that draws no video."""
-    return order.rig.simulated and order.rig.frame_source == "tracks"
+    return run_request.rig.simulated and run_request.rig.frame_source == "tracks"
 
 
-def check_labels(order: Order, trials: int = TRIALS) -> dict[str, Any]:
+def check_labels(run_request: RunRequest, trials: int = TRIALS) -> dict[str, Any]:
     """Take, label and compare what is missing; the figures are kept in the study's store."""
-    video = video_order(order, trials)
+    video = video_request(run_request, trials)
     taken = collect(video)["taken"] if video.most else 0
-    store = Store.open(folder_of(order))
+    store = Store.open(folder_of(run_request))
     campaigns = collected(store, [video.campaign])
     label(store, campaigns)
     made_of = [recording.checksum for _, recording in campaigns[0].trials]
     key = make_key(CHECK, VERSION, [made_of, labelling.VERSION], None)
-    kept = Derived.of(Store.open(order.store), CHECK)
+    kept = Derived.of(Store.open(run_request.store), CHECK)
     stale = not kept.fresh(CHECK, key)
     if stale:
         figures = rules_compared(store, campaigns)

@@ -11,7 +11,7 @@ from sliplab.rigs.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.storage.lock import Locked
 
 if TYPE_CHECKING:
-    from sliplab.flows.planning.orders import Order
+    from sliplab.flows.planning.run_request import RunRequest
     from sliplab.rigs.rig import Rig
 
 LISTEN_S = 3.0
@@ -27,28 +27,28 @@ class Check:
     finding: str
 
 
-def check_devices(order: Order) -> list[Check]:
+def check_devices(run_request: RunRequest) -> list[Check]:
     """Connect every device, read its state, and fit the clocks; nothing moves."""
     from sliplab.rigs.rig_lock import held
 
     try:
-        with held(order.rig, order.store):
-            return _check_held(order)
+        with held(run_request.rig, run_request.store):
+            return _check_held(run_request)
     except Locked as error:
         return [Check("rig", False, str(error))]
     except RigError as error:
         return [Check(error.device, False, _message(error))]
 
 
-def _check_held(order: Order) -> list[Check]:
+def _check_held(run_request: RunRequest) -> list[Check]:
     """As `check_devices`, of a rig that nobody else uses meanwhile."""
     from sliplab.rigs.build import build_rig
 
-    found = _check_reach(order)
+    found = _check_reach(run_request)
     if not all(item.passed for item in found):
         return found
     try:
-        rig = build_rig(order.rig)
+        rig = build_rig(run_request.rig)
     except RigError as error:
         return [Check(error.device, False, _message(error))]
     try:
@@ -58,7 +58,7 @@ def _check_held(order: Order) -> list[Check]:
             raise ArmFault("arm", f"is in {state.value}: {state.advice}")
         found.append(Check("arm", True, state.value))
         found += [Check(device.device, True, _said(device)) for device in rig.health()]
-        found += _check_clocks(order, rig)
+        found += _check_clocks(run_request, rig)
     except RigError as error:
         found.append(Check(error.device, False, _message(error)))
     finally:
@@ -71,24 +71,26 @@ def _check_held(order: Order) -> list[Check]:
     return found
 
 
-def _check_reach(order: Order) -> list[Check]:
+def _check_reach(run_request: RunRequest) -> list[Check]:
     """Devices of a real rig that cannot be reached at all, each by name."""
-    if order.rig.simulated or order.rig.devices is None:
+    if run_request.rig.simulated or run_request.rig.devices is None:
         return []
     from sliplab.rigs.reach import reach
 
     return [
-        Check(name, False, why) for name, why in reach(order.rig.devices).items() if why is not None
+        Check(name, False, why)
+        for name, why in reach(run_request.rig.devices).items()
+        if why is not None
     ]
 
 
-def _check_clocks(order: Order, rig: Rig) -> list[Check]:
+def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's would be."""
     from sliplab.analysis.timeline.synchronise import streams_of, synchronise
     from sliplab.storage.hdf5 import StreamReader
     from sliplab.storage.writer import DATA, TrialWriter
 
-    rate = order.plan.protocol.collection.recording.sync_rate
+    rate = run_request.plan.protocol.collection.recording.sync_rate
     with TemporaryDirectory() as folder:
         aside = Path(folder) / "check"
         writer = TrialWriter(aside, aside.with_name("none"), None, rate)

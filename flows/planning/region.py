@@ -9,23 +9,23 @@ from sliplab.flows.planning.device_checks import Check
 from sliplab.protocols.program import Move
 
 if TYPE_CHECKING:
-    from sliplab.flows.planning.orders import Order
+    from sliplab.flows.planning.run_request import RunRequest
 
 
-def check_region(order: Order) -> list[Check]:
+def check_region(run_request: RunRequest) -> list[Check]:
     """Markers that leave the recorded region somewhere on their way, none if it has no video.
 
     The centre marker must stay in it, since gross slip is read from it. Outer ones that leave are
     only told of: they are not measured while they are cut by the edge.
     """
-    size_px = order.rig.frame_px(order.plan)
+    size_px = run_request.rig.frame_px(run_request.plan)
     if size_px is None:
         return []
-    scale = order.rig.frame_camera.scale_px_per_mm
+    scale = run_request.rig.frame_camera.scale_px_per_mm
     half = [side / scale / 2 for side in size_px]
-    radius = float(order.rig.skin.radius)
-    reach = _reach(order)
-    skin = max(math.hypot(x, y) for x, y in order.rig.skin.layout_mm())
+    radius = float(run_request.rig.skin.radius)
+    reach = _reach(run_request)
+    skin = max(math.hypot(x, y) for x, y in run_request.rig.skin.layout_mm())
     spare = min(limit - way - radius for limit, way in zip(half, reach, strict=True))
     if spare < 0:
         text = (
@@ -40,11 +40,11 @@ def check_region(order: Order) -> list[Check]:
     return [Check("region", True, text)]
 
 
-def _reach(order: Order) -> tuple[float, float]:
+def _reach(run_request: RunRequest) -> tuple[float, float]:
     """How far from the middle recorded motion takes the sensor, mm, right and up."""
     x = y = 0.0
-    for trial in order.plan:
-        for step in order.plan.program(trial).steps:
+    for trial in run_request.plan:
+        for step in run_request.plan.program(trial).steps:
             if isinstance(step, Move) and step.recorded:
                 x, y = max(x, abs(step.to.x_mm)), max(y, abs(step.to.y_mm))
     return x, y

@@ -35,7 +35,7 @@ from sliplab.flows.learning.samples import (
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
-from sliplab.flows.searching.other_rig import other_order
+from sliplab.flows.searching.other_rig import other_request
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.quantity import level_order
@@ -197,7 +197,7 @@ class Generalisation:
         missing = trials - len(store.campaign(item.name).committed())
         if missing > 0:
             change = {"mock": {"scene": {"skin": {"seed": seed}}}}
-            collect(other_order(item, change, folder, most=missing))
+            collect(other_request(item, change, folder, most=missing))
         campaigns = collected(store)
         label(store, campaigns)
         samples, place, _ = all_samples(store, campaigns)

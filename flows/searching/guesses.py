@@ -28,11 +28,11 @@ from sliplab.flows.learning.evaluate import choose_model
 from sliplab.flows.learning.samples import several
 from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.flows.searching.guess_changes import AS_IT_IS, NAMES, figures
-from sliplab.flows.searching.other_rig import judge, other_order
+from sliplab.flows.searching.other_rig import judge, other_request
 from sliplab.flows.searching.scene_runs import sample_trials
 from sliplab.flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested, value_of
 from sliplab.protocols.errors import InputError
@@ -139,10 +139,10 @@ class Guesses:
         key = self._key(setting)
         folder = self.folder / key[:12]
         store = Store.create(folder / "store")
-        orders = [self._order(item, setting, folder) for item in self.campaigns]
-        for order in orders:
-            collect(order)
-        campaigns = collected(store, [order.campaign for order in orders])
+        run_requests = [self._run_request(item, setting, folder) for item in self.campaigns]
+        for run_request in run_requests:
+            collect(run_request)
+        campaigns = collected(store, [run_request.campaign for run_request in run_requests])
         label(store, campaigns)
         found = self._judge(store, campaigns)
         value = None
@@ -172,7 +172,7 @@ class Guesses:
         inputs += several(self.campaigns)
         return make_key(STEP, VERSION, inputs, [setting.parameter, setting.factor])
 
-    def _order(self, item: Collected, setting: Setting, folder: Path) -> Order:
+    def _run_request(self, item: Collected, setting: Setting, folder: Path) -> RunRequest:
         """The chosen trials of a campaign on the changed rig."""
         change: Json = {}
         if setting.parameter is not None:
@@ -180,8 +180,8 @@ class Guesses:
             if setting.parameter.endswith("poisson_ratio"):
                 new = min(new, LARGEST_POISSON)
             change = {"mock": nested(setting.parameter, new)}
-        order = other_order(item, change, folder)
-        return replace(order, only=frozenset(self.trials[item.name]))
+        run_request = other_request(item, change, folder)
+        return replace(run_request, only=frozenset(self.trials[item.name]))
 
     def _judge(self, store: Store, campaigns: list[Collected]) -> Json:
         """Windows and trials at one setting, by the study's network and settings."""

@@ -23,10 +23,10 @@ from sliplab.flows.learning.evaluate import choose_model, evaluation_of
 from sliplab.flows.learning.samples import several
 from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
-from sliplab.flows.searching.other_rig import judge, other_order
+from sliplab.flows.searching.other_rig import judge, other_request
 from sliplab.flows.searching.scene_runs import sample_trials
 from sliplab.protocols.settings import Detection
 from sliplab.storage.derived import make_key
@@ -86,11 +86,11 @@ class Holdout:
             return None
         return found
 
-    def order(self) -> Order:
+    def run_request(self) -> RunRequest:
         """The study's protocol and rig with another seed and skin, all trials for the test."""
         trials, skin = self.seeds
         split = {"method": "ranked", "train": 0.0, "validation": 0.0, "test": 1.0}
-        order = other_order(
+        run_request = other_request(
             self.item,
             {"mock": {"scene": {"skin": {"seed": skin}}}},
             self.store.folder / STEP,
@@ -99,18 +99,18 @@ class Holdout:
                 "analysis": {"split": split},
             },
         )
-        chosen = sample_trials(order.plan, self.trials)
-        return replace(order, only=frozenset(trial.id for trial in chosen))
+        chosen = sample_trials(run_request.plan, self.trials)
+        return replace(run_request, only=frozenset(trial.id for trial in chosen))
 
     def measure(self) -> Json:
         """Take what is missing of the trials, label and judge them; keep figures and ledger."""
-        order = self.order()
-        collect(order)
-        store = Store.open(order.store)
-        campaigns = collected(store, [order.campaign])
+        run_request = self.run_request()
+        collect(run_request)
+        store = Store.open(run_request.store)
+        campaigns = collected(store, [run_request.campaign])
         label(store, campaigns)
         fitted = model_file.load(self.model.path)
-        judged = judge(fitted, {order.campaign: self.detection}, store, campaigns)
+        judged = judge(fitted, {run_request.campaign: self.detection}, store, campaigns)
         rows = [row for row, _ in judged.trials]
         windows = metrics.score(judged.counts, judged.samples.y, self.detection.margin)
         before = self.kept()

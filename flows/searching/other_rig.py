@@ -15,7 +15,7 @@ from sliplab.analysis.nets.samples import strided_windows
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.trial_scores import score_row
-from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
@@ -25,14 +25,14 @@ from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store
 
 
-def other_order(
+def other_request(
     item: Collected,
     change: Mapping[str, Any],
     folder: Path,
     most: int | None = None,
     protocol: Mapping[str, Any] | None = None,
-) -> Order:
-    """An order for the same protocol, into ``folder/store``.
+) -> RunRequest:
+    """A run request for the same protocol, into ``folder/store``.
 
     Args:
         change: values by key, as deep as they stand in a rig file.
@@ -48,7 +48,7 @@ def other_order(
         file = folder / f"{item.name}.protocol.yaml"
         _changed(item.campaign.protocol_file, "protocol", protocol, file)
     enabled: Any = item.info.get("enabled", ())
-    return make_order(
+    return make_request(
         file, rig, folder / "store", enable=tuple(enabled), campaign=item.name, most=most
     )
 

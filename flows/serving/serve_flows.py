@@ -12,7 +12,7 @@ from typing import Any
 from prefect import flow
 
 from sliplab.flows.collecting import controlling
-from sliplab.flows.planning.orders import Bench, Order, check_disk, make_order
+from sliplab.flows.planning.run_request import RunRequest, SessionMetadata, check_disk, make_request
 from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, Evaluate, OnRig, Step, Study
 from sliplab.flows.serving.serve_runs import HOOKS, run_of, until_of, when_free
 from sliplab.flows.serving.service import Service
@@ -92,20 +92,29 @@ CONTROL = (pause, resume, stop)
 """At any time."""
 
 
-def _order(here: Service, wanted: OnRig, protocol: Path, run: Any, **options: Any) -> Order:
-    bench = Bench(wanted.operator, wanted.temperature_c, wanted.humidity_percent, wanted.note)
-    order = make_order(
-        protocol, Path(here.rig), here.folder, bench=bench, until=until_of(wanted, run), **options
+def _run_request(
+    here: Service, wanted: OnRig, protocol: Path, run: Any, **options: Any
+) -> RunRequest:
+    metadata = SessionMetadata(
+        wanted.operator, wanted.temperature_c, wanted.humidity_percent, wanted.note
     )
-    check_disk([order])
-    return order
+    run_request = make_request(
+        protocol,
+        Path(here.rig),
+        here.folder,
+        metadata=metadata,
+        until=until_of(wanted, run),
+        **options,
+    )
+    check_disk([run_request])
+    return run_request
 
 
-def _take(wanted: OnRig, order: Order, run: Any) -> str:
+def _take(wanted: OnRig, run_request: RunRequest, run: Any) -> str:
     from sliplab.flows.collecting.collect import collect as take
 
-    done = when_free(order, wanted.patience_min * 60, partial(take, order), run)
-    simulated = "simulated " if order.rig.simulated else ""
+    done = when_free(run_request, wanted.patience_min * 60, partial(take, run_request), run)
+    simulated = "simulated " if run_request.rig.simulated else ""
     return (
         f"{done['taken']} {simulated}trials taken, {done['committed']} of {done['planned']} "
         f"committed, {done['missing']} missing, {len(done['set_aside'])} set aside"
@@ -113,11 +122,11 @@ def _take(wanted: OnRig, order: Order, run: Any) -> str:
 
 
 def _collect(wanted: Collect, here: Service, run: Any) -> str:
-    order = _order(
+    run_request = _run_request(
         here, wanted, here.protocol(wanted.protocol), run,
         most=wanted.trials, campaign=wanted.campaign, enable=tuple(wanted.enable),
     )  # fmt: skip
-    return _take(wanted, order, run)
+    return _take(wanted, run_request, run)
 
 
 def _chain(wanted: Chain, here: Service, run: Any) -> str:
@@ -135,16 +144,16 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
     from sliplab.flows.study import study as whole
 
     files = study_protocols(wanted.pilot, wanted.extra)
-    orders = [_order(here, wanted, file, run, enable=on) for file, on in files.items()]
-    check_disk(orders)
+    run_requests = [_run_request(here, wanted, file, run, enable=on) for file, on in files.items()]
+    check_disk(run_requests)
     done: dict[str, Any] = {}
 
     def work() -> dict[str, Any]:
-        outcome = whole(orders, LABELS_CHECKED)
+        outcome = whole(run_requests, LABELS_CHECKED)
         done.update({step["step"]: step["done"] for step in outcome.steps})
         return {"taken": sum(item["taken"] for item in outcome.collected)}
 
-    taken = when_free(orders[0], wanted.patience_min * 60, work, run)["taken"]
+    taken = when_free(run_requests[0], wanted.patience_min * 60, work, run)["taken"]
     return f"{taken} trials taken; " + ", ".join(f"{name}: {n} done" for name, n in done.items())
 
 

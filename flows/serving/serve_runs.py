@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console, run_records, server_calls, stopping
 from sliplab.flows.running.embedded_server import die_with
 from sliplab.flows.serving.serve_parameters import OnRig
@@ -111,7 +111,7 @@ def until_of(wanted: OnRig, run: Any) -> float | None:
 
 
 def when_free(
-    order: Order, patience_s: float, work: Callable[[], dict[str, Any]], run: Any
+    run_request: RunRequest, patience_s: float, work: Callable[[], dict[str, Any]], run: Any
 ) -> dict[str, Any]:
     """Do `work` as soon as no other program holds the store or the rig.
 
@@ -124,9 +124,9 @@ def when_free(
         try:
             return work()
         except Locked as busy:
-            if order.until is None and waited >= patience_s:
+            if run_request.until is None and waited >= patience_s:
                 raise
-            if order.until is not None and datetime.now().timestamp() >= order.until:
+            if run_request.until is not None and datetime.now().timestamp() >= run_request.until:
                 raise WindowOver(f"the window is over and nothing was taken: {busy}") from None
             if not waited:
                 _report_waiting(run, str(busy))

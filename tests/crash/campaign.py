@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from sliplab.flows.collecting.stretch import stretch
-from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.collecting.run_session import run_session
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.storage.files import read_json
 from sliplab.storage.store import Store
 from sliplab.storage.verify import UNFINISHED, verify
@@ -42,17 +42,17 @@ def protocol(trials: int, video: bool = False) -> dict[str, Any]:
     return data
 
 
-def order(folder: Path, trials: int, video: bool = False) -> Order:
+def run_request(folder: Path, trials: int, video: bool = False) -> RunRequest:
     """Protocol and rig file in `folder`, and a store beside them that may not exist yet."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "protocol.yaml").write_text(yaml.safe_dump(protocol(trials, video)))
     rig = ROOT / "rigs" / ("mock.yaml" if video else "rehearsal.yaml")
-    return make_order(folder / "protocol.yaml", rig, folder / "store")
+    return make_request(folder / "protocol.yaml", rig, folder / "store")
 
 
-def collect(wanted: Order) -> None:
+def collect(wanted: RunRequest) -> None:
     """Take what the store lacks, as `sliplab collect` does below Prefect."""
-    with stretch(wanted) as work:
+    with run_session(wanted) as work:
         work.session.rig.connect()
         work.session.take(work.trials)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.flows.__main__ import _explain
-from sliplab.flows.planning.orders import Order
-from tests.crash.campaign import collect, hashes, order, wrong, wrong_at_the_end
+from sliplab.flows.planning.run_request import RunRequest
+from tests.crash.campaign import collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.hooks import Policy
 from tests.crash.policies import Full, ReadOnly
 from tests.crash.process import End, live
@@ -18,7 +18,7 @@ from tests.crash.process import End, live
 STEP = 64 * 1024
 
 
-def last_end(wanted: Order, policy: Policy) -> End:
+def last_end(wanted: RunRequest, policy: Policy) -> End:
     """Collect as the command line does, with its exit code and its message."""
 
     def work() -> None:
@@ -60,21 +60,21 @@ def fill(
         step: bytes from one boundary to the next.
         more: how often besides, at random bytes.
     """
-    calm = order(folder / "calm", 1, video)
+    calm = run_request(folder / "calm", 1, video)
     collect(calm)
     whole, needed = hashes(calm.store), size(calm.store)
     found, tried = [], rooms(needed, step, more, seed)
     for room in tried:
         place = folder / "full"
         shutil.rmtree(place, ignore_errors=True)
-        wanted = order(place, 1, video)
+        wanted = run_request(place, 1, video)
         end = last_end(wanted, Full(room))
         said = wrong_message(end, "its disk is full") + wrong(wanted.store, whole)
         found += [f"room for {room} bytes: {text}" for text in said + _goes_on(wanted, whole)]
     return {"bytes": needed, "step": step, "tried": len(tried), "wrong": found}
 
 
-def _goes_on(wanted: Order, whole: dict[str, dict[str, str]]) -> list[str]:
+def _goes_on(wanted: RunRequest, whole: dict[str, dict[str, str]]) -> list[str]:
     try:
         collect(wanted)
         return wrong_at_the_end(wanted.store, whole, also="OSError: ")
@@ -84,10 +84,10 @@ def _goes_on(wanted: Order, whole: dict[str, dict[str, str]]) -> list[str]:
 
 def read_only(folder: Path) -> dict[str, Any]:
     """Collect into a read-only store that lacks a trial, and into a folder that is read-only."""
-    begun = order(folder / "some", 1)
+    begun = run_request(folder / "some", 1)
     collect(begun)
     whole = hashes(begun.store)
-    more, none = order(folder / "some", 2), order(folder / "none", 1)
+    more, none = run_request(folder / "some", 2), run_request(folder / "none", 1)
     found = []
     for wanted in (more, none):
         end = last_end(wanted, ReadOnly())

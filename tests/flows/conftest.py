@@ -18,7 +18,7 @@ _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
 from sliplab.flows.collecting.collect import collect  # noqa: E402
-from sliplab.flows.planning.orders import Order, make_order  # noqa: E402
+from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
 from sliplab.flows.running.orchestration import prepare  # noqa: E402
 from sliplab.flows.study import Outcome, study  # noqa: E402
 
@@ -50,7 +50,7 @@ def six_trials(folder: Path, rig: Path) -> Path:
     """A store with the six slides, shortened, and nothing derived from them."""
     data = tiny()
     data["collection"]["motion"][3]["distance"] = "5 mm"
-    collect(make_order(write(folder / "tiny.yaml", data), rig, folder / "store"))
+    collect(make_request(write(folder / "tiny.yaml", data), rig, folder / "store"))
     return folder / "store"
 
 
@@ -77,12 +77,14 @@ def rig_path() -> Path:
 
 
 @pytest.fixture(scope="session")
-def ran(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> tuple[list[Order], Outcome]:
+def ran(
+    tmp_path_factory: pytest.TempPathFactory, rig_path: Path
+) -> tuple[list[RunRequest], Outcome]:
     """Both small campaigns, run once through every step; who changes the store puts it back."""
     folder = tmp_path_factory.mktemp("study")
     protocols = [
         write(folder / "tiny.yaml", tiny()),
         write(folder / "tiny_gravity.yaml", tiny_gravity()),
     ]
-    orders = [make_order(protocol, rig_path, folder / "store") for protocol in protocols]
-    return orders, study(orders)
+    run_requests = [make_request(protocol, rig_path, folder / "store") for protocol in protocols]
+    return run_requests, study(run_requests)

@@ -12,7 +12,12 @@ from typing import Any
 import yaml
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import Order, describe_campaign, make_order, pending_trials
+from sliplab.flows.planning.run_request import (
+    RunRequest,
+    describe_campaign,
+    make_request,
+    pending_trials,
+)
 from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.wire.loopback import Loopback
@@ -61,10 +66,10 @@ def rig_yaml(folder: Path) -> Path:
     return write(folder / "rig.yaml", data)
 
 
-def order_in(folder: Path, data: dict[str, Any], rig: Path) -> Order:
-    """What a person orders: this protocol on that rig, into a store of the folder's own."""
+def request_in(folder: Path, data: dict[str, Any], rig: Path) -> RunRequest:
+    """Request a run: this protocol on that rig, into a store of the folder's own."""
     folder.mkdir(exist_ok=True)
-    return make_order(write(folder / "p.yaml", data), rig, folder / "store")
+    return make_request(write(folder / "p.yaml", data), rig, folder / "store")
 
 
 @contextmanager
@@ -80,14 +85,14 @@ def stage_of(file: RigFile) -> Iterator[Loopback]:
 
 @contextmanager
 def at_work(
-    order: Order, stage: Loopback, file: RigFile | None = None
+    run_request: RunRequest, stage: Loopback, file: RigFile | None = None
 ) -> Iterator[tuple[Session, Campaign]]:
     """One session, as the same command begins and ends it: drivers are built anew each time."""
-    campaign = describe_campaign(Store.create(order.store), order)
-    rig = loopback_rig(file or order.rig, stage)
+    campaign = describe_campaign(Store.create(run_request.store), run_request)
+    rig = loopback_rig(file or run_request.rig, stage)
     try:
         rig.connect()
-        yield Session(order.plan, file or order.rig, rig, campaign), campaign
+        yield Session(run_request.plan, file or run_request.rig, rig, campaign), campaign
     finally:
         rig.close()
 

@@ -24,7 +24,7 @@ from sliplab.flows.learning import window_baselines, window_checks
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.samples import by_id, load_samples, split_trials
 from sliplab.flows.learning.train import train
-from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.running import trial_work
 from sliplab.flows.running.campaigns import collected, training_campaigns
@@ -38,12 +38,12 @@ from tests.flows.conftest import tiny, tiny_gravity, write
 pytestmark = pytest.mark.programs
 
 
-def store_of(ran: tuple[list[Order], Outcome]) -> Store:
+def store_of(ran: tuple[list[RunRequest], Outcome]) -> Store:
     """The study's store."""
     return Store.open(ran[0][0].store)
 
 
-def test_every_step_did_its_work(ran: tuple[list[Order], Outcome]) -> None:
+def test_every_step_did_its_work(ran: tuple[list[RunRequest], Outcome]) -> None:
     _, outcome = ran
     assert [item["committed"] for item in outcome.collected] == [6, 2]
     assert [(step["step"], step["done"]) for step in outcome.steps] == [
@@ -51,7 +51,7 @@ def test_every_step_did_its_work(ran: tuple[list[Order], Outcome]) -> None:
     ]  # fmt: skip
 
 
-def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[Order], Outcome]) -> None:
+def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Outcome]) -> None:
     errors = read_summary(store_of(ran))["labels"]["error_ms"]
     for kind in ("incipient", "gross"):
         assert errors[kind]["n"] >= 7
@@ -59,26 +59,26 @@ def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[Order], Outcome]
 
 
 def test_labels_of_tracks_are_checked_with_video(
-    ran: tuple[list[Order], Outcome], tmp_path: Path
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path
 ) -> None:
-    order = replace(ran[0][0], store=tmp_path / "store")
-    shutil.copytree(store_of(ran).folder, order.store)
-    assert wanted(order)
-    assert check_labels(order, 2)["done"] == 2
-    found = read_check(Store.open(order.store))
+    run_request = replace(ran[0][0], store=tmp_path / "store")
+    shutil.copytree(store_of(ran).folder, run_request.store)
+    assert wanted(run_request)
+    assert check_labels(run_request, 2)["done"] == 2
+    found = read_check(Store.open(run_request.store))
     assert found is not None
     assert (found["trials"], found["simulated"]) == (2, True)
     assert found["rules_ms"]["paper"]["incipient"]["n"] == 2
     assert (
         found["rules_ms"]["paper"]["incipient"]["max_abs"] < 25.0
     )  # the true onset to within 2.5 frames
-    (first, second) = Store.open(folder_of(order)).campaign(order.campaign).committed()
-    assert {first, second} <= {trial.id for trial in order.plan}
-    assert check_labels(order, 2)["done"] == 0
-    assert check_labels(order, 3)["done"] == 1
+    (first, second) = Store.open(folder_of(run_request)).campaign(run_request.campaign).committed()
+    assert {first, second} <= {trial.id for trial in run_request.plan}
+    assert check_labels(run_request, 2)["done"] == 0
+    assert check_labels(run_request, 3)["done"] == 1
 
 
-def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Outcome]) -> None:
+def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
     summary = read_summary(store_of(ran))
     assert summary["simulated"] is True
     kinematic = summary["kinematic"]
@@ -112,7 +112,7 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[Order], Out
     assert summary["seeds"]["network"] == [0]
 
 
-def test_plan_and_collection_agree(ran: tuple[list[Order], Outcome]) -> None:
+def test_plan_and_collection_agree(ran: tuple[list[RunRequest], Outcome]) -> None:
     for known in read_summary(store_of(ran))["planned"].values():
         assert known["seconds_collected"] == pytest.approx(known["seconds"], rel=0.1)
         # without a video these are events, and the plan reckons with the mean of all conditions;
@@ -120,7 +120,7 @@ def test_plan_and_collection_agree(ran: tuple[list[Order], Outcome]) -> None:
         assert 0.5 < known["bytes_collected"] / known["bytes"] < 2.0
 
 
-def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outcome]) -> None:
+def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
     text = (store_of(ran).folder / "report" / "index.html").read_text()
     assert "Every number and picture here is simulated" in text
     assert text.count("simulated tracks of the markers (no video was drawn)") >= 3
@@ -136,22 +136,25 @@ def test_the_report_is_one_page_that_says_simulated(ran: tuple[list[Order], Outc
         assert all("xmlns" in line or "DTD" in line or "purl.org" in line for line in found)
 
 
-def test_nothing_changed_is_nothing_to_do(ran: tuple[list[Order], Outcome]) -> None:
+def test_nothing_changed_is_nothing_to_do(ran: tuple[list[RunRequest], Outcome]) -> None:
     again = study(ran[0])
     assert [item["taken"] for item in again.collected] == [0, 0]
     assert [step["done"] for step in again.steps] == [0, 0, 0, 0, 0]
 
 
 def test_another_margin_is_evaluation_and_report_only(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
 ) -> None:
     store = store_of(ran)
     counts = Derived.of(store, "counts", "tiny").folder
     before = {path: path.stat().st_mtime_ns for path in counts.iterdir()}
     data: dict[str, Any] = tiny()
     data["analysis"]["detection"]["margin"] = 3.0
-    orders = [make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder), ran[0][1]]
-    outcome = study(orders)
+    run_requests = [
+        make_request(write(tmp_path / "p.yaml", data), rig_path, store.folder),
+        ran[0][1],
+    ]
+    outcome = study(run_requests)
     done = [(step["step"], step["done"]) for step in outcome.steps]
     assert done == [
         ("sync", 0), ("label", 0), ("train", 0), ("evaluate", 1), ("report", 1),
@@ -161,7 +164,7 @@ def test_another_margin_is_evaluation_and_report_only(
     study(ran[0])  # back to what the other tests know
 
 
-def test_windows_are_looked_at_from_every_side(ran: tuple[list[Order], Outcome]) -> None:
+def test_windows_are_looked_at_from_every_side(ran: tuple[list[RunRequest], Outcome]) -> None:
     summary = read_summary(store_of(ran))
     kinematic = summary["kinematic"]
     n = kinematic["accuracy"]["n"]
@@ -194,7 +197,7 @@ def test_windows_are_looked_at_from_every_side(ran: tuple[list[Order], Outcome])
 
 
 def test_no_window_of_a_test_trial_is_near_a_training_window(
-    ran: tuple[list[Order], Outcome],
+    ran: tuple[list[RunRequest], Outcome],
 ) -> None:
     """Neighbours on a time line are alike: parts must have no trial, so no time line, in common."""
     store = store_of(ran)
@@ -215,7 +218,7 @@ def test_no_window_of_a_test_trial_is_near_a_training_window(
 
 
 def test_other_methods_are_kept_and_the_report_tells_of_them(
-    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
     campaigns = collected(store)
@@ -237,7 +240,7 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
 
 
 def test_a_device_that_is_not_there_is_a_wrong_input(
-    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
     monkeypatch.setattr("sliplab.flows.learning.train.Model.fresh", False)
@@ -250,7 +253,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
 
 
 def test_a_check_that_fails_ends_the_command(
-    ran: tuple[list[Order], Outcome], monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
     campaigns = collected(store)
@@ -263,7 +266,7 @@ def test_a_check_that_fails_ends_the_command(
         window_checks.window_checks(store, campaigns)
 
 
-def test_detectors_are_compared_at_equal_rates(ran: tuple[list[Order], Outcome]) -> None:
+def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outcome]) -> None:
     store = store_of(ran)
     summary = read_summary(store)
     compared = summary["detectors"]
@@ -282,7 +285,7 @@ def test_detectors_are_compared_at_equal_rates(ran: tuple[list[Order], Outcome])
 
 
 def test_smoothing_can_be_chosen_and_windows_can_overlap(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path
 ) -> None:
     store = store_of(ran)
     kept = {path: path.stat().st_mtime_ns for path in (store.folder / "derived").glob("heard*/*/*")}
@@ -292,11 +295,11 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
     )
     gravity = tiny_gravity()
     gravity["analysis"].setdefault("detection", {})["choose"] = "test"
-    orders = [
-        make_order(write(tmp_path / "p.yaml", data), rig_path, store.folder),
-        make_order(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
+    run_requests = [
+        make_request(write(tmp_path / "p.yaml", data), rig_path, store.folder),
+        make_request(write(tmp_path / "g.yaml", gravity), rig_path, store.folder),
     ]
-    assert [(s["step"], s["done"]) for s in study(orders).steps][2:] == [
+    assert [(s["step"], s["done"]) for s in study(run_requests).steps][2:] == [
         ("train", 0), ("evaluate", 1), ("report", 1),
     ]  # fmt: skip
     # kept predictions are not made again
@@ -322,7 +325,7 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
     study(ran[0])  # back to what the other tests know
 
 
-def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> None:
+def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -> None:
     store = store_of(ran)
     campaigns = collected(store)
     assert evaluate(store, campaigns, margin=4.0)["done"] == 1
@@ -333,12 +336,15 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[Order], Outcome]) -> Non
 
 
 def test_the_same_seed_gives_the_same_summary(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, rig_path: Path,
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(trial_work, "START_S", 0.0)  # all in processes, and still the same
-    orders = [make_order(Path(order.plan.file), rig_path, tmp_path / "store") for order in ran[0]]
-    study(orders)
+    run_requests = [
+        make_request(Path(run_request.plan.file), rig_path, tmp_path / "store")
+        for run_request in ran[0]
+    ]
+    study(run_requests)
     first, second = (read_summary(Store.open(folder)) for folder in (
         store_of(ran).folder, tmp_path / "store"
     ))  # fmt: skip
@@ -347,7 +353,9 @@ def test_the_same_seed_gives_the_same_summary(
     assert json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
 
 
-def test_a_collection_that_is_complete_returns_at_once(ran: tuple[list[Order], Outcome]) -> None:
+def test_a_collection_that_is_complete_returns_at_once(
+    ran: tuple[list[RunRequest], Outcome],
+) -> None:
     result = collect(ran[0][0])
     assert (result["taken"], result["committed"], result["missing"]) == (0, 6, 0)
 
@@ -357,7 +365,7 @@ class _Killed(Exception):
 
 
 def test_a_training_that_was_killed_goes_on_to_the_same_model(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = (store_of(ran).folder / "models" / "seed0.pt").read_bytes()
     shutil.copytree(store_of(ran).folder, tmp_path / "store")
@@ -396,7 +404,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
 
 
 def test_the_model_goes_out_as_what_it_is(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
     from sliplab.analysis.nets import onnx_file

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.flows import study_searches
 from sliplab.flows.learning import window_baselines
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.searching.detector_tradeoff_data import Ask
 from sliplab.flows.searching.detector_tradeoff_grid import Axes
@@ -26,13 +26,13 @@ pytestmark = pytest.mark.programs
 NAMES = ["baselines", "generalisation", "guesses", "scene search", "detector search"]
 
 
-def test_what_a_study_can_have(ran: tuple[list[Order], Outcome]) -> None:
+def test_what_a_study_can_have(ran: tuple[list[RunRequest], Outcome]) -> None:
     slides, falls = ran[0]
     assert [each.name for each in searches([slides, falls])] == NAMES
     assert [each.name for each in searches([falls])] == ["guesses"]
     real = slides.rig.model_copy(update={"driver": "devices"})
     assert not real.simulated
-    slides, falls = (replace(order, rig=real) for order in (slides, falls))
+    slides, falls = (replace(run_request, rig=real) for run_request in (slides, falls))
     assert [each.name for each in searches([slides, falls])] == [
         "baselines", "generalisation", "detector search",
     ]  # fmt: skip
@@ -41,19 +41,19 @@ def test_what_a_study_can_have(ran: tuple[list[Order], Outcome]) -> None:
 
 
 def test_they_stand_before_the_report_with_their_own_time(
-    ran: tuple[list[Order], Outcome],
+    ran: tuple[list[RunRequest], Outcome],
 ) -> None:
-    orders, _ = ran
-    plain, more = expected(orders, 0), expected(orders, 0, searches(orders))
+    run_requests, _ = ran
+    plain, more = expected(run_requests, 0), expected(run_requests, 0, searches(run_requests))
     assert list(more)[-7:] == ["evaluate", *NAMES, "report"]
     assert sum(more.values()) - sum(plain.values()) > 3600
 
 
 def test_each_is_done_once_and_reported(
-    ran: tuple[list[Order], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(ran[0][0].store, tmp_path / "store")
-    orders = [replace(order, store=tmp_path / "store") for order in ran[0]]
+    run_requests = [replace(run_request, store=tmp_path / "store") for run_request in ran[0]]
     monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1})
     few = partial(measure_generalisation, factors=("direction",), skins=1, trials=3, epochs=1)
     monkeypatch.setattr(study_searches, "measure_generalisation", few)
@@ -64,7 +64,7 @@ def test_each_is_done_once_and_reported(
     axes = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(1.0,))
     monkeypatch.setattr(study_searches, "AXES", axes)
 
-    outcome = study(orders, more=searches(orders))
+    outcome = study(run_requests, more=searches(run_requests))
     done = {step["step"]: step["done"] for step in outcome.steps}
     assert done == {
         "sync": 0, "label": 0, "train": 0, "evaluate": 0, "baselines": 1,
@@ -72,17 +72,20 @@ def test_each_is_done_once_and_reported(
         "report": 1,
     }  # fmt: skip
     assert {"generalisation", "guesses", "scene", "detector"} <= set(
-        extras(Store.open(orders[0].store))
+        extras(Store.open(run_requests[0].store))
     )
-    page = (orders[0].store / "report" / "index.html").read_text()
+    page = (run_requests[0].store / "report" / "index.html").read_text()
     for whose in ("scene", "detector"):
         assert f"The whole of the {whose}&#39;s search" in page
 
-    again = study(orders, more=searches(orders))
+    again = study(run_requests, more=searches(run_requests))
     assert not any(step["done"] for step in again.steps)
     notes = {row.name: (row.state, row.note) for row in again.rows}
     assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
 
     monkeypatch.setattr(study_searches, "SCENE_TRIALS", 2)
-    third = {step["step"]: step["done"] for step in study(orders, more=searches(orders)).steps}
+    third = {
+        step["step"]: step["done"]
+        for step in study(run_requests, more=searches(run_requests)).steps
+    }
     assert third["scene search"] == 1

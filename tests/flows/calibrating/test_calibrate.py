@@ -46,13 +46,13 @@ def lab(folder: Path, *, moved_mm: float = 0.0, leant_mm: float = 0.0, mock: str
     return path
 
 
-def bench(path: Path, **attributes: Any) -> measuring.Bench:
+def session(path: Path, **attributes: Any) -> measuring.CalibrationSession:
     file, _ = load_rig_file(path)
     rig = build_rig(file)
     rig.connect()
     for name, value in attributes.items():
         setattr(rig, name, value)
-    return measuring.Bench(file, rig, date(2026, 12, 1))
+    return measuring.CalibrationSession(file, rig, date(2026, 12, 1))
 
 
 def taught(finding: measuring.Finding) -> PlateFrame:
@@ -77,7 +77,7 @@ def error_of(frame: PlateFrame) -> tuple[float, float]:
     ("moved_mm", "leant_mm"), [(1.2, 0.0), (-1.5, 0.0), (0.5, 1.5), (0.0, 0.0)]
 )
 def test_a_wrong_plane_is_mended(tmp_path: Path, moved_mm: float, leant_mm: float) -> None:
-    found = teach.teach_plane(bench(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
+    found = teach.teach_plane(session(lab(tmp_path, moved_mm=moved_mm, leant_mm=leant_mm)), 12.0,
                               QUICK, 2)  # fmt: skip
     off, turned = error_of(taught(found))
     assert off < 0.12
@@ -88,7 +88,7 @@ def test_a_wrong_plane_is_mended(tmp_path: Path, moved_mm: float, leant_mm: floa
 
 
 def test_a_plane_by_hand_is_found_too(tmp_path: Path) -> None:
-    found = teach.teach_plane_by_hand(bench(lab(tmp_path, moved_mm=8.0, leant_mm=6.0)))
+    found = teach.teach_plane_by_hand(session(lab(tmp_path, moved_mm=8.0, leant_mm=6.0)))
     off, turned = error_of(taught(found))
     assert off < 0.15
     assert turned < 0.5
@@ -128,11 +128,11 @@ def test_points_that_make_no_plane_write_nothing(
 ) -> None:
     monkeypatch.setattr(teach, "jogged", by_hand(points))
     with pytest.raises(RigError, match=says):
-        teach.teach_plane_by_hand(bench(lab(tmp_path)))
+        teach.teach_plane_by_hand(session(lab(tmp_path)))
 
 
 def test_depth_zero_by_both_ways_is_the_truth(tmp_path: Path) -> None:
-    found = teach.teach_zero(bench(lab(tmp_path, moved_mm=-0.6)), QUICK, 3, True)
+    found = teach.teach_zero(session(lab(tmp_path, moved_mm=-0.6)), QUICK, 3, True)
     entry_ = found.changes["calibration.depth_zero"]
     assert found.figures["zero_mm"] == pytest.approx(0.6, abs=0.06)
     assert np.mean(found.figures["by_markers_mm"]) == pytest.approx(0.6, abs=0.06)
@@ -144,22 +144,22 @@ def test_a_touch_depth_that_is_wrong_is_told_by_the_markers(tmp_path: Path) -> N
     path = lab(tmp_path)
     path.write_text(path.read_text().replace("touch_depth: 0.34 mm", "touch_depth: 0.04 mm"))
     with pytest.raises(RigError, match=r"apart. Is calibration.touch_depth = 0.04 mm right"):
-        teach.teach_zero(bench(path), QUICK, 1, True)
-    found = teach.teach_zero(bench(path), QUICK, 1, False)
+        teach.teach_zero(session(path), QUICK, 1, True)
+    found = teach.teach_zero(session(path), QUICK, 1, False)
     assert found.figures["by_markers_mm"] is None
 
 
 def test_depth_zero_from_a_video(tmp_path: Path) -> None:
     path = lab(tmp_path)
     path.write_text(path.read_text().replace("level: tracks", "level: video"))
-    found = teach.teach_zero(bench(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
+    found = teach.teach_zero(session(path), Creep(clearance_mm=1.0, search_mm=1.0), 1, True)
     assert abs(found.figures["by_markers_mm"][0]) < 0.08
 
 
 @pytest.mark.parametrize("tip", [(0.0, 0.0, 0.0), (0.8, -1.5, 3.0)])
 def test_the_tip_is_found_by_pivoting(tmp_path: Path, tip: tuple[float, float, float]) -> None:
     path = lab(tmp_path, mock=f"  arm: {{tip_offset_mm: {list(tip)}}}\n")
-    found = teach.teach_tool(bench(path), 8, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    found = teach.teach_tool(session(path), 8, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     assert np.linalg.norm(np.array(found.figures["offset_mm"]) - tip) < 0.1
     assert found.figures["residual_mm"] < 0.1
     assert found.figures["off_the_tool_set_mm"] == pytest.approx(np.linalg.norm(tip), abs=0.1)
@@ -169,7 +169,7 @@ def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> 
     """Poses are those of a tool; what is found is from the flange."""
     path = lab(tmp_path, mock="  arm: {tip_offset_mm: [0.5, 0, 1]}\n")
     tool = Pose((10.0, -5.0, 80.0), (0.0, 0.0, 90.0))
-    found = teach.teach_tool(bench(path), 8, tool)
+    found = teach.teach_tool(session(path), 8, tool)
     # the tip in the tool's axes, turned by 90 degrees about z into the flange's
     assert np.allclose(found.figures["offset_mm"], [10.0, -5.0 + 0.5, 81.0], atol=0.1)
 
@@ -177,25 +177,25 @@ def test_a_tool_that_the_controller_has_already_is_taken_off(tmp_path: Path) -> 
 def test_poses_that_are_all_alike_write_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = bench(lab(tmp_path))
+    here = session(lab(tmp_path))
     here.rig.operator.ask = lambda task, prompt, expected: True  # type: ignore[method-assign]
     with pytest.raises(RigError, match="too much alike"):
         teach.teach_tool(here, 5, Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
 def test_the_crop_is_where_the_skin_is(tmp_path: Path) -> None:
-    found = calibrate.calibrate_crop(bench(lab(tmp_path)), 2.4, 1.0)
+    found = calibrate.calibrate_crop(session(lab(tmp_path)), 2.4, 1.0)
     assert np.hypot(*(np.array(found.figures["centre_px"]) - [319.5, 239.5])) < 4.0
     # the outer ring's markers, and what they move
     assert 2 * (11.2 + 1.2) * 14 - 10 < found.figures["diameter_px"] < 400
     with pytest.raises(RigError, match="event camera"):
-        calibrate.calibrate_crop(bench(lab(tmp_path)), 0.01, 0.1)
+        calibrate.calibrate_crop(session(lab(tmp_path)), 0.01, 0.1)
 
 
 def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(MOCK + "  frame_camera: {k1: -0.2}\n")
-    here = bench(path)
+    here = session(path)
     pictures = calibrate.see_boards(here, 8)
     assert len(pictures) == 8
     found = calibrate.calibrate_lens(pictures, Board(), here.today)
@@ -210,7 +210,7 @@ def test_the_lens_of_the_simulated_camera_is_found(tmp_path: Path) -> None:
 
 def test_a_camera_of_tracks_has_no_pictures_of_a_board(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="tracks and no pictures"):
-        calibrate.see_boards(bench(lab(tmp_path)), 4)
+        calibrate.see_boards(session(lab(tmp_path)), 4)
 
 
 @pytest.mark.parametrize("name", ["board.png", "board.pdf"])
@@ -439,7 +439,7 @@ def test_check_refuses_what_is_missing_or_old(tmp_path: Path) -> None:
 
 def test_an_arm_that_is_stopped_stays_so(tmp_path: Path) -> None:
     """Nothing here unlocks anything."""
-    here = bench(lab(tmp_path, mock=(
+    here = session(lab(tmp_path, mock=(
         "  faults: [{kind: arm_protective_stop, trial: 1, at_s: 2, since: trial}]\n"
     )))  # fmt: skip
     with pytest.raises(RigError, match="protective stop"):

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from sliplab.flows.__main__ import _run
-from sliplab.flows.planning.orders import make_order
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running.campaigns import collected
 from sliplab.protocols import InputError
 from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
@@ -127,7 +127,7 @@ def test_an_imported_campaign_has_no_protocol(tmp_path: Path, sliplab: Any) -> N
     store = tmp_path / "store"
     assert sliplab("import", tmp_path / "slide.h5", "--store", store, "--name", "tiny")[0] == 0
     with pytest.raises(StoreError, match="was imported"):
-        make_order(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
+        make_request(write(tmp_path / "p.yaml", tiny()), ROOT / "rigs" / "rehearsal.yaml", store)
     with pytest.raises(StoreError, match="imported campaigns only"):
         collected(Store.open(store))
     where = Store.open(store).campaign("c")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from sliplab.flows.__main__ import main
-from sliplab.flows.collecting.stretch import stretch
-from sliplab.flows.planning.orders import campaign_counts, make_order, pending_trials
+from sliplab.flows.collecting.run_session import run_session
+from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.lock import Locked, exclusive
 from sliplab.storage.store import FORMAT, Store, StoreError
@@ -56,11 +56,13 @@ def flip(path: Path) -> None:
 
 def test_figures_add_up_after_damage(whole: Path, sliplab: Sliplab) -> None:
     (trials(whole)[0] / "data.h5").write_bytes(b"x")
-    order = make_order(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
     campaign = Store.open(whole / "store").campaign("tiny")
-    counts = campaign_counts(order, campaign)
+    counts = campaign_counts(run_request, campaign)
     assert (counts["planned"], counts["committed"], counts["missing"]) == (2, 1, 1)
-    assert [trial.id for trial in pending_trials(order.plan, campaign)] == [trials(whole)[0].name]
+    assert [trial.id for trial in pending_trials(run_request.plan, campaign)] == [
+        trials(whole)[0].name
+    ]
     code, found, _ = sliplab("verify", whole / "store", "--json")
     assert found is not None
     assert code == 1
@@ -90,9 +92,12 @@ def test_a_damaged_trial_is_set_aside_and_taken_again(whole: Path, sliplab: Slip
 
 def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path, sliplab: Sliplab) -> None:
     flip(trials(whole)[0] / "data.h5")
-    order = make_order(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+    run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
     with exclusive(whole / "store" / ".lock", "the store"):
-        with pytest.raises(Locked, match=r"in use by another program .*pid"), stretch(order):
+        with (
+            pytest.raises(Locked, match=r"in use by another program .*pid"),
+            run_session(run_request),
+        ):
             raise AssertionError("two writers")
         for command in (["verify", "--quarantine"], ["migrate"]):
             code, _, said = sliplab(command[0], whole / "store", *command[1:])
@@ -115,7 +120,7 @@ def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(
             assert (code, found["format"], found["from"]) == (0, FORMAT, [1])
             assert Path(found["copies"][0], "store.json").is_file()
         else:
-            with stretch(make_order(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
+            with run_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
                 assert Store.open(whole / "store").format == FORMAT
     code, found, _ = sliplab("migrate", whole / "store", "--json")
     assert found is not None
@@ -138,14 +143,14 @@ def test_no_path_of_a_protocol_leads_out_of_the_store(whole: Path, name: str) ->
     before = sorted(whole.parent.rglob("*"))
     path = write(whole.parent / "evil.yaml", data)
     with pytest.raises((StoreError, ValueError, RuntimeError)):
-        make_order(path, whole / "rig.yaml", whole / "store")
+        make_request(path, whole / "rig.yaml", whole / "store")
     path.unlink()
     with pytest.raises(StoreError, match="cannot be the name"):
-        make_order(whole / "p.yaml", whole / "rig.yaml", whole / "store", campaign=name or ".")
+        make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store", campaign=name or ".")
     assert sorted(whole.parent.rglob("*")) == before
 
 
 def test_a_campaign_without_its_description_is_not_begun_anew(whole: Path) -> None:
     (whole / "store" / "campaigns" / "tiny" / "campaign.json").unlink()
     with pytest.raises(StoreError, match=r"campaign.json.*put it back from a copy"):
-        make_order(whole / "p.yaml", whole / "rig.yaml", whole / "store")
+        make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")

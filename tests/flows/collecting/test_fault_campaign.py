@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.flows.planning.orders import campaign_counts, make_order, pending_trials
+from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
 from sliplab.protocols.settings import Labelling
 from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.mock.fault_settings import KINDS
@@ -151,8 +151,8 @@ def test_every_fault_once_in_a_campaign_and_the_table_in_the_docs(tmp_path: Path
     assert len(sound.plan) == len(campaign.committed()) == PLANNED
     assert kept.items() <= checksums(campaign).items()
     assert verify(Store.open(tmp_path / "store")) == []
-    order = make_order(tmp_path / "p.yaml", tmp_path / "rig.yaml", tmp_path / "store")
-    counts = campaign_counts(order, campaign)
+    run_request = make_request(tmp_path / "p.yaml", tmp_path / "rig.yaml", tmp_path / "store")
+    counts = campaign_counts(run_request, campaign)
     assert (counts["planned"], counts["missing"], counts["set_aside"]) == (PLANNED, 0, [])
 
     falling = tiny_gravity()

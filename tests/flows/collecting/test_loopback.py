@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import describe_campaign
+from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.rigs.arms.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.rig_file import RigFile
@@ -20,8 +20,8 @@ from sliplab.storage.verify import verify
 from tests.flows.live import (
     at_work,
     free_udp_port,
-    order_in,
     quick,
+    request_in,
     rig_yaml,
     stage_of,
     take_all,
@@ -42,14 +42,14 @@ class Taken:
     by_mock: Recording
     sent: dict[str, int]
     events_sent: int
-    order: Any
+    run_request: Any
 
 
 @pytest.fixture(scope="module")
 def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
     folder = tmp_path_factory.mktemp("loopback")
-    order = order_in(folder / "live", quick(), rig_yaml(folder))
-    with stage_of(order.rig) as stage, at_work(order, stage) as (work, campaign):
+    run_request = request_in(folder / "live", quick(), rig_yaml(folder))
+    with stage_of(run_request.rig) as stage, at_work(run_request, stage) as (work, campaign):
         take_all(work)
         assert (work.taken, work.retaken) == (1, 0)
         (recording,) = campaign.recordings()
@@ -57,14 +57,14 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
             event_us = reader.event_times()
         sent = dict(stage.sent())
         events_sent = stage.events_between(int(event_us[0]), int(event_us[-1]))
-    mock = order_in(folder / "mock", quick(), folder / "rig.yaml")
-    file = order.rig.model_copy(update={"driver": "mock", "devices": None})
+    mock = request_in(folder / "mock", quick(), folder / "rig.yaml")
+    file = run_request.rig.model_copy(update={"driver": "mock", "devices": None})
     other = describe_campaign(Store.create(mock.store), mock)
     rig = build_rig(file)
     rig.connect()
     take_all(Session(mock.plan, file, rig, other))
     (by_mock,) = other.recordings()
-    return Taken(recording, by_mock, sent, events_sent, order)
+    return Taken(recording, by_mock, sent, events_sent, run_request)
 
 
 def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:
@@ -76,11 +76,11 @@ def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:
     assert gates["sync_uncertainty_frames_s"]["grade"] == "hardware trigger"
     assert gates["sync_uncertainty_arm_s"]["grade"] == "digital input"
     assert gates["frames_lost"]["value"] == 0
-    assert verify(Store.open(taken.order.store)) == []
+    assert verify(Store.open(taken.run_request.store)) == []
 
 
 def test_its_labels_are_those_of_the_mock(taken: Taken) -> None:
-    settings = taken.order.plan.protocol.analysis.labelling
+    settings = taken.run_request.plan.protocol.analysis.labelling
     after_ms = []
     for recording in (taken.recording, taken.by_mock):
         onsets = label_recording(recording, settings).onsets
@@ -129,9 +129,9 @@ def with_arm(file: RigFile, kind: str) -> RigFile:
 
 @pytest.mark.parametrize("kind", [pytest.param("abb", marks=pytest.mark.long), "abb_socket"])
 def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> None:
-    order = order_in(tmp_path / "live", quick(), rig_yaml(tmp_path))
-    file = with_arm(order.rig, kind)
-    with stage_of(file) as stage, at_work(order, stage, file) as (work, campaign):
+    run_request = request_in(tmp_path / "live", quick(), rig_yaml(tmp_path))
+    file = with_arm(run_request.rig, kind)
+    with stage_of(file) as stage, at_work(run_request, stage, file) as (work, campaign):
         take_all(work)
     assert [failed["cause"] for failed in campaign.quarantined()] == []
     (recording,) = campaign.recordings()

@@ -17,7 +17,7 @@ from typing import Any, cast
 import pytest
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import Order, pending_trials
+from sliplab.flows.planning.run_request import RunRequest, pending_trials
 from sliplab.rigs.arms.ur import SILENCE_S, UrArm
 from sliplab.rigs.arms.ur_control import WATCHDOG_HZ
 from sliplab.rigs.build import calibrated_arm
@@ -27,7 +27,7 @@ from sliplab.storage.files import read_json
 from sliplab.storage.store import Campaign, Store
 from sliplab.storage.verify import verify
 from tests.flows.collecting.test_session import checksums
-from tests.flows.live import at_work, order_in, quick, rig_yaml, stage_of
+from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
 from tests.rigs.loopback import until
 
 pytestmark = pytest.mark.realtime
@@ -44,13 +44,13 @@ WATCHING_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, Order]]:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, RunRequest]]:
     """Stand-ins for all tests here, and the campaign of which each takes the next trial."""
     folder = tmp_path_factory.mktemp("faults")
     data = quick(LENGTH_MM, SPEED_MM_S, repetitions=len(CASES) + 2)
-    order = order_in(folder / "begin", data, rig_yaml(folder))
-    with stage_of(order.rig) as stage:
-        yield stage, order
+    run_request = request_in(folder / "begin", data, rig_yaml(folder))
+    with stage_of(run_request.rig) as stage:
+        yield stage, run_request
 
 
 def take_next(work: Session) -> None:
@@ -128,10 +128,10 @@ FIRST = {("arm", "protective stop"), ("arm", "link cut"), ("event_camera", "unpl
     ],
 )
 def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
-    scene: tuple[Loopback, Order], case: Case
+    scene: tuple[Loopback, RunRequest], case: Case
 ) -> None:
-    stage, order = scene
-    with at_work(order, stage) as (work, campaign):
+    stage, run_request = scene
+    with at_work(run_request, stage) as (work, campaign):
         good, aside = checksums(campaign), campaign.quarantined()
 
         def happen() -> None:
@@ -165,23 +165,23 @@ def test_the_arm_stops_the_trial_is_put_aside_and_the_next_one_is_good(
     kept = read_json(campaign.folder / "quarantine" / failed["folder"] / "cause.json")
     assert kept["cause"] == f"{type(raised.value).__name__}: {raised.value}"
     if case.kind == "protective stop":
-        nobody_unlocks_it(order, stage)
+        nobody_unlocks_it(run_request, stage)
     put_right(stage, case.device)
-    with at_work(order, stage) as (work, campaign):
+    with at_work(run_request, stage) as (work, campaign):
         take_next(work)
         assert work.rig.arm.state() is ArmState.READY
     assert new_in_quarantine(campaign, aside) == failed
     now = checksums(campaign)
     assert good.items() <= now.items()
     assert now.keys() - good.keys() == {failed["trial"]}
-    assert verify(Store.open(order.store)) == []
+    assert verify(Store.open(run_request.store)) == []
 
 
-def nobody_unlocks_it(order: Order, stage: Loopback) -> None:
+def nobody_unlocks_it(run_request: RunRequest, stage: Loopback) -> None:
     """The same command again, with nobody at the pendant in between, is refused."""
     with (
         pytest.raises(ArmFault, match="protective stop; clear the cause and unlock the stop"),
-        at_work(order, stage),
+        at_work(run_request, stage),
     ):
         pytest.fail("it took control of a stopped arm")
 
@@ -195,10 +195,10 @@ def put_right(stage: Loopback, device: str) -> None:
 
 
 def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
-    scene: tuple[Loopback, Order],
+    scene: tuple[Loopback, RunRequest],
 ) -> None:
-    stage, order = scene
-    with at_work(order, stage) as (work, campaign):
+    stage, run_request = scene
+    with at_work(run_request, stage) as (work, campaign):
         aside = campaign.quarantined()
         camera = cast("Any", work.rig.frames)
         with once_sliding(stage, lambda: camera.device.drop_frames(3)):
@@ -207,13 +207,13 @@ def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
     failed = new_in_quarantine(campaign, aside)
     assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
     assert campaign.recording(failed["trial"]).record["attempt"] == 1
-    assert verify(Store.open(order.store)) == []
+    assert verify(Store.open(run_request.store)) == []
 
 
-def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, Order]) -> None:
-    stage, order = scene
-    assert order.rig.devices is not None
-    second = UrArm(cast("Any", calibrated_arm(order.rig, order.rig.devices)))
+def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, RunRequest]) -> None:
+    stage, run_request = scene
+    assert run_request.rig.devices is not None
+    second = UrArm(cast("Any", calibrated_arm(run_request.rig, run_request.rig.devices)))
 
     def take_it() -> str:
         with pytest.raises(ArmFault) as refused:
@@ -221,7 +221,7 @@ def test_a_second_program_gets_no_arm_that_slides(scene: tuple[Loopback, Order])
         second.close()
         return str(refused.value)
 
-    with at_work(order, stage) as (work, campaign):
+    with at_work(run_request, stage) as (work, campaign):
         good = campaign.committed()
         with once_sliding(stage, take_it) as tried:
             take_next(work)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.calibrating.measuring import Bench, Finding, Measurement
+from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Measurement
 from sliplab.flows.cli.rigs import _about
-from sliplab.flows.collecting.stretch import stretch
+from sliplab.flows.collecting.run_session import run_session
 from sliplab.flows.planning.device_checks import check_devices
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, lock_names
@@ -33,7 +33,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a device was opened")
 
     for place in (
-        "flows.collecting.stretch.build_rig", "rigs.build.build_rig", "flows.cli.rigs.reach",
+        "flows.collecting.run_session.build_rig", "rigs.build.build_rig", "flows.cli.rigs.reach",
         "rigs.reach.reach",
     ):  # fmt: skip
         monkeypatch.setattr(f"sliplab.{place}", opened)
@@ -42,10 +42,10 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-def order(folder: Path) -> Order:
+def run_request(folder: Path) -> RunRequest:
     file, text = load_rig_file(UR5)
     plan = load_plan(ROOT / "protocols" / "pilot.yaml")
-    return Order(plan, file, text, folder / "store", "pilot", ())
+    return RunRequest(plan, file, text, folder / "store", "pilot", ())
 
 
 @pytest.mark.usefixtures("taken")
@@ -55,7 +55,7 @@ def test_collect_is_refused(tmp_path: Path) -> None:
             Locked,
             match=r"the arm at .* is in use .*pid .* for the store /data/other",
         ),
-        stretch(order(tmp_path)),
+        run_session(run_request(tmp_path)),
     ):
         pass
     # and takes the store's lock along: nothing stands in the way of another rig
@@ -65,7 +65,7 @@ def test_collect_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("taken")
 def test_check_says_so(tmp_path: Path) -> None:
-    (found,) = check_devices(order(tmp_path))
+    (found,) = check_devices(run_request(tmp_path))
     assert (found.name, found.passed) == ("rig", False)
     assert "is in use by another program (pid" in found.finding
 
@@ -74,7 +74,7 @@ def test_check_says_so(tmp_path: Path) -> None:
 def test_teaching_and_calibrating_are_refused(tmp_path: Path) -> None:
     command = Measurement(UR5, tmp_path / "new.yaml", "plane", True)
 
-    def never(bench: Bench) -> Finding:
+    def never(session: CalibrationSession) -> Finding:
         raise AssertionError("measured")
 
     with pytest.raises(Locked, match="is in use"):

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.collecting.stretch import owned
-from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.flows.collecting.run_session import owned
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.flows.running import console
 from sliplab.protocols import InputError
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
@@ -83,17 +83,17 @@ def abb(folder: Path, password: str, **more: str) -> Path:
 
 def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
     protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
-    order = make_order(protocol, abb(tmp_path / "lab", SECRET), store.folder)
-    assert SECRET in order.rig_text
-    assert order.rig.devices is not None
-    assert SECRET not in repr(order.rig)
-    where = describe_campaign(store, order)
+    run_request = make_request(protocol, abb(tmp_path / "lab", SECRET), store.folder)
+    assert SECRET in run_request.rig_text
+    assert run_request.rig.devices is not None
+    assert SECRET not in repr(run_request.rig)
+    where = describe_campaign(store, run_request)
     kept = [path for path in tmp_path.rglob("*") if path.is_file() and "lab" not in path.parts]
     assert len(kept) > 3
     assert not [path for path in kept if SECRET.encode() in path.read_bytes()]
     copy = where.folder / "rig.yaml"
     known, text = load_rig_file(copy, stored=True)
-    assert known.model_copy(update={"devices": None}) == order.rig.model_copy(
+    assert known.model_copy(update={"devices": None}) == run_request.rig.model_copy(
         update={"devices": None}
     )
     assert rig_hash(text) == where.info["rig_hash"]
@@ -103,16 +103,16 @@ def test_a_store_keeps_no_password_of_a_rig_file(tmp_path: Path) -> None:
 
 def test_another_password_is_no_other_rig(tmp_path: Path) -> None:
     protocol, store = ROOT / "protocols" / "pilot.yaml", Store.create(tmp_path / "store")
-    order = make_order(protocol, abb(tmp_path / "lab", SECRET), store.folder)
-    campaign = describe_campaign(store, order)
-    make_order(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
+    run_request = make_request(protocol, abb(tmp_path / "lab", SECRET), store.folder)
+    campaign = describe_campaign(store, run_request)
+    make_request(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
     # a store of before, with the password in its copy
     info = {**campaign.info, "rig_hash": "0" * 64}
-    campaign.update(info, protocol.read_text(), order.rig_text)
-    make_order(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
+    campaign.update(info, protocol.read_text(), run_request.rig_text)
+    make_request(protocol, abb(tmp_path / "lab", "another-one"), store.folder)
     wrong = abb(tmp_path / "lab", "another-one", sensor="name: irb120 ")
     with pytest.raises(StoreError) as caught:
-        make_order(protocol, wrong, store.folder)
+        make_request(protocol, wrong, store.folder)
     assert "sensor: sensor-1 -> x" in str(caught.value)
     assert SECRET not in str(caught.value)
     assert "another-one" not in str(caught.value)

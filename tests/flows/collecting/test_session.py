@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import (
+from sliplab.flows.planning.run_request import (
     campaign_counts,
     describe_campaign,
-    make_order,
+    make_request,
     pending_trials,
 )
 from sliplab.protocols.yaml_file import parse_yaml
@@ -46,11 +46,13 @@ def session(
         default=lambda v: float(v) if isinstance(v, Decimal) else str(v),
     )
     (folder / "rig.yaml").write_text(text)
-    order = make_order(write(folder / "p.yaml", data), folder / "rig.yaml", folder / "store")
-    campaign = describe_campaign(Store.create(folder / "store"), order)
-    rig = build_rig(order.rig)
+    run_request = make_request(
+        write(folder / "p.yaml", data), folder / "rig.yaml", folder / "store"
+    )
+    campaign = describe_campaign(Store.create(folder / "store"), run_request)
+    rig = build_rig(run_request.rig)
     rig.connect()
-    return Session(order.plan, order.rig, rig, campaign), campaign
+    return Session(run_request.plan, run_request.rig, rig, campaign), campaign
 
 
 def take_all(work: Session) -> None:
@@ -102,10 +104,10 @@ def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     assert campaign.committed() == set()
     assert len(campaign.quarantined()) == 6
     assert pending_trials(work.plan, campaign) == []
-    order = make_order(
+    run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
-    counts = campaign_counts(order, campaign)
+    counts = campaign_counts(run_request, campaign)
     assert counts["planned"] == counts["committed"] + counts["missing"] == 3
     assert len(counts["set_aside"]) == 3
 
@@ -162,14 +164,14 @@ def test_another_collection_or_rig_is_refused_and_new_trials_are_not(tmp_path: P
     data = short()
     data["analysis"]["detection"]["margin"] = 5
     data["collection"]["factors"]["direction"]["values"].append(300)
-    order = make_order(write(tmp_path / "more.yaml", data), rig, store)
-    assert len(pending_trials(order.plan, Store.open(store).campaign("tiny"))) == 1
+    run_request = make_request(write(tmp_path / "more.yaml", data), rig, store)
+    assert len(pending_trials(run_request.plan, Store.open(store).campaign("tiny"))) == 1
     data["collection"]["motion"][1]["speed"] = "1 mm/s"
     with pytest.raises(StoreError, match="another `collection:` section"):
-        make_order(write(tmp_path / "other.yaml", data), rig, store)
+        make_request(write(tmp_path / "other.yaml", data), rig, store)
     fewer = short()
     fewer["collection"]["factors"]["direction"]["values"] = [0, 120]
     with pytest.raises(StoreError, match="may only add trials"):
-        make_order(write(tmp_path / "fewer.yaml", fewer), rig, store)
+        make_request(write(tmp_path / "fewer.yaml", fewer), rig, store)
     with pytest.raises(StoreError, match="another rig file"):
-        make_order(tmp_path / "more.yaml", ROOT / "rigs" / "mock.yaml", store)
+        make_request(tmp_path / "more.yaml", ROOT / "rigs" / "mock.yaml", store)

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting.boundary import Boundary, carry_out
 from sliplab.flows.collecting.disk_watch import DiskWatch
 from sliplab.flows.collecting.reference_watch import ReferenceWatch, hold_rate
 from sliplab.flows.collecting.remaining import Remaining
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.collecting.stops import CampaignStopped
+from sliplab.flows.collecting.trial_gate import TrialGate, carry_out
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
-from sliplab.flows.planning.orders import Order, make_order, pending_trials
+from sliplab.flows.planning.run_request import RunRequest, make_request, pending_trials
 from sliplab.protocols import InputError, load_plan
 from sliplab.storage import control
 from sliplab.storage.store import Campaign, Store
@@ -23,17 +23,17 @@ from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import tiny, write
 
 
-def begin(folder: Path, data: dict[str, Any]) -> tuple[Session, Campaign, Order]:
-    """A session and its order."""
+def begin(folder: Path, data: dict[str, Any]) -> tuple[Session, Campaign, RunRequest]:
+    """A session and its run request."""
     work, campaign = session(folder, data)
-    return work, campaign, make_order(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+    return work, campaign, make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
 
 
 def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
-    work, campaign, order = begin(tmp_path / "a", short())
+    work, campaign, run_request = begin(tmp_path / "a", short())
     left = [RESERVE + 1e9, RESERVE + 1e9, RESERVE + 1000]
-    disk = DiskWatch(order, campaign, lambda folder: int(left.pop(0)))
-    work.boundary = Boundary(order, Store.open(order.store), campaign, disk)
+    disk = DiskWatch(run_request, campaign, lambda folder: int(left.pop(0)))
+    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign, disk)
     with pytest.raises(CampaignStopped) as stopped:
         work.take(pending_trials(work.plan, campaign))
     message = str(stopped.value)
@@ -45,28 +45,28 @@ def test_a_campaign_stops_before_its_disk_is_full(tmp_path: Path) -> None:
     assert len(campaign.committed()) == 2
     assert campaign.quarantined() == []
     assert not list((campaign.folder / "incoming").iterdir())
-    assert verify(Store.open(order.store)) == []
+    assert verify(Store.open(run_request.store)) == []
 
 
 def test_what_a_trial_needs_comes_from_the_plan_then_from_the_trials(tmp_path: Path) -> None:
-    work, campaign, order = begin(tmp_path / "a", short())
-    first, second, _ = order.plan
-    disk = DiskWatch(order, campaign)
-    planned = trial_bytes(order.rig, order.plan, second)
+    work, campaign, run_request = begin(tmp_path / "a", short())
+    first, second, _ = run_request.plan
+    disk = DiskWatch(run_request, campaign)
+    planned = trial_bytes(run_request.rig, run_request.plan, second)
     assert disk.needs(second) == planned
     work.take([first])
     disk.learn(first)
     folder = campaign.folder / "trials" / first.id
     took = sum(path.stat().st_size for path in folder.iterdir())
-    ratio = took / trial_bytes(order.rig, order.plan, first)
+    ratio = took / trial_bytes(run_request.rig, run_request.plan, first)
     assert disk.needs(second) == pytest.approx(planned * ratio)
-    assert DiskWatch(order, campaign).needs(second) == disk.needs(second)  # next stretch
-    camera = order.rig.frame_camera.model_copy(update={"spool": True})
-    spooling = order.rig.model_copy(update={"frame_camera": camera})
-    raw = DiskWatch(Order(**{**vars(order), "rig": spooling}), campaign)
-    frame = order.rig.frame_px(order.plan)
+    assert DiskWatch(run_request, campaign).needs(second) == disk.needs(second)  # next stretch
+    camera = run_request.rig.frame_camera.model_copy(update={"spool": True})
+    spooling = run_request.rig.model_copy(update={"frame_camera": camera})
+    raw = DiskWatch(RunRequest(**{**vars(run_request), "rig": spooling}), campaign)
+    frame = run_request.rig.frame_px(run_request.plan)
     assert frame is not None
-    seconds = order.plan.seconds(second, recorded_only=True)
+    seconds = run_request.plan.seconds(second, recorded_only=True)
     assert raw.needs(second) - disk.needs(second) == frame[0] * frame[1] * 100 * seconds
 
 
@@ -82,10 +82,10 @@ def with_references(bound: str = "20 %") -> dict[str, Any]:
 def test_references_that_drift_apart_stop_the_campaign(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work, campaign, order = begin(tmp_path / "a", with_references())
-    store = Store.open(order.store)
-    work.boundary = Boundary(order, store, campaign)
-    references = [trial.id for trial in order.plan if trial.role == "reference"]
+    work, campaign, run_request = begin(tmp_path / "a", with_references())
+    store = Store.open(run_request.store)
+    work.gate = TrialGate(run_request, store, campaign)
+    references = [trial.id for trial in run_request.plan if trial.role == "reference"]
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
     monkeypatch.setattr(
@@ -98,19 +98,19 @@ def test_references_that_drift_apart_stop_the_campaign(
     for part in (
         f"{second} has 1,234 events/s in the hold, {first} had 1,000 (+23.4 %, "
         "gates.reference.event_rate = 20 %)", "simulated reference trials",
-        f"`sliplab again {order.store} {second} --why ...`", "Onsets were not compared",
+        f"`sliplab again {run_request.store} {second} --why ...`", "Onsets were not compared",
     ):  # fmt: skip
         assert part in message
     assert len(campaign.committed()) == 3
     # it does not go on by itself ...
     with pytest.raises(CampaignStopped, match="drifted apart"):
-        Boundary(order, store, campaign).begin()
+        TrialGate(run_request, store, campaign).begin()
     # ... but when the trial is wanted again
     control.ask(store, "again", campaign="tiny", trials=(second,), why="skin cleaned")
     carry_out(store)
     rates = dict.fromkeys(references, 1100.0) | {first: 1000.0}
-    work.boundary = Boundary(order, store, campaign)
-    work.boundary.begin()
+    work.gate = TrialGate(run_request, store, campaign)
+    work.gate.begin()
     pending = pending_trials(work.plan, campaign)
     assert pending[0].id == second
     work.take(pending)
@@ -118,11 +118,13 @@ def test_references_that_drift_apart_stop_the_campaign(
 
 
 def test_true_event_rates_in_the_hold_agree_within_some_percent(tmp_path: Path) -> None:
-    work, campaign, order = begin(tmp_path / "a", with_references())
-    work.boundary = Boundary(order, Store.open(order.store), campaign)
+    work, campaign, run_request = begin(tmp_path / "a", with_references())
+    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign))
     rates = [
-        hold_rate(campaign.recording(trial.id)) for trial in order.plan if trial.role == "reference"
+        hold_rate(campaign.recording(trial.id))
+        for trial in run_request.plan
+        if trial.role == "reference"
     ]
     assert len(rates) == 3
     assert min(rates) > 0
@@ -134,15 +136,15 @@ def test_without_the_gate_nothing_is_compared(
 ) -> None:
     data = with_references()
     del data["collection"]["gates"]["reference"]
-    work, campaign, order = begin(tmp_path / "a", data)
+    work, campaign, run_request = begin(tmp_path / "a", data)
 
     def never(recording: object) -> float:
         raise AssertionError("read")
 
     monkeypatch.setattr("sliplab.flows.collecting.reference_watch.hold_rate", never)
-    work.boundary = Boundary(order, Store.open(order.store), campaign)
+    work.gate = TrialGate(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign)[:3])
-    ReferenceWatch(order, campaign).begin()
+    ReferenceWatch(run_request, campaign).begin()
 
 
 def test_a_gate_without_reference_trials_is_refused(tmp_path: Path) -> None:

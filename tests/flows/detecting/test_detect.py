@@ -18,7 +18,7 @@ from sliplab.analysis.nets.windows import bin_events
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.detecting.detect import detect
 from sliplab.flows.detecting.detect_order import make_detect_order
-from sliplab.flows.planning.orders import describe_campaign
+from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
 from sliplab.rigs.build import build_rig
@@ -39,7 +39,7 @@ from tests.flows.detecting.detecting import (
     stands_clear,
     untrained,
 )
-from tests.flows.live import order_in, take_all
+from tests.flows.live import request_in, take_all
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """The same trial as `collect` takes it, by a rig that looks as often: moves end with a look."""
     folder = tmp_path_factory.mktemp("stored")
     rig_file = write(folder / "r.yaml", {"extends": str(RIG), "poll": "5 ms"})
-    order = order_in(folder / "at", short_slide(), rig_file)
+    order = request_in(folder / "at", short_slide(), rig_file)
     campaign = describe_campaign(Store.create(order.store), order)
     rig = build_rig(order.rig)
     rig.connect()

@@ -11,7 +11,7 @@ import yaml
 
 from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import describe_campaign, make_order, pending_trials
+from sliplab.flows.planning.run_request import describe_campaign, make_request, pending_trials
 from sliplab.rigs.build import build_rig
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store
@@ -47,15 +47,15 @@ def take(folder: Path, data: dict[str, Any], **camera: Any) -> tuple[Recording, 
     rig_path = folder / "rig.yaml"
     base = str(ROOT / "rigs" / "mock.yaml")
     rig_path.write_text(yaml.safe_dump({"extends": base, "mock": {"frame_camera": camera}}))
-    order = make_order(write(folder / "p.yaml", data), rig_path, folder / "store")
-    campaign = describe_campaign(Store.create(folder / "store"), order)
-    rig = build_rig(order.rig)
+    run_request = make_request(write(folder / "p.yaml", data), rig_path, folder / "store")
+    campaign = describe_campaign(Store.create(folder / "store"), run_request)
+    rig = build_rig(run_request.rig)
     rig.connect()
-    (trial,) = pending_trials(order.plan, campaign)
-    Session(order.plan, order.rig, rig, campaign).take([trial])
+    (trial,) = pending_trials(run_request.plan, campaign)
+    Session(run_request.plan, run_request.rig, rig, campaign).take([trial])
     assert verify(Store.open(folder / "store")) == []
-    with_plate = order.plan.protocol.collection.plate is not None
-    return campaign.recording(trial.id), order.rig.frame_bytes(with_plate)
+    with_plate = run_request.plan.protocol.collection.plate is not None
+    return campaign.recording(trial.id), run_request.rig.frame_bytes(with_plate)
 
 
 def label(recording: Recording, data: dict[str, Any]) -> Label:

@@ -21,7 +21,7 @@ from sliplab.flows.learning.evaluate import evaluate, evaluation_of
 from sliplab.flows.learning.other_networks import STEP, judge_model
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import train
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.running.campaigns import collected
 from sliplab.flows.study import Outcome
@@ -34,7 +34,7 @@ from tests.command_line import here
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study."""
     folder = tmp_path_factory.mktemp("others") / "store"
     shutil.copytree(ran[0][0].store, folder)

@@ -16,7 +16,7 @@ from sliplab.flows.learning.evaluate import evaluate, evaluation_of
 from sliplab.flows.learning.samples import load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_scores import kept_counts
-from sliplab.flows.planning.orders import make_order
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running.campaigns import collected
 from sliplab.storage.review import Onsets, decide
 from sliplab.storage.store import Store
@@ -35,7 +35,7 @@ def two(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
         data = tiny()
         data["name"] = name
         data["analysis"]["training"] = {"epochs": 1}
-        collect(make_order(write(folder / f"{name}.yaml", data), rig_path, folder / "store"))
+        collect(make_request(write(folder / f"{name}.yaml", data), rig_path, folder / "store"))
     store = Store.open(folder / "store")
     campaigns = collected(store)
     label(store, campaigns)

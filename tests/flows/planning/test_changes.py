@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from sliplab.flows.planning.changes import MOST, differences, format_differences
-from sliplab.flows.planning.orders import describe_campaign, make_order
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.store import Store, StoreError
@@ -39,15 +39,15 @@ RIG = ROOT / "rigs" / "rehearsal.yaml"
 
 def begin(folder: Path, data: dict[str, Any]) -> Store:
     """A store in which a campaign under `data` was begun."""
-    order = make_order(write(folder / "p.yaml", data), RIG, folder / "store")
+    run_request = make_request(write(folder / "p.yaml", data), RIG, folder / "store")
     store = Store.create(folder / "store")
-    describe_campaign(store, order)
+    describe_campaign(store, run_request)
     return store
 
 
 def refused(folder: Path, data: dict[str, Any], rig: Path = RIG) -> str:
     with pytest.raises(StoreError) as error:
-        make_order(write(folder / "new.yaml", data), rig, folder / "store")
+        make_request(write(folder / "new.yaml", data), rig, folder / "store")
     return str(error.value)
 
 
@@ -73,7 +73,7 @@ def test_another_way_to_write_the_same_is_no_change(tmp_path: Path) -> None:
     data = tiny()
     data["collection"]["motion"][1]["speed"] = "0.2 cm/s"
     data["collection"]["gates"]["path_deviation"] = "0.1 mm"  # the default
-    make_order(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
+    make_request(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
 
 
 def test_the_gate_of_references_is_a_change_only_where_it_is_set(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_the_gate_of_references_is_a_change_only_where_it_is_set(tmp_path: Path)
     data = tiny()
     condition = {"depth": 2.4, "speed": 1.6, "direction": 0}
     data["collection"]["references"] = {"every": 3, "condition": condition}
-    make_order(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
+    make_request(write(tmp_path / "new.yaml", data), RIG, tmp_path / "store")
     data["collection"]["gates"]["reference"] = {"event_rate": "20 %"}
     assert "collection.gates.reference: not there -> {event_rate: 20 percent}" in refused(
         tmp_path, data

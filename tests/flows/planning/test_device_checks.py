@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 
 from sliplab.flows.cli.app import app
 from sliplab.flows.planning.device_checks import check_devices
-from sliplab.flows.planning.orders import Order, make_order
 from sliplab.flows.planning.region import check_region
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml
 from tests.conftest import ROOT
 
 
-def order_of(folder: Path, rig: dict[str, Any] | None = None, **recording: Any) -> Order:
+def request_of(folder: Path, rig: dict[str, Any] | None = None, **recording: Any) -> RunRequest:
     """The pilot on a mock rig, with changes to the rig's file and to the recording."""
     folder.mkdir(exist_ok=True)
     pilot = parse_yaml((ROOT / "protocols" / "pilot.yaml").read_text(), "pilot.yaml")
@@ -28,11 +28,11 @@ def order_of(folder: Path, rig: dict[str, Any] | None = None, **recording: Any) 
     for name, data in (("p.yaml", pilot), ("rig.yaml", {**mock, **(rig or {})})):
         text = json.dumps(data, default=lambda v: float(v) if isinstance(v, Decimal) else str(v))
         (folder / name).write_text(text)
-    return make_order(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+    return make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
 
 
 def test_every_clock_is_fitted_as_a_trials_would_be(tmp_path: Path) -> None:
-    found = {item.name: item for item in check_devices(order_of(tmp_path))}
+    found = {item.name: item for item in check_devices(request_of(tmp_path))}
     assert set(found) == {"arm", "clock: events", "clock: arm"}
     assert all(item.passed for item in found.values())
     assert found["clock: events"].finding.endswith("(trigger input)")
@@ -42,8 +42,8 @@ def test_every_clock_is_fitted_as_a_trials_would_be(tmp_path: Path) -> None:
 def test_a_clock_that_cannot_be_fitted_fails_by_name(tmp_path: Path) -> None:
     # an arm that looks at its input every 8 ms, which the rig file does not say
     mock = {"seed": 1, "arm": {"input_sampling_us": 8_000}}
-    order = order_of(tmp_path, {"mock": mock})
-    found = {item.name: item for item in check_devices(order)}
+    run_request = request_of(tmp_path, {"mock": mock})
+    found = {item.name: item for item in check_devices(run_request)}
     assert found["clock: events"].passed
     assert not found["clock: arm"].passed
 
@@ -51,19 +51,19 @@ def test_a_clock_that_cannot_be_fitted_fails_by_name(tmp_path: Path) -> None:
 def test_scatter_beyond_a_quarter_of_a_tick_is_refused_before_anything_runs(tmp_path: Path) -> None:
     timing = {"arm_controller": {"jitter_us": 5000}}
     with pytest.raises(InputError, match=r"timing.arm_controller.jitter_us = 5000.* at most 2500"):
-        order_of(tmp_path, {"timing": timing})
+        request_of(tmp_path, {"timing": timing})
 
 
 def test_the_region_must_cover_the_centre_marker(tmp_path: Path) -> None:
-    (wide,) = check_region(order_of(tmp_path / "a"))
+    (wide,) = check_region(request_of(tmp_path / "a"))
     assert wide.passed
     assert "to spare" in wide.finding
     small = {"width": "12 mm", "height": "12 mm"}
-    (narrow,) = check_region(order_of(tmp_path / "b", region=small))
+    (narrow,) = check_region(request_of(tmp_path / "b", region=small))
     assert not narrow.passed
     assert "widen recording.region by" in narrow.finding
     middle = {"width": "20 mm", "height": "20 mm"}
-    (near,) = check_region(order_of(tmp_path / "c", region=middle))
+    (near,) = check_region(request_of(tmp_path / "c", region=middle))
     assert near.passed
     assert "leave it on the longest" in near.finding
 

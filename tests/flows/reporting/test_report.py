@@ -17,7 +17,7 @@ from sliplab.analysis.nets.metrics import CLASSES
 from sliplab.analysis.statistics.scene_windows import PHASES
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
-from sliplab.flows.planning.orders import Order, make_order
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting import campaign_section, others_section
 from sliplab.flows.reporting.report import read_summary, report, write_figures
 from sliplab.flows.reporting.report_against import compare
@@ -42,7 +42,7 @@ UNITLESS = {
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, with its report."""
     folder = tmp_path_factory.mktemp("report") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -315,9 +315,9 @@ def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -
     data["collection"]["references"] = {
         "every": 1, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
     }  # fmt: skip
-    order = make_order(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
-    collect(order)
-    store = Store.open(order.store)
+    run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
+    collect(run_request)
+    store = Store.open(run_request.store)
     (item,) = collected(store)
     before = campaign_section.reference_rows(store, item)
     assert [row["first_slip_ms"] for row in before] == [None, None]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import against, report_folder
 from sliplab.flows.study import Outcome
 from sliplab.storage.store import Store
@@ -34,7 +34,7 @@ EMPTY = """() => [...document.querySelectorAll('figure')].filter((e) => {
 
 
 @pytest.fixture(scope="module")
-def folder(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the small study's report, compared with itself."""
     store = tmp_path_factory.mktemp("page") / "store"
     shutil.copytree(ran[0][0].store, store, ignore=shutil.ignore_patterns("trials"))

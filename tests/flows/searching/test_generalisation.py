@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching import generalisation
@@ -26,7 +26,7 @@ from tests.command_line import here
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, tried without one direction and on one other skin."""
     folder = tmp_path_factory.mktemp("generalisation") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -59,7 +59,9 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     assert not (folder / "skin101").exists()
     seen: list[str] = []
     monkeypatch.setattr(
-        generalisation, "collect", lambda order: seen.append(order.rig.scene.scene.skin.seed)
+        generalisation,
+        "collect",
+        lambda run_request: seen.append(run_request.rig.scene.scene.skin.seed),
     )
     with pytest.raises(StoreError, match="holds no campaign yet"):
         Generalisation(store, collected(store), 1).skin(102, 4)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import guesses_section
 from sliplab.flows.reporting.report import report
 from sliplab.flows.running.campaigns import collected
@@ -27,7 +27,7 @@ GUESS = "event_camera.contrast"
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, its contrast measured down and up."""
     folder = tmp_path_factory.mktemp("guesses") / "store"
     shutil.copytree(ran[0][0].store, folder)

@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.running.campaigns import collected
@@ -26,7 +26,7 @@ SEEDS = (5, 6)
 
 
 @pytest.fixture(scope="module")
-def store(ran: tuple[list[Order], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A copy of the small study, with four trials held out."""
     folder = tmp_path_factory.mktemp("holdout") / "store"
     shutil.copytree(ran[0][0].store, folder)
@@ -53,16 +53,18 @@ def test_the_release_s_seeds_stand_nowhere_else() -> None:
 
 def test_its_trials_are_others_on_another_skin(store: Store) -> None:
     item = collected(store)[0]
-    order = Holdout(store, collected(store), 4, SEEDS).order()
-    assert order.plan.protocol.collection.seed == SEEDS[0] != item.plan.protocol.collection.seed
-    assert order.rig.scene.scene.skin.seed == SEEDS[1]
-    assert {trial.split for trial in order.plan} == {"test"}
-    assert not {trial.seed for trial in order.plan} & {trial.seed for trial in item.plan}
+    run_request = Holdout(store, collected(store), 4, SEEDS).run_request()
+    assert (
+        run_request.plan.protocol.collection.seed == SEEDS[0] != item.plan.protocol.collection.seed
+    )
+    assert run_request.rig.scene.scene.skin.seed == SEEDS[1]
+    assert {trial.split for trial in run_request.plan} == {"test"}
+    assert not {trial.seed for trial in run_request.plan} & {trial.seed for trial in item.plan}
     theirs = Store.open(store.folder / "holdout" / "store").campaign(item.name)
-    assert theirs.committed() == order.only
+    assert theirs.committed() == run_request.only
     # the study's own campaigns are what they were: nothing trains on these, or chooses by them
     assert [campaign.name for campaign in store.campaigns()] == ["tiny", "tiny_gravity"]
-    settings = order.plan.protocol.analysis
+    settings = run_request.plan.protocol.analysis
     assert settings.model_copy(update={"split": item.settings.split}) == item.settings
 
 

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sliplab.flows.planning.orders import Order
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running.campaigns import collected
-from sliplab.flows.searching.other_rig import other_order
+from sliplab.flows.searching.other_rig import other_request
 from sliplab.flows.study import Outcome
 from sliplab.storage.store import Store
 
 
-def test_only_what_is_asked_for_differs(ran: tuple[list[Order], Outcome], tmp_path: Path) -> None:
+def test_only_what_is_asked_for_differs(
+    ran: tuple[list[RunRequest], Outcome], tmp_path: Path
+) -> None:
     (first, _), _ = ran
     (item,) = collected(Store.open(first.store), [first.campaign])
     change = {"mock": {"scene": {"skin": {"seed": 77}}}}
-    order = other_order(item, change, tmp_path / "other", most=3)
-    assert (order.store, order.campaign, order.most) == (tmp_path / "other" / "store", "tiny", 3)
-    assert order.plan.trials == first.plan.trials
-    skin = order.rig.scene.scene.skin
+    run_request = other_request(item, change, tmp_path / "other", most=3)
+    assert (run_request.store, run_request.campaign, run_request.most) == (
+        tmp_path / "other" / "store",
+        "tiny",
+        3,
+    )
+    assert run_request.plan.trials == first.plan.trials
+    skin = run_request.rig.scene.scene.skin
     assert skin.seed == 77 != first.rig.scene.scene.skin.seed
     own = first.rig.scene.scene
-    again = order.rig.scene.scene.model_copy(update={"skin": own.skin})
+    again = run_request.rig.scene.scene.model_copy(update={"skin": own.skin})
     assert skin.model_copy(update={"seed": own.skin.seed}) == own.skin
     assert again == own
-    assert other_order(item, {}, tmp_path / "same").rig.scene == first.rig.scene
+    assert other_request(item, {}, tmp_path / "same").rig.scene == first.rig.scene

@@ -18,7 +18,7 @@ import yaml
 
 from sliplab.flows.collecting import showing
 from sliplab.flows.collecting.stops import WindowOver
-from sliplab.flows.planning.orders import make_order
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from sliplab.flows.serving import serve, serve_runs
@@ -171,7 +171,7 @@ def test_a_rig_that_is_free_again_is_taken(
     service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(serve_runs, "LOOK_S", 0.01)
-    order = make_order(protocol, RIG, service.folder)
+    run_request = make_request(protocol, RIG, service.folder)
     answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
     told: list[str] = []
     monkeypatch.setattr(serve_runs, "_report_waiting", lambda run, why: told.append(why))
@@ -182,11 +182,11 @@ def test_a_rig_that_is_free_again_is_taken(
             raise answer
         return answer
 
-    assert serve_runs.when_free(order, 10.0, work, None) == {"taken": 1}
+    assert serve_runs.when_free(run_request, 10.0, work, None) == {"taken": 1}
     assert told == ["the rig is in use by anna"]
     answers[:] = [Locked("the rig is in use by anna")]
     with pytest.raises(WindowOver, match="nothing was taken: the rig is in use by anna"):
-        serve_runs.when_free(replace(order, until=0.0), 10.0, work, None)
+        serve_runs.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 
 def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:

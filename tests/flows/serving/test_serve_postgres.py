@@ -110,7 +110,7 @@ def test_a_campaign_is_paused_and_cancelled_and_goes_on(
     with serving(store, rig, "postgres", server, tmp_path / "serve.log", nights) as page:
         page_collects(page, file, committed)
 
-    reference = campaign.make_order(file, rig, tmp_path / "undisturbed")
+    reference = campaign.make_request(file, rig, tmp_path / "undisturbed")
     campaign.collect(reference)
     whole = campaign.hashes(tmp_path / "undisturbed")
     assert len(whole) == TRIALS

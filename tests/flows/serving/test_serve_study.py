@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.planning.orders import make_order
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.serving import serve_flows
 from sliplab.flows.serving.serve_parameters import Study
 from sliplab.flows.study import Outcome
@@ -35,18 +35,22 @@ def test_a_served_study_asks_for_the_same_trials(
 ) -> None:
     asked: list[Any] = []
 
-    def study(orders: list[Any], check: int) -> Outcome:
-        asked.extend([orders, check])
+    def study(run_requests: list[Any], check: int) -> Outcome:
+        asked.extend([run_requests, check])
         return Outcome([{"taken": 3}], [{"step": "report", "done": 1}])
 
     monkeypatch.setattr("sliplab.flows.study.study", study)
-    monkeypatch.setattr(serve_flows, "when_free", lambda _order, _patience, work, _run: work())
+    monkeypatch.setattr(
+        serve_flows, "when_free", lambda _run_request, _patience, work, _run: work()
+    )
     here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
     said = serve_flows._study(Study(extra=extra), here, None)
     assert said == "3 trials taken; report: 1 done"
-    orders, check = asked
+    run_requests, check = asked
     assert check == LABELS_CHECKED
-    assert [len(order.plan.trials) for order in orders] == [864, 180, trials]
-    for order, (file, on) in zip(orders, study_protocols(False, extra).items(), strict=True):
+    assert [len(run_request.plan.trials) for run_request in run_requests] == [864, 180, trials]
+    for run_request, (file, on) in zip(
+        run_requests, study_protocols(False, extra).items(), strict=True
+    ):
         rig = ROOT / "rigs" / "rehearsal.yaml"
-        assert order.plan == make_order(file, rig, tmp_path / "other", enable=on).plan
+        assert run_request.plan == make_request(file, rig, tmp_path / "other", enable=on).plan

@@ -14,7 +14,7 @@ from sliplab.analysis.timeline import synchronise
 from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
-from sliplab.flows.planning.orders import make_order
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.reporting.summary import _sync as sync_summary
 from sliplab.flows.running.campaigns import Collected, collected
 from sliplab.flows.syncing.sync import sync
@@ -40,8 +40,8 @@ def store(tmp_path_factory: pytest.TempPathFactory, rig_path: Path) -> Store:
         "validation_levels": {"direction": ["120 deg"]},
         "test_levels": {"direction": ["240 deg"]},
     }
-    order = make_order(write(folder / "tiny.yaml", data), rig_path, folder / "store")
-    collect(order)
+    run_request = make_request(write(folder / "tiny.yaml", data), rig_path, folder / "store")
+    collect(run_request)
     return Store.open(folder / "store")
 
 

@@ -13,7 +13,7 @@ from datetime import datetime
 from sliplab.flows.collecting.disk_watch import DiskWatch
 from sliplab.flows.collecting.reference_watch import ReferenceWatch
 from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
-from sliplab.flows.planning.orders import Order, pending_trials
+from sliplab.flows.planning.run_request import RunRequest, pending_trials
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import Trial
 from sliplab.storage import control, decisions
@@ -68,8 +68,8 @@ def refuse_paused(store: Store) -> None:
         )
 
 
-class Boundary:
-    """What a session asks before each trial, and tells after it.
+class TrialGate:
+    """Trial gate: asked before each trial, notified after it.
 
     Attributes:
         wait: lets some seconds pass, and answers stop requests.
@@ -79,11 +79,15 @@ class Boundary:
     """
 
     def __init__(
-        self, order: Order, store: Store, campaign: Campaign, disk: DiskWatch | None = None
+        self,
+        run_request: RunRequest,
+        store: Store,
+        campaign: Campaign,
+        disk: DiskWatch | None = None,
     ) -> None:
-        self._order, self._store, self._campaign = order, store, campaign
-        self.disk = DiskWatch(order, campaign) if disk is None else disk
-        self._references = ReferenceWatch(order, campaign)
+        self._run_request, self._store, self._campaign = run_request, store, campaign
+        self.disk = DiskWatch(run_request, campaign) if disk is None else disk
+        self._references = ReferenceWatch(run_request, campaign)
         self.wait: Callable[[float], None] = stopping.wait
         self.on_pause: Callable[[float], None] = lambda seconds: None
         self.fresh_start: Callable[[], None] = lambda: None
@@ -133,7 +137,7 @@ class Boundary:
         wanted, self._wanted = self._wanted, set()
         if not wanted:
             return []
-        return [t for t in pending_trials(self._order.plan, self._campaign) if t.id in wanted]
+        return [t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in wanted]
 
     def _look(self) -> Request | None:
         """Carry out what is new; returns the request by which the store is paused, if it is."""
@@ -141,12 +145,12 @@ class Boundary:
         if names != self._seen:
             self._seen = names  # without the answers below: so what comes meanwhile is seen, too
             for request, answer in carry_out(self._store, running=True):
-                self._heed(request, answer)
+                self._apply(request, answer)
             self._paused = control.paused(self._store)
         return self._paused
 
-    def _heed(self, request: Request, answer: Json) -> None:
-        """What an answered request means for this stretch of work."""
+    def _apply(self, request: Request, answer: Json) -> None:
+        """Apply an answered request to this session."""
         if request.kind == "stop":
             console.say(f"stopped: {request}")
             stopping.stop()
@@ -160,11 +164,11 @@ class Boundary:
 
     def _check_window(self, trial: Trial) -> None:
         """A trial is begun only if its planned time fits in: the arm rests when people come."""
-        until = self._order.until
+        until = self._run_request.until
         if until is None:
             return
-        virtual = self._order.rig.in_virtual_time
-        planned = 0.0 if virtual else self._order.plan.seconds(trial)
+        virtual = self._run_request.rig.in_virtual_time
+        planned = 0.0 if virtual else self._run_request.plan.seconds(trial)
         if self.clock() + planned > until:
             raise WindowOver(
                 f"the window of campaign {self._campaign.name} ends "

@@ -20,8 +20,8 @@ from sliplab.storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreErro
 
 
 @dataclass(frozen=True)
-class Bench:
-    """Who stands at the rig, and what the room is like; kept for each stretch of work."""
+class SessionMetadata:
+    """Operator and conditions of one session at the rig."""
 
     operator: str = ""
     temperature_c: float | None = None
@@ -30,8 +30,8 @@ class Bench:
 
 
 @dataclass(frozen=True)
-class Order:
-    """A collection that was asked for and found possible."""
+class RunRequest:
+    """A requested collection that was checked and found possible."""
 
     plan: Plan
     rig: RigFile
@@ -39,7 +39,7 @@ class Order:
     store: Path
     campaign: str
     enable: tuple[str, ...]
-    bench: Bench = Bench()
+    metadata: SessionMetadata = SessionMetadata()
     most: int | None = None
     """Trials that were asked for at most."""
     until: float | None = None
@@ -53,17 +53,17 @@ class Order:
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
 
 
-def make_order(
+def make_request(
     protocol: Path,
     rig: Path,
     store: Path,
     *,
     enable: tuple[str, ...] = (),
     campaign: str | None = None,
-    bench: Bench = Bench(),
+    metadata: SessionMetadata = SessionMetadata(),
     most: int | None = None,
     until: float | None = None,
-) -> Order:
+) -> RunRequest:
     """Read and check everything that can be known before anything moves.
 
     Raises:
@@ -84,47 +84,47 @@ def make_order(
     # one campaign, one physics: a level of a factor that is added later must not change it
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
-    order = Order(plan, rig_file, rig_text, store, name, enable, bench, most, until)
+    run_request = RunRequest(plan, rig_file, rig_text, store, name, enable, metadata, most, until)
     if begun:
-        _check_same(order, begun)
-    return order
+        _check_same(run_request, begun)
+    return run_request
 
 
-def _check_same(order: Order, campaign: Campaign) -> None:
+def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
     info = campaign.info
     if IMPORTED in info:
         raise StoreError(
             f"{campaign.folder}: was imported; give the new one its own name with --campaign"
         )
-    if info["collection_hash"] != order.plan.collection_hash:
+    if info["collection_hash"] != run_request.plan.collection_hash:
         raise StoreError(
             f"{campaign.folder}: was begun under another `collection:` section; changing "
             "analysis, levels or repetitions is fine, anything else would mix two experiments. "
-            f"Give the new one its own name with --campaign.{_changed(order, campaign)}"
+            f"Give the new one its own name with --campaign.{_changed(run_request, campaign)}"
         )
-    if info["rig_hash"] != rig_hash(order.rig_text) and not same_rig(
-        read_text(campaign.folder / "rig.yaml", "rig file"), order.rig_text
+    if info["rig_hash"] != rig_hash(run_request.rig_text) and not same_rig(
+        read_text(campaign.folder / "rig.yaml", "rig file"), run_request.rig_text
     ):
         raise StoreError(
             f"{campaign.folder}: was begun on another rig file (its copy is rig.yaml there); "
-            f"give the new one its own name with --campaign.{_rig_changed(order, campaign)}"
+            f"give the new one its own name with --campaign.{_rig_changed(run_request, campaign)}"
         )
-    if missing := campaign.committed() - {trial.id for trial in order.plan}:
+    if missing := campaign.committed() - {trial.id for trial in run_request.plan}:
         raise StoreError(
             f"{campaign.folder}: holds trials that the protocol no longer has, such as "
             f"{min(missing)}; a protocol may only add trials to a campaign."
-            f"{_changed(order, campaign)}"
+            f"{_changed(run_request, campaign)}"
         )
 
 
-def _changed(order: Order, campaign: Campaign) -> str:
+def _changed(run_request: RunRequest, campaign: Campaign) -> str:
     """What differs from the campaign's own copy of its protocol, if that can be read."""
     try:
         begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()), stored=True)
     except InputError:
         return ""
-    old, new = begun.collection_data, order.plan.collection_data
-    for data, enabled in ((old, begun.enabled), (new, order.plan.enabled)):
+    old, new = begun.collection_data, run_request.plan.collection_data
+    for data, enabled in ((old, begun.enabled), (new, run_request.plan.enabled)):
         for name, factor in data["factors"].items():  # however they were written
             for key in ("values", "range", "optional"):
                 factor.pop(key)
@@ -133,10 +133,10 @@ def _changed(order: Order, campaign: Campaign) -> str:
     return f" What changed:{changes}" if changes else ""
 
 
-def _rig_changed(order: Order, campaign: Campaign) -> str:
+def _rig_changed(run_request: RunRequest, campaign: Campaign) -> str:
     """What differs from the campaign's own copy of its rig file."""
     old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
-    new = parse_yaml(order.rig_text, "rig file")
+    new = parse_yaml(run_request.rig_text, "rig file")
     changes = format_differences(without_secrets(old), without_secrets(new))
     return f" What changed:{changes}" if changes else ""
 
@@ -183,46 +183,48 @@ def set_aside(
     return found
 
 
-def describe_campaign(store: Store, order: Order) -> Campaign:
+def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
     """Write what the campaign is; the protocol's analysis and levels may have changed."""
-    campaign = store.campaign(order.campaign)
+    campaign = store.campaign(run_request.campaign)
     info = {
-        "name": order.campaign,
-        "protocol": order.plan.protocol.name,
-        "experiment": order.plan.protocol.collection.experiment,
-        "collection_hash": order.plan.collection_hash,
-        "rig": order.rig.name,
-        "rig_hash": rig_hash(order.rig_text),
-        "simulated": order.rig.simulated,
-        "scene_level": order.rig.scene.scene.level if order.rig.simulated else None,
-        "enabled": list(order.enable),
+        "name": run_request.campaign,
+        "protocol": run_request.plan.protocol.name,
+        "experiment": run_request.plan.protocol.collection.experiment,
+        "collection_hash": run_request.plan.collection_hash,
+        "rig": run_request.rig.name,
+        "rig_hash": rig_hash(run_request.rig_text),
+        "simulated": run_request.rig.simulated,
+        "scene_level": run_request.rig.scene.scene.level if run_request.rig.simulated else None,
+        "enabled": list(run_request.enable),
     }
-    protocol_text = read_text(Path(order.plan.file), "protocol")
-    campaign.update(info, protocol_text, mask_secrets(order.rig_text))
+    protocol_text = read_text(Path(run_request.plan.file), "protocol")
+    campaign.update(info, protocol_text, mask_secrets(run_request.rig_text))
     return campaign
 
 
-def missing_bytes(order: Order) -> float:
+def missing_bytes(run_request: RunRequest) -> float:
     """Bytes that the trials still to take are expected to need."""
-    pending = order.wanted(Store(order.store).campaign(order.campaign))
-    done = {trial.id for trial in order.plan} - {trial.id for trial in pending}
-    return plan_bytes(order.rig, order.plan, done)
+    pending = run_request.wanted(Store(run_request.store).campaign(run_request.campaign))
+    done = {trial.id for trial in run_request.plan} - {trial.id for trial in pending}
+    return plan_bytes(run_request.rig, run_request.plan, done)
 
 
-def check_disk(orders: list[Order]) -> int:
-    """Free bytes where the orders' store is or will be.
+def check_disk(run_requests: list[RunRequest]) -> int:
+    """Free bytes where the requests' store is or will be.
 
     Raises:
         InputError: what is still to be taken does not fit.
     """
-    return check_space(orders[0].store, sum(missing_bytes(order) for order in orders))
+    return check_space(
+        run_requests[0].store, sum(missing_bytes(run_request) for run_request in run_requests)
+    )
 
 
-def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:
+def campaign_counts(run_request: RunRequest, campaign: Campaign) -> dict[str, Any]:
     """What a campaign holds now: planned = committed + missing."""
-    planned = {trial.id for trial in order.plan}
+    planned = {trial.id for trial in run_request.plan}
     committed = campaign.committed() & planned
-    aside = set_aside(order.plan, campaign)
+    aside = set_aside(run_request.plan, campaign)
     return {
         "campaign": campaign.name,
         "planned": len(planned),
@@ -231,5 +233,5 @@ def campaign_counts(order: Order, campaign: Campaign) -> dict[str, Any]:
         "set_aside": sorted(item["trial"] for item in aside),
         "causes": aside,
         "missing": len(planned) - len(committed),
-        "simulated": order.rig.simulated,
+        "simulated": run_request.rig.simulated,
     }

@@ -1,6 +1,6 @@
-"""One stretch of work at a rig, from the store's lock to the last trial, without Prefect.
+"""One session at a rig, from the store's lock to the last trial, without Prefect.
 
-Everything that a crash may have left behind is put right here, before the first trial.
+Recovery from a crash happens here, before the first trial.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from sliplab.flows.collecting.boundary import Boundary, carry_out
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.orders import Order, describe_campaign, pending_trials
+from sliplab.flows.collecting.trial_gate import TrialGate, carry_out
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign, pending_trials
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
@@ -28,11 +28,11 @@ from sliplab.storage.store import Campaign, Store
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RunSession:
     """A session that is about to begin, and the trials that it is to take."""
 
     session: Session
-    boundary: Boundary
+    gate: TrialGate
     trials: list[Trial]
     left_out: int = 0
     """Trials that the store lacks besides, and that were not asked for."""
@@ -60,50 +60,52 @@ def owned(store: Store, *, brief: bool = False, collects: str = "") -> Iterator[
 
 
 @contextmanager
-def stretch(order: Order) -> Iterator[Stretch]:
-    """What a collection does round its trials; the rig is closed when the block ends.
+def run_session(run_request: RunRequest) -> Iterator[RunSession]:
+    """Open a session round a collection's trials; the rig is closed when the block ends.
 
     Raises:
         Locked: somebody else collects into the store, or uses the rig.
         StoreError: its disk is full, read-only or failing.
         CampaignStopped: reference trials had drifted.
     """
-    store = Store.create(order.store)
-    with owned(store, collects=order.campaign):
-        campaign = _put_right(store, order)
-        boundary = Boundary(order, store, campaign)
-        boundary.begin()
-        with held(order.rig, store.folder):
-            rig = build_rig(order.rig)
+    store = Store.create(run_request.store)
+    with owned(store, collects=run_request.campaign):
+        campaign = _recover(store, run_request)
+        gate = TrialGate(run_request, store, campaign)
+        gate.begin()
+        with held(run_request.rig, store.folder):
+            rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
-            trials = order.wanted(campaign)
-            left_out = len(pending_trials(order.plan, campaign)) - len(trials)
-            campaign.add_bench_record(_bench_record(order))
-            session = Session(order.plan, order.rig, rig, campaign, order.bench.operator)
-            session.boundary, boundary.fresh_start = boundary, session.fresh_start
+            trials = run_request.wanted(campaign)
+            left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+            campaign.add_bench_record(_session_record(run_request))
+            session = Session(
+                run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
+            )
+            session.gate, gate.fresh_start = gate, session.fresh_start
             try:
-                yield Stretch(session, boundary, trials, left_out)
+                yield RunSession(session, gate, trials, left_out)
             finally:
                 rig.close()
 
 
-def refresh(order: Order) -> Campaign:
-    """Put the store right and write what the campaign is, when there is nothing to take."""
-    store = Store.create(order.store)
+def refresh(run_request: RunRequest) -> Campaign:
+    """Recover the store and write the campaign's description, when there is nothing to take."""
+    store = Store.create(run_request.store)
     with owned(store):
-        return _put_right(store, order)
+        return _recover(store, run_request)
 
 
-def _put_right(store: Store, order: Order) -> Campaign:
-    """What a crash left is cleared up, and what was asked for and not done yet is done."""
-    clear_up(store)
-    campaign = describe_campaign(store, order)
+def _recover(store: Store, run_request: RunRequest) -> Campaign:
+    """Clean up after a crash and carry out requests that were not carried out yet."""
+    clean_up(store)
+    campaign = describe_campaign(store, run_request)
     campaign.sweep()
     carry_out(store)
     return campaign
 
 
-def clear_up(store: Store) -> None:
+def clean_up(store: Store) -> None:
     """Delete the temporary files that killed programs left outside the campaigns."""
     sweep_temporary(store.folder)
     sweep_temporary(store.folder / control.FOLDER)
@@ -115,17 +117,17 @@ def clear_up(store: Store) -> None:
         sweep_temporary(folder)
 
 
-def _bench_record(order: Order) -> dict[str, Any]:
-    """One stretch of work at the rig."""
+def _session_record(run_request: RunRequest) -> dict[str, Any]:
+    """Metadata of one session at the rig, as the store keeps it."""
     began = datetime.now(UTC)
-    skin = order.rig.skin
+    skin = run_request.rig.skin
     return {
         "began": began.isoformat(timespec="seconds"),
-        **asdict(order.bench),
-        "rig": order.rig.name,
-        "sensor": order.rig.sensor,
+        **asdict(run_request.metadata),
+        "rig": run_request.rig.name,
+        "sensor": run_request.rig.sensor,
         "skin": skin.serial,
-        "calibration": order.rig.calibration.model_dump(mode="json", exclude_none=True),
+        "calibration": run_request.rig.calibration.model_dump(mode="json", exclude_none=True),
         "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
-        "simulated": order.rig.simulated,
+        "simulated": run_request.rig.simulated,
     }

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting import boundary as boundary_module
-from sliplab.flows.collecting.boundary import Boundary, carry_out, refuse_paused
+from sliplab.flows.collecting import trial_gate as gate_module
+from sliplab.flows.collecting.run_session import run_session
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.collecting.stops import CampaignStopped
-from sliplab.flows.collecting.stretch import stretch
-from sliplab.flows.planning.orders import make_order, pending_trials, set_aside
+from sliplab.flows.collecting.trial_gate import TrialGate, carry_out, refuse_paused
+from sliplab.flows.planning.run_request import make_request, pending_trials, set_aside
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.storage import control
@@ -34,17 +34,17 @@ def forget() -> Iterator[None]:
 def guarded(
     folder: Path, data: dict[str, Any] | None = None, **mock: Any
 ) -> tuple[Session, Campaign, Store]:
-    """A session with a boundary, whose waits fail unless a test says what happens in them."""
+    """A session with a trial gate, whose waits fail unless a test says what happens in them."""
     work, campaign = session(folder, data or short(), **mock)
     store = Store.open(folder / "store")
-    order = make_order(folder / "p.yaml", folder / "rig.yaml", folder / "store")
-    work.boundary = Boundary(order, store, campaign)
-    work.boundary.fresh_start = work.fresh_start
+    run_request = make_request(folder / "p.yaml", folder / "rig.yaml", folder / "store")
+    work.gate = TrialGate(run_request, store, campaign)
+    work.gate.fresh_start = work.fresh_start
 
     def never(seconds: float) -> None:
         raise AssertionError("waits")
 
-    work.boundary.wait = never
+    work.gate.wait = never
     return work, campaign, store
 
 
@@ -76,11 +76,11 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
         if len(waits) == 3:
             control.ask(store, "resume", who="ben")
 
-    assert work.boundary is not None
-    work.boundary.wait, work.boundary.on_pause = wait, pauses.append
+    assert work.gate is not None
+    work.gate.wait, work.gate.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
-    assert pauses == [3 * boundary_module.LOOK_S]
+    assert pauses == [3 * gate_module.LOOK_S]
     asked = control.requests(store)
     assert [(item.kind, item.who, item.why) for item in asked] == [
         ("pause", "anna", "lunch"), ("resume", "ben", ""),
@@ -93,10 +93,10 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
 def test_a_pause_that_nobody_ends_ends_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(boundary_module, "PAUSE_LIMIT_S", 2.0)
+    monkeypatch.setattr(gate_module, "PAUSE_LIMIT_S", 2.0)
     work, campaign, store = guarded(tmp_path / "a")
-    assert work.boundary is not None
-    work.boundary.wait = lambda seconds: None
+    assert work.gate is not None
+    work.gate.wait = lambda seconds: None
     with pytest.raises(CampaignStopped, match=r"pause by anna.*nobody resumed it: `sliplab resume"):
         after_first(work, lambda: control.ask(store, "pause", who="anna"))
     assert len(campaign.committed()) == 1
@@ -116,8 +116,8 @@ def test_after_a_pause_the_skin_is_warmed_up_and_zero_found_again(tmp_path: Path
     press, touch_off = work.rig.press, work.rig.touch_off
     work.rig.press = lambda *given: (done.append("warm up"), press(*given))[1]  # type: ignore[method-assign]
     work.rig.touch_off = lambda *given: (done.append("zero"), touch_off(*given))[1]  # type: ignore[method-assign]
-    assert work.boundary is not None
-    work.boundary.wait = lambda seconds: control.ask(store, "resume") and None
+    assert work.gate is not None
+    work.gate.wait = lambda seconds: control.ask(store, "resume") and None
     after_first(work, lambda: control.ask(store, "pause"))
     assert done == ["warm up", "zero"] * 2
     assert len(campaign.committed()) == 3
@@ -140,10 +140,10 @@ def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
     work, _, store = guarded(tmp_path / "a")
     work.rig.close()
     control.ask(store, "stop")
-    order = make_order(
+    run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
-    with stretch(order) as work_now:
+    with run_session(run_request) as work_now:
         work_now.session.rig.connect()
         work_now.session.take(work_now.trials)
         assert work_now.session.taken == 3
@@ -171,16 +171,16 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert skipped(campaign)[second]["request"] == 1
     (kept,) = campaign.quarantined()
     assert (kept["cause"], kept["asked"]["who"]) == ("again: dust", "ben")
-    assert work.boundary is not None
-    again = work.boundary.more()
+    assert work.gate is not None
+    again = work.gate.more()
     assert [trial.id for trial in again] == [first]
     work.take(again)
-    assert work.boundary.more() == []
+    assert work.gate.more() == []
     assert campaign.recording(first).record["attempt"] == 1  # another take, another seed
     assert campaign.committed() == {first, third}
     assert verify(store) == []
     control.ask(store, "again", campaign="tiny", trials=(second,), why="cable is gone")
-    work.take(work.boundary.more())
+    work.take(work.gate.more())
     assert campaign.committed() == {first, second, third}
     assert set_aside(work.plan, campaign) == []
 
