@@ -90,7 +90,7 @@ def _samples(events: EventChunk, count: int, settings: Windows) -> U8:
     """Windows from all over a trial."""
     last = int(events.t_us[-1]) - settings.length_ms * 1000
     starts = np.linspace(int(events.t_us[0]), last, count).astype(np.int64)
-    return bin_events(events.x, events.y, events.p, events.t_us, starts, settings)
+    return bin_events(events, starts, settings)
 
 
 def _training(
@@ -264,15 +264,14 @@ def _windows(events: EventChunk, settings: Windows, runs: int) -> Figures:
     first, last = int(events.t_us[0]), int(events.t_us[-1])
     starts = np.arange(first, last, settings.length_ms * 1000, dtype=np.int64)
     repeats = 20
-    columns = (events.x, events.y, events.p, events.t_us)
 
     def listed() -> None:
         for _ in range(repeats):
-            list_events(*columns, starts, settings)
+            list_events(events, starts, settings)
 
     def dense() -> None:
         for _ in range(repeats):
-            bin_events(*columns, starts, settings)
+            bin_events(events, starts, settings)
 
     work: dict[str, Callable[[], object]] = {"listed": listed, "dense": dense}
     if find_spec("tonic"):

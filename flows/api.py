@@ -20,6 +20,7 @@ from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store as TrialStore
+from sliplab.storage.streams import EventChunk
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -361,8 +362,8 @@ class Model:
         from sliplab.analysis.nets.windows import list_events
 
         windows = list_events(
-            events.x, events.y, events.p, events.t_ns // 1000, np.asarray(start_ns) // 1000,
-            self.fitted.windows, *size_px,
+            EventChunk(events.x, events.y, events.p, events.t_ns // 1000),
+            np.asarray(start_ns) // 1000, self.fitted.windows, *size_px,
         )  # fmt: skip
         return training.predict_counts(self.fitted, windows)
 

@@ -210,8 +210,7 @@ class LiveDetector:
 
     def _bin(self, chunk: EventChunk, start_us: int) -> npt.NDArray[np.uint8]:
         starts = np.array([start_us], np.int64)
-        columns = (chunk.x, chunk.y, chunk.p, chunk.t_us)
-        return bin_events(*columns, starts, self._windows, *self._geometry)
+        return bin_events(chunk, starts, self._windows, *self._geometry)
 
     # -- windows -----------------------------------------------------------------------------
 

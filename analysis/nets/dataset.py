@@ -113,10 +113,7 @@ def cut_windows(
     events = recording.events()
     starts_us = np.asarray(recording.clock("events").to_device(starts_ns)) // 1000
     width, height = recording.record["geometry"]["event_px"]
-    return list_events(
-        events.x, events.y, events.p, events.t_us, starts_us, windows, width, height,
-        crop_centre_px(recording),
-    )  # fmt: skip
+    return list_events(events, starts_us, windows, width, height, crop_centre_px(recording))
 
 
 def crop_centre_px(recording: Recording) -> tuple[float, float] | None:

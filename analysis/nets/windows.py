@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 
 from sliplab.analysis.nets.sparse import SparseWindows
 from sliplab.protocols.settings import Windows
+from sliplab.storage.streams import EventChunk
 
 _UNSORTED = -1
 
 
 def bin_events(
-    x: NDArray[Any],
-    y: NDArray[Any],
-    p: NDArray[Any],
-    t_us: NDArray[np.int64],
+    events: EventChunk,
     starts_us: NDArray[np.int64],
     settings: Windows,
     width: int = 640,
@@ -37,9 +35,8 @@ def bin_events(
     cell of ``pool`` x ``pool`` pixels of the square crop that holds its pixel.
 
     Args:
-        x, y: (k,) unsigned or signed integers, pixel column and row.
-        p: (k,) bool or integers, positive where greater than 0.
-        t_us: (k,) int64, microseconds, sorted.
+        events: k of them, sorted by time; pixels may be integers of any kind, polarity also bool or
+            signed, positive where greater than 0.
         starts_us: (n,) int64, the windows' starts on the same clock, any order, may overlap.
         settings: window length, step, crop, pooling and polarity.
         width, height: the sensor's pixels.
@@ -55,7 +52,7 @@ def bin_events(
             sensor, or a crop larger than the sensor.
         TypeError: a column holds no integers.
     """
-    columns = _columns(x, y, p, t_us)
+    columns = _columns(events)
     starts = _times(starts_us, "starts_us")
     of_x, of_y = _cells(settings, width, height, centre_px)
     shape = (starts.size, settings.steps, settings.channels, settings.cells, settings.cells)
@@ -68,10 +65,7 @@ def bin_events(
 
 
 def list_events(
-    x: NDArray[Any],
-    y: NDArray[Any],
-    p: NDArray[Any],
-    t_us: NDArray[np.int64],
+    events: EventChunk,
     starts_us: NDArray[np.int64],
     settings: Windows,
     width: int = 640,
@@ -82,7 +76,7 @@ def list_events(
 
     Arguments and errors as `bin_events`; ``list_events(...).dense()`` is what that returns.
     """
-    columns = _columns(x, y, p, t_us)
+    columns = _columns(events)
     starts = _times(starts_us, "starts_us")
     of_x, of_y = _cells(settings, width, height, centre_px)
     shape = (settings.steps, settings.channels, settings.cells, settings.cells)
@@ -101,10 +95,7 @@ def list_events(
 
 
 def window_totals(
-    x: NDArray[Any],
-    y: NDArray[Any],
-    p: NDArray[Any],
-    t_us: NDArray[np.int64],
+    events: EventChunk,
     starts_us: NDArray[np.int64],
     settings: Windows,
     width: int = 640,
@@ -115,7 +106,7 @@ def window_totals(
 
     Arguments and errors as there; returns (n,) int64.
     """
-    columns = _columns(x, y, p, t_us)
+    columns = _columns(events)
     starts = _times(starts_us, "starts_us")
     of_x, of_y = _cells(settings, width, height, centre_px)
     out = np.zeros(starts.size, np.int64)
@@ -131,11 +122,12 @@ _CODES = {"negative": 0, "positive": 1, "both": 2}
 _Columns = tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.uint8], NDArray[np.int64]]
 
 
-def _columns(x: NDArray[Any], y: NDArray[Any], p: NDArray[Any], t_us: NDArray[Any]) -> _Columns:
+def _columns(events: EventChunk) -> _Columns:
+    x, y, p, t_us = events.x, events.y, events.p, events.t_us
     if not len(x) == len(y) == len(p) == len(t_us):
         lengths = f"x {len(x)}, y {len(y)}, p {len(p)}, t_us {len(t_us)}"
         raise ValueError(f"event columns of unequal length: {lengths}")
-    polarity = np.asarray(p)
+    polarity: NDArray[Any] = np.asarray(p)
     if polarity.dtype.kind not in "iub" or polarity.ndim != 1:
         raise TypeError(
             f"p must be a 1-D integer or bool array, not {polarity.dtype} {polarity.shape}"

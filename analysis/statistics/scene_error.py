@@ -138,13 +138,10 @@ def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
         return None
     starts = consecutive_windows(reference.begin_us, reference.end_us, windows.length_ms * 1000)
     b, a = (
-        bin_events(
-            seen.events.x, seen.events.y, seen.events.p, seen.events.t_us, starts, windows,
-            *seen.size_px,
-        )
+        bin_events(seen.events, starts, windows, *seen.size_px)
         for seen in (reference, other)
         if seen.events is not None
-    )  # fmt: skip
+    )
     total = int(b.sum(dtype=np.int64))
     # counts are unsigned: the larger less the smaller one
     return (

@@ -57,10 +57,9 @@ def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWind
     chosen = choose_windows(
         begin_ns, end_ns, *seen.markers, windows.length_ms * 1_000_000, samples.per_class, seed
     )
-    columns = seen.events.x, seen.events.y, seen.events.p, seen.events.t_us
     silent = []
     for name in sorted(chosen):
-        totals = window_totals(*columns, chosen[name] // 1000, windows, *seen.size_px)
+        totals = window_totals(seen.events, chosen[name] // 1000, windows, *seen.size_px)
         silent.append(int(np.count_nonzero(totals == 0)))
     in_hold = np.count_nonzero(chosen[NO_SLIP] + windows.length_ms * 1_000_000 <= 0)
     incipient, gross = (end_ns if onset is None else onset for onset in seen.markers)

@@ -61,9 +61,7 @@ def part(chunk: EventChunk, which: object) -> EventChunk:
 
 
 def offline(chunk: EventChunk, starts_us: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    return bin_events(
-        chunk.x, chunk.y, chunk.p, chunk.t_us, starts_us, TINY, SIZE["width"], SIZE["height"]
-    )
+    return bin_events(chunk, starts_us, TINY, SIZE["width"], SIZE["height"])
 
 
 streams = st.lists(st.integers(0, 2500), min_size=1, max_size=60)

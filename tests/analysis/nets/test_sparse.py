@@ -12,6 +12,7 @@ from sliplab.analysis.nets.dataset import SampleSet, TrialId
 from sliplab.analysis.nets.sparse import SparseWindows
 from sliplab.analysis.nets.windows import bin_events, list_events
 from sliplab.protocols.settings import Windows
+from sliplab.storage.streams import EventChunk
 
 dense = hnp.arrays(
     np.uint8,
@@ -85,8 +86,10 @@ def test_events_are_listed_as_they_are_binned(seed: int, how: Windows, events: i
     p = rng.integers(0, 2, events)
     size = (640, 480) if how.crop_px > 64 else (64, 64)
     starts = rng.integers(-5_000, 45_000, 5)
-    got = list_events(x, y, p, t, starts, how, *size)
-    np.testing.assert_array_equal(got.dense(), bin_events(x, y, p, t, starts, how, *size))
+    got = list_events(EventChunk(x, y, p, t), starts, how, *size)
+    np.testing.assert_array_equal(
+        got.dense(), bin_events(EventChunk(x, y, p, t), starts, how, *size)
+    )
     for a, b in zip(got.offsets[:-1], got.offsets[1:], strict=True):
         assert (np.diff(got.cell[a:b].astype(int)) > 0).all()
     assert (got.count > 0).all()

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from sliplab.analysis.nets.windows import bin_events, first_pixel, window_totals
 from sliplab.protocols.settings import Windows
+from sliplab.storage.streams import EventChunk
 
 PAPER = Windows()
 
 
 def one(x: int, y: int, p: int, t: int, start: int = 0, how: Windows = PAPER) -> NDArray[np.uint8]:
     columns = (np.array([v]) for v in (x, y, p, t))
-    return bin_events(*columns, np.array([start]), how)
+    return bin_events(EventChunk(*columns), np.array([start]), how)
 
 
 def naive(
@@ -76,11 +77,11 @@ def test_counts_are_the_naive_histogram(
     starts = rng.integers(-4, 44, 5) * 500 + base
     columns = (events["x"], events["y"], events["p"], events["t"])
     expected = naive(events, starts, how, width, height)
-    got = bin_events(*columns, starts, how, width, height)
+    got = bin_events(EventChunk(*columns), starts, how, width, height)
     assert got.shape == (5, how.steps, how.channels, how.cells, how.cells)
     assert got.dtype == np.uint8
     np.testing.assert_array_equal(got, np.minimum(expected, 255))
-    totals = window_totals(*columns, starts, how, width, height)
+    totals = window_totals(EventChunk(*columns), starts, how, width, height)
     np.testing.assert_array_equal(totals, expected.sum(axis=(1, 2, 3, 4)))
 
 
@@ -114,7 +115,7 @@ def test_the_crop_is_centred_and_half_open(x: int, y: int, cell: tuple[int, int]
 def test_an_odd_crop_keeps_the_floor_of_the_margin() -> None:
     how = Windows(crop_px=63, pool_px=9)
     columns = (np.array([0, 63]), np.array([0, 63]), np.array([1, 1]), np.array([0, 0]))
-    sample = bin_events(*columns, np.array([0]), how, 64, 64)
+    sample = bin_events(EventChunk(*columns), np.array([0]), how, 64, 64)
     assert sample.sum() == sample[0, 0, 0, 0, 0] == 1
 
 
@@ -127,23 +128,23 @@ def test_polarities() -> None:
         assert both[0, 0, int(positive), 10, 10] == both.sum() == 1
     flags = np.array([True, False])
     two = np.array([320, 320]), np.array([240, 240]), flags, np.array([0, 0])
-    assert bin_events(*two, np.array([0]), PAPER).sum() == 1
+    assert bin_events(EventChunk(*two), np.array([0]), PAPER).sum() == 1
 
 
 def test_counts_saturate_and_totals_do_not() -> None:
     k = 1_000
     columns = (np.full(k, 320), np.full(k, 240), np.ones(k, np.int8), np.zeros(k, np.int64))
-    assert bin_events(*columns, np.array([0]), PAPER).max() == 255
-    assert window_totals(*columns, np.array([0]), PAPER).tolist() == [k]
+    assert bin_events(EventChunk(*columns), np.array([0]), PAPER).max() == 255
+    assert window_totals(EventChunk(*columns), np.array([0]), PAPER).tolist() == [k]
 
 
 def test_no_events_and_no_windows() -> None:
     none = (np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8))
     times = np.empty(0, np.int64)
-    assert bin_events(*none, times, np.array([0, 5]), PAPER).shape == (2, 30, 1, 20, 20)
-    assert not bin_events(*none, times, np.array([0]), PAPER).any()
-    assert bin_events(*none, times, times, PAPER).shape[0] == 0
-    assert window_totals(*none, times, times, PAPER).shape == (0,)
+    assert bin_events(EventChunk(*none, times), np.array([0, 5]), PAPER).shape == (2, 30, 1, 20, 20)
+    assert not bin_events(EventChunk(*none, times), np.array([0]), PAPER).any()
+    assert bin_events(EventChunk(*none, times), times, PAPER).shape[0] == 0
+    assert window_totals(EventChunk(*none, times), times, PAPER).shape == (0,)
 
 
 def test_read_only_and_strided_columns() -> None:
@@ -152,9 +153,9 @@ def test_read_only_and_strided_columns() -> None:
     p, t = np.ones(2_000, np.uint8), np.arange(2_000, dtype=np.int64) * 15
     for column in (table, p, t):
         column.flags.writeable = False
-    got = bin_events(table[:, 0], table[:, 1], p, t, np.array([0]), PAPER)
+    got = bin_events(EventChunk(table[:, 0], table[:, 1], p, t), np.array([0]), PAPER)
     copies = (table[:, 0].copy(), table[:, 1].copy(), p.copy(), t.copy())
-    np.testing.assert_array_equal(got, bin_events(*copies, np.array([0]), PAPER))
+    np.testing.assert_array_equal(got, bin_events(EventChunk(*copies), np.array([0]), PAPER))
     assert got.sum() == 2_000
 
 
@@ -162,24 +163,24 @@ def test_bad_columns_are_named() -> None:
     x, y, p, t = (np.array([300, 300]) for _ in range(4))
     start = np.array([0])
     with pytest.raises(ValueError, match="event 0 at 5 us, then 4"):
-        bin_events(x, y, p, np.array([5, 4]), start, PAPER)
+        bin_events(EventChunk(x, y, p, np.array([5, 4])), start, PAPER)
     with pytest.raises(ValueError, match=r"event 1 at pixel \(640, 300\): outside 640 x 480"):
-        window_totals(np.array([300, 640]), y, p, t, start, PAPER)
+        window_totals(EventChunk(np.array([300, 640]), y, p, t), start, PAPER)
     with pytest.raises(ValueError, match="event 0 at pixel"):
-        bin_events(x, np.array([480, 2]), p, t, start, PAPER)
+        bin_events(EventChunk(x, np.array([480, 2]), p, t), start, PAPER)
     with pytest.raises(ValueError, match="not pixels"):
-        bin_events(np.array([-1, 2]), y, p, t, start, PAPER)
+        bin_events(EventChunk(np.array([-1, 2]), y, p, t), start, PAPER)
     with pytest.raises(ValueError, match="unequal length"):
-        bin_events(x[:1], y, p, t, start, PAPER)
+        bin_events(EventChunk(x[:1], y, p, t), start, PAPER)
     with pytest.raises(ValueError, match="larger than the sensor"):
-        bin_events(x, y, p, t, start, PAPER, 300, 300)
+        bin_events(EventChunk(x, y, p, t), start, PAPER, 300, 300)
     for bad in (t.astype(float), t.reshape(2, 1)):
         with pytest.raises(TypeError, match="1-D int64"):
-            bin_events(x, y, p, bad, start, PAPER)
+            bin_events(EventChunk(x, y, p, bad), start, PAPER)
         with pytest.raises(TypeError, match="p must"):
-            bin_events(x, y, bad, t, start, PAPER)
+            bin_events(EventChunk(x, y, bad, t), start, PAPER)
     with pytest.raises(TypeError, match="x must"):
-        bin_events(x.astype(float), y, p, t, start, PAPER)
+        bin_events(EventChunk(x.astype(float), y, p, t), start, PAPER)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +196,9 @@ def test_a_crop_is_as_near_to_its_centre_as_the_sensor_allows(
 def test_events_are_counted_about_the_centre_that_is_told() -> None:
     columns = [np.array([v]) for v in (450, 250, 1, 0)]
     start = np.array([0])
-    middle = bin_events(*columns, start, PAPER)
-    moved = bin_events(*columns, start, PAPER, centre_px=(339.5, 259.5))  # 20 px right and down
+    middle = bin_events(EventChunk(*columns), start, PAPER)
+    moved = bin_events(
+        EventChunk(*columns), start, PAPER, centre_px=(339.5, 259.5)
+    )  # 20 px right and down
     assert np.argwhere(middle[0, 0, 0]).tolist() == [[(250 - 40) // 20, (450 - 120) // 20]]
     assert np.argwhere(moved[0, 0, 0]).tolist() == [[(250 - 60) // 20, (450 - 140) // 20]]

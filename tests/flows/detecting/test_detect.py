@@ -124,7 +124,7 @@ def test_the_live_trial_is_the_stored_one(
     # what arrives first begins the windows
     assert starts_us[0] in (events.t_us[0], first_pulse_us)
     assert result["events"] == len(events)
-    x = bin_events(events.x, events.y, events.p, events.t_us, starts_us, fitted.windows)
+    x = bin_events(events, starts_us, fitted.windows)
     counts = predict_counts(fitted, x)
     assert [line["counts"] for line in lines] == counts.tolist()
     whole = detect_trial(counts, (starts_us + 30_000) * 1000, Detection(margin=1))
