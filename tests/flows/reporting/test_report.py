@@ -22,7 +22,13 @@ from sliplab.flows.reporting import campaign_section, others_section
 from sliplab.flows.reporting.report import read_summary, report, write_figures
 from sliplab.flows.reporting.report_against import compare
 from sliplab.flows.reporting.report_extras import FILES
-from sliplab.flows.reporting.report_trials import OUTCOMES, Conditions, accounted, intervals, told
+from sliplab.flows.reporting.report_trials import (
+    OUTCOMES,
+    Conditions,
+    accounted,
+    intervals,
+    trial_summary,
+)
 from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching.tradeoff_page import ERRORS
 from sliplab.flows.study import Outcome
@@ -99,20 +105,20 @@ def judged(**changed: Any) -> Json:
 
 
 def test_what_became_of_a_trial() -> None:
-    assert told(judged())["outcome"] == "detected_first"
-    assert told(judged())["duration_ms"] == 1000.0
-    assert told(judged(late_incipient_ms=20.0, lead_ms=None))["outcome"] == "late"
-    late = told(judged(late_gross_ms=299.0, latency_gross_ms=None))
+    assert trial_summary(judged())["outcome"] == "detected_first"
+    assert trial_summary(judged())["duration_ms"] == 1000.0
+    assert trial_summary(judged(late_incipient_ms=20.0, lead_ms=None))["outcome"] == "late"
+    late = trial_summary(judged(late_gross_ms=299.0, latency_gross_ms=None))
     assert (late["gross"], late["late_gross_ms"]) == ("late", 299.0)
-    assert told(judged(missed_incipient=True))["outcome"] == "missed"
-    assert told(judged(false_early_incipient=True))["outcome"] == "false_early"
-    assert told(judged(false_early_gross=True))["gross"] == "false_early"
-    assert told(judged(missed_gross=True))["gross"] == "missed"
-    none = told({**judged(), "latency": None, "gross_ns": None})
+    assert trial_summary(judged(missed_incipient=True))["outcome"] == "missed"
+    assert trial_summary(judged(false_early_incipient=True))["outcome"] == "false_early"
+    assert trial_summary(judged(false_early_gross=True))["gross"] == "false_early"
+    assert trial_summary(judged(missed_gross=True))["gross"] == "missed"
+    none = trial_summary({**judged(), "latency": None, "gross_ns": None})
     assert (none["outcome"], none["gross"], none["lead_ms"]) == (
         "without_onsets", "without_onsets", None
     )  # fmt: skip
-    found = intervals([told(judged()), told(judged(lead_ms=1000.0)), none])
+    found = intervals([trial_summary(judged()), trial_summary(judged(lead_ms=1000.0)), none])
     assert found["lead_ms"]["n"] == 2
     half = 12.7062047 * 50  # Student's t of two trials
     assert found["lead_ms"]["mean"] == pytest.approx([950 - half, 950 + half])
