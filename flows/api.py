@@ -18,6 +18,7 @@ import numpy.typing as npt
 from sliplab.protocols import InputError, Plan, load_plan
 from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store as TrialStore
 from sliplab.storage.streams import EventChunk
@@ -306,19 +307,20 @@ class Store:
         Raises:
             StoreError: there is no report yet.
         """
-        from sliplab.flows.reporting.report import read_summary
-
-        return read_summary(self._store)
+        path = self.folder / "report" / "summary.json"
+        if not path.exists():
+            raise StoreError(f"{path}: is not there; run `Store.report` first")
+        return read_json(path)
 
     def models(self) -> list[Path]:
         """Files of the networks that were trained here."""
         return sorted((self.folder / "models").glob("*.pt"))
 
     def _run(self, step: str, campaigns: Sequence[str] | None) -> dict[str, Any]:
-        from sliplab.flows.running import stopping
+        from sliplab.flows.running import extras, stopping
         from sliplab.flows.steps import run_step
 
-        with stopping.signals():
+        with stopping.signals(), extras.named(f"Store.{step}"):
             return run_step(self.folder, None if campaigns is None else list(campaigns), step)
 
 
@@ -391,8 +393,12 @@ def load_model(path: str | Path) -> Model:
     Raises:
         OSError: the file cannot be read.
         ValueError: it is no model, or is damaged.
+        ModuleNotFoundError: the extra ``learn`` is not installed.
     """
-    from sliplab.analysis.nets import model_file
+    from sliplab.flows.running import extras
+
+    with extras.named("load_model"):
+        from sliplab.analysis.nets import model_file
 
     return Model(model_file.load(Path(path)))
 
@@ -433,9 +439,10 @@ def collect(
         InputError: protocol or rig is wrong, or the rig cannot take the protocol.
         StoreError: the store cannot be used.
         CampaignStopped: collection cannot go on; the message says why.
+        ModuleNotFoundError: an extra is not installed; the message says which.
     """
     from sliplab.flows.planning.run_request import make_request
-    from sliplab.flows.running import stopping
+    from sliplab.flows.running import extras, stopping
     from sliplab.flows.steps import prepare_store
 
     if trials is not None and trials < 1:
@@ -444,9 +451,9 @@ def collect(
         Path(protocol), Path(rig), Path(store), enable=tuple(enable), campaign=campaign,
         most=trials,
     )  # fmt: skip
-    prepare_store(run_request.store)
-    from sliplab.flows.collecting.collect import collect as take
+    with stopping.signals(), extras.named("collect"):
+        prepare_store(run_request.store)
+        from sliplab.flows.collecting.collect import collect as take
 
-    with stopping.signals():
         take(run_request)
     return open_store(run_request.store)

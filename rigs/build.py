@@ -13,6 +13,7 @@ from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.operator import ConsoleOperator
 from sliplab.rigs.people import PersonAtPlate
 from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.reach import need_libraries
 from sliplab.rigs.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import Sink
@@ -51,10 +52,12 @@ def build_rig(file: RigFile) -> Rig:
 
     Raises:
         RigError: a device that has to be there before a rig is, such as a camera, is not.
+        ModuleNotFoundError: a maker's library is not installed.
     """
     if file.driver == "mock":
         return simulated_rig(file, build_mock(file.scene, file.timing))
     assert file.devices is not None
+    need_libraries(file.devices)
     if file.driver == "loopback":
         return _loopback_rig(file, file.devices)
     return _real_rig(file, file.devices)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from sliplab.rigs.arms.settings import AbbSettings, ArmSettings, UrSettings
 from sliplab.rigs.cameras.settings import BaslerSettings, DvxplorerSettings, NetworkStream
@@ -15,13 +16,32 @@ from sliplab.rigs.sync_settings import SyncBoxSettings
 ANSWER_S = 1.0
 """For each connection, s."""
 _UR_PORT = 30004
+_ARM_LIBRARIES: dict[str, tuple[str, ...]] = {
+    "ur": ("rtde_control",),
+    "abb": ("abb_motion_program_exec", "abb_robot_client"),
+}
+
+
+def need_libraries(devices: DeviceSettings) -> None:
+    """Look for the makers' libraries that the drivers of these devices use; none is loaded.
+
+    Raises:
+        ModuleNotFoundError: one is not installed.
+    """
+    for name in (*_ARM_LIBRARIES.get(devices.arm.driver, ()), "dv_processing", "pypylon", "serial"):
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
 
 
 def reach(devices: DeviceSettings) -> dict[str, str | None]:
     """By device: None if it can be reached, else why not, and what to look at.
 
     Nothing is opened for longer than it takes to see that somebody answers; takes some seconds.
+
+    Raises:
+        ModuleNotFoundError: a maker's library is not installed.
     """
+    need_libraries(devices)
     box = devices.sync_box
     looks: dict[str, Callable[[], str | None]] = {
         "arm": lambda: _arm(devices.arm),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import typer
 from pydantic import ValidationError
 from typer.exceptions import TyperException
 
-from sliplab.flows.running import console
+from sliplab.flows.running import console, extras
 from sliplab.flows.running.limits import exhausted
 from sliplab.flows.running.standard_streams import OutputLost
 from sliplab.protocols.errors import InputError
@@ -90,6 +91,8 @@ def failure(error: Exception) -> Failure:
         return Failure(known, console.FAILED)
     if isinstance(error, InputError):
         return _wrong_input(error)
+    if said := extras.lacking(error, _command()):
+        return Failure(said, console.WRONG_INPUT)
     if isinstance(error, TyperException):
         return _wrong_usage(error)
     if isinstance(error, OSError) and error.filename:
@@ -102,6 +105,12 @@ def failure(error: Exception) -> Failure:
     if type(error).__name__ not in _EXPECTED:
         trace = "".join(traceback.format_exception(error, limit=-8))
     return Failure(str(error) or type(error).__name__, console.FAILED, trace=trace)
+
+
+def _command() -> str:
+    """Return what was called, as far as it names the command."""
+    named = [word for word in sys.argv[1:] if not word.startswith("-")]
+    return " ".join(["sliplab", *named[:1]])
 
 
 def _place(message: str) -> str | None:

@@ -100,7 +100,8 @@ def export_model(
     Raises:
         InputError: the store's windows are others than the model's.
         StoreError: nothing collected, or not labelled.
-        ExportFailed: the ONNX file gives other counts, or cannot be made.
+        ExportFailed: the ONNX file gives other counts.
+        ModuleNotFoundError: the extra ``onnx`` is not installed.
     """
     campaigns = collected(store, names)
     if training_settings(campaigns).windows != fitted.windows:
@@ -197,10 +198,6 @@ def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[byte
     try:
         data = to_onnx(net, windows, about)
         return data, check_onnx(data, net, some)
-    except ModuleNotFoundError as error:
-        raise ExportFailed(
-            f"ONNX cannot be written ({error}): `pip install 'sliplab[onnx]'`, or --no-onnx"
-        ) from None
     except OnnxDiffers as error:
         raise ExportFailed(f"{source.path}: nothing was written: {error}") from None
 

@@ -55,14 +55,10 @@ def rerun() -> ModuleType:
     """The Rerun library.
 
     Raises:
-        StoreError: it is not installed.
+        ModuleNotFoundError: it is not installed.
     """
-    try:
-        import rerun as found
-    except ImportError as error:
-        raise StoreError(
-            f"Rerun is not installed ({error}); it comes with `pip install 'sliplab[view]'`"
-        ) from None
+    import rerun as found
+
     return found
 
 
@@ -73,7 +69,8 @@ def save(subject: Subject, path: Path) -> dict[str, Any]:
         how many there are of what, and the file's bytes.
 
     Raises:
-        StoreError: Rerun is not installed, or the trial is damaged.
+        StoreError: the trial is damaged.
+        ModuleNotFoundError: Rerun is not installed.
     """
     library = rerun()
     from sliplab.flows.reviewing.view_streams import blueprint, send
@@ -103,7 +100,8 @@ def show(subject: Subject) -> None:
     """Open a trial in Rerun's viewer, and wait until somebody closes it.
 
     Raises:
-        StoreError: Rerun is not installed, or there is no display.
+        StoreError: there is no display.
+        ModuleNotFoundError: Rerun is not installed.
     """
     rerun()
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -1,0 +1,49 @@
+"""Which extra of SlipLab brings a package that is not installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+EXTRAS = {
+    "hardware": (
+        "rtde_control", "rtde_receive", "abb_motion_program_exec", "abb_robot_client", "requests",
+        "serial", "pypylon", "dv_processing",
+    ),
+    "learn": ("torch", "sinabs", "sklearn", "threadpoolctl"),
+    "prefect": ("prefect",),
+    "report": ("matplotlib", "jinja2", "bokeh"),
+    "cluster": ("distributed", "prefect_dask"),
+    "view": ("rerun",),
+    "onnx": ("onnx", "onnxruntime"),
+}  # fmt: skip
+"""By extra, the modules that are imported of what it brings."""
+
+_BRINGS = {module: extra for extra, modules in EXTRAS.items() for module in modules}
+
+
+def lacking(error: BaseException, who: str) -> str | None:
+    """Say in one line which extra `who` needs, if `error` is that its package is missing."""
+    # a package that is there without one of its own modules is damaged, and no extra mends it
+    module = error.name if isinstance(error, ModuleNotFoundError) else None
+    extra = _BRINGS.get(module or "")
+    if extra is None:
+        return None
+    return (
+        f"`{who}` needs {module}, which the extra '{extra}' brings: pip install 'sliplab[{extra}]'"
+    )
+
+
+@contextmanager
+def named(who: str) -> Iterator[None]:
+    """Name the extra where a package of one is missing inside.
+
+    Raises:
+        ModuleNotFoundError: as it was raised, with the extra in its message.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if said := lacking(error, who):
+            raise ModuleNotFoundError(said, name=error.name) from error
+        raise

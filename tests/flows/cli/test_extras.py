@@ -1,0 +1,164 @@
+"""What works without any extra, and how a command says which one it lacks."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from sliplab.flows.running.extras import EXTRAS, lacking
+from tests.conftest import ROOT
+from tests.flows.test_older_store import FIXTURE
+
+BLOCKED = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in MISSING:
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+
+MISSING = set(sys.argv.pop(1).split(","))
+sys.meta_path.insert(0, Missing())
+"""
+COMMAND = f"{BLOCKED}\nfrom sliplab.flows.__main__ import main\nmain()"
+PYTHON = """
+import sliplab
+store = sliplab.open_store(sys.argv[1])
+assert len(store.trials()) == 4
+for trial in store:
+    assert len(trial.events()) > 10_000 and len(trial.poses()) and len(trial.pulses())
+    assert trial.onsets().incipient_ns
+assert store.summary()["simulated"] is True
+assert len(sliplab.plan("pilot").trials) == 36
+assert not MISSING & set(sys.modules), MISSING & set(sys.modules)
+for ask in (store.label, store.train, lambda: sliplab.load_model(store.models()[0])):
+    try:
+        ask()
+    except ModuleNotFoundError as error:
+        print(error)
+"""
+
+
+def run(code: str, extras: tuple[str, ...], *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run Python without what these extras bring."""
+    missing = ",".join(module for extra in extras for module in EXTRAS[extra])
+    return subprocess.run(
+        [sys.executable, "-c", code, missing, *map(str, arguments)],
+        capture_output=True, text=True, cwd=ROOT, env={**os.environ}, timeout=300,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four labelled slides, a network and a report; nothing here changes them."""
+    folder = tmp_path_factory.mktemp("extras") / "store"
+    with tarfile.open(FIXTURE) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "--version",
+        "plan pilot",
+        "plan pilot --rig mock",
+        "rigs",
+        "schema rig",
+        "schema protocol",
+        "trials STORE",
+        "verify STORE",
+        "migrate STORE",
+        "export STORE small --format aedat4 --output OUT/aedat4",
+        "export STORE small --format dsec --output OUT/dsec",
+        "export STORE small --labels --output OUT/labels.csv",
+    ],
+)
+def test_the_core_plans_reads_and_writes(command: str, store: Path, tmp_path: Path) -> None:
+    words = command.replace("STORE", str(store)).replace("OUT", str(tmp_path)).split()
+    done = run(COMMAND, tuple(EXTRAS), *words)
+    assert done.returncode == 0, done.stderr
+
+
+def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
+    done = run(BLOCKED + PYTHON, tuple(EXTRAS), store)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        "`Store.label` needs prefect, which the extra 'prefect' brings: "
+        "pip install 'sliplab[prefect]'",
+        "`Store.train` needs prefect, which the extra 'prefect' brings: "
+        "pip install 'sliplab[prefect]'",
+        "`load_model` needs torch, which the extra 'learn' brings: pip install 'sliplab[learn]'",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("extra", "module", "command"),
+    [
+        ("learn", "torch", "train STORE"),
+        ("learn", "torch", "export-model STORE --out OUT/model"),
+        ("learn", "torch", "detect --rig rehearsal --model STORE/models/small.pt"),
+        ("prefect", "prefect", "label STORE"),
+        ("prefect", "prefect", "sync STORE"),
+        ("prefect", "prefect", "collect pilot --rig rehearsal --store OUT/new --trials 1"),
+        ("report", "jinja2", "sync STORE"),
+        ("report", "bokeh", "review STORE"),
+        ("report", "matplotlib", "calibrate board --out OUT/board.pdf"),
+        ("hardware", "abb_motion_program_exec", "rigs irb120 --ask"),
+        ("hardware", "rtde_control", "rigs ur5 --ask"),
+        ("hardware", "rtde_control", "check pilot --rig ur5 --store OUT/new"),
+        ("hardware", "rtde_control", "check pilot --rig loopback --store OUT/new"),
+        ("cluster", "distributed", "label STORE --dask 127.0.0.1:1"),
+        ("view", "rerun", "view STORE TRIAL --save OUT/trial.rrd"),
+    ],
+)
+def test_a_command_says_which_extra_it_lacks(
+    extra: str, module: str, command: str, store: Path, tmp_path: Path
+) -> None:
+    trial = next((store / "campaigns" / "small" / "trials").iterdir()).name
+    places = {"STORE": str(store), "OUT": str(tmp_path), "TRIAL": trial}
+    words = command.split()
+    for name, place in places.items():
+        words = [word.replace(name, place) for word in words]
+    done = run(COMMAND, (extra,), *words, "--json")
+    found = json.loads(done.stdout)["error"]
+    assert (done.returncode, found["exit_code"]) == (2, 2), done.stderr
+    if extra == "cluster":  # the option is what is wrong
+        assert found["key"] == "--dask"
+        assert found["message"].endswith("`pip install 'sliplab[cluster]'`")
+    else:
+        assert (found["file"], found["key"], found["value"]) == (None, None, None)
+        assert found["message"] == (
+            f"`sliplab {words[0]}` needs {module}, which the extra '{extra}' brings: "
+            f"pip install 'sliplab[{extra}]'"
+        )
+    assert f"error: {found['message']}\n" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_damaged_package_is_not_called_missing() -> None:
+    assert lacking(ModuleNotFoundError("", name="torch.nn"), "x") is None
+    assert lacking(ModuleNotFoundError("", name="sympy"), "x") is None
+    assert lacking(ImportError("", name="torch"), "x") is None
+    assert lacking(ModuleNotFoundError("", name="torch"), "x") is not None
+
+
+def test_every_extra_that_is_named_brings_its_modules() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extra, modules in EXTRAS.items():
+        brought: set[str] = set()
+        for line in declared["optional-dependencies"][extra]:
+            name = re.split("[<>=[;]", line)[0].strip()
+            if name != "sliplab":
+                files = metadata.files(name) or ()
+                brought |= {file.parts[0].partition(".")[0] for file in files}
+        assert set(modules) <= brought, f"[{extra}] lacks {set(modules) - brought}"
