@@ -35,19 +35,19 @@ def crash(folder: Path, kills: int, seed: int, trials: int, video: bool = False)
     Raises:
         RuntimeError: a life ended by itself in another way than by completing the campaign.
     """
-    from tests.crash.campaign import collect, hashes, order, wrong, wrong_at_the_end
+    from tests.crash.campaign import collect, hashes, run_request, wrong, wrong_at_the_end
     from tests.crash.policies import Killer
     from tests.crash.process import live
 
-    collect(order(folder / "warm", 1, video))  # compiled code is loaded once, for every child
-    calm = order(folder / "calm", trials, video)
+    collect(run_request(folder / "warm", 1, video))  # compiled code is loaded once, for every child
+    calm = run_request(folder / "calm", trials, video)
     collect(calm)
     whole = hashes(calm.store)
     rng, killed = random.Random(seed), Counter[str]()
     found: list[str] = [f"undisturbed: {text}" for text in wrong_at_the_end(calm.store, whole)]
     campaigns = lives = 0
     while sum(killed.values()) < kills or campaigns == 0:
-        wanted = order(folder / f"disturbed-{campaigns}", trials, video)
+        wanted = run_request(folder / f"disturbed-{campaigns}", trials, video)
         complete = False
         while not complete:
             lives += 1

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tests.crash.campaign import NAME, collect, hashes, order, wrong, wrong_at_the_end
+from tests.crash.campaign import NAME, collect, hashes, run_request, wrong, wrong_at_the_end
 from tests.crash.disk import Disk, Tree, write_tree
 from tests.crash.policies import Done, Killer, Recorder
 from tests.crash.process import live
@@ -29,10 +29,10 @@ def recorded(folder: Path, trials: int, video: bool) -> tuple[Disk, list[Done], 
     Raises:
         RuntimeError: the collection failed.
     """
-    begun = order(folder, trials - 1, video)
+    begun = run_request(folder, trials - 1, video)
     live(lambda: collect(begun), begun.store, Killer("write", 70, 0.5))
     before = Disk(begun.store.resolve())
-    more = order(folder, trials, video)
+    more = run_request(folder, trials, video)
     recorder, file = Recorder(), folder / "calls.json"
 
     def work() -> None:
@@ -73,7 +73,7 @@ def cut(
     Args:
         every: each so manieth state is put on the disk, verified, and collected to the end.
     """
-    calm = order(folder / "calm", trials, video)
+    calm = run_request(folder / "calm", trials, video)
     collect(calm)
     whole = hashes(calm.store)
     disk, calls, store = recorded(folder / "power", trials, video)
@@ -107,7 +107,7 @@ def _go_on(
     write_tree(tree, place / "store")
     found = wrong(place / "store", whole)
     try:
-        collect(order(place, trials, video))
+        collect(run_request(place, trials, video))
     except Exception as error:
         return [*found, f"cannot go on: {error!r}"]
     return found + wrong_at_the_end(place / "store", whole)
