@@ -28,6 +28,7 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.running import trial_work
 from sliplab.flows.running.campaigns import collected, training_campaigns
+from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
 from sliplab.protocols.errors import InputError
 from sliplab.storage.derived import Derived
@@ -447,5 +448,7 @@ def test_the_model_goes_out_as_what_it_is(
         export_model(model, fitted, tmp_path / "other", store, checked=4)
     assert not (tmp_path / "other").exists()
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ExportFailed, match=r"sliplab\[onnx\]"):
+    with pytest.raises(ModuleNotFoundError) as missing:
         export_model(model, fitted, tmp_path / "other", store, checked=4)
+    assert "pip install 'sliplab[onnx]'" in str(lacking(missing.value, "sliplab export-model"))
+    assert not (tmp_path / "other").exists()
