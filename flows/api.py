@@ -191,7 +191,7 @@ class Trial:
         return Onsets(self.label["incipient_ns"], self.label["gross_ns"])
 
     def displacements(self) -> tuple[I64, F64]:
-        """How far each of m markers has moved, by which slip is told.
+        """Displacement of each of m markers, from which slip is found.
 
         Returns:
             times of n frames on the time line, int64 nanoseconds, shape (n,); displacements in

@@ -1,4 +1,4 @@
-"""The protocol files that ship with the package, by name."""
+"""Files that ship with a package and are found by name: protocols here, rigs in their package."""
 
 from __future__ import annotations
 
@@ -7,9 +7,25 @@ from pathlib import Path
 from sliplab.protocols.errors import InputError
 
 
+def shipped_files(folder: Path) -> dict[str, Path]:
+    """The YAML files of a folder, by name."""
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_shipped(given: Path, known: dict[str, Path]) -> Path | None:
+    """The file that a person means: a path, or a bare name among `known`; None for neither.
+
+    A hyphen in the name is an underscore in the file's.
+    """
+    if len(given.parts) != 1 or given.suffix or given.is_file():
+        return given
+    named = known.get(given.name.replace("-", "_"))
+    return given if named is None and given.exists() else named  # reading a folder says so
+
+
 def shipped_protocols() -> dict[str, Path]:
     """The protocol files that ship with the package, by name."""
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+    return shipped_files(Path(__file__).parent)
 
 
 def protocol_path(given: Path) -> Path:
@@ -18,11 +34,7 @@ def protocol_path(given: Path) -> Path:
     Raises:
         InputError: a bare name that is neither.
     """
-    if len(given.parts) != 1 or given.suffix or given.exists():
-        return given
-    known = shipped_protocols()
-    if (name := given.name.replace("-", "_")) in known:
-        return known[name]
-    names = ", ".join(known)
-    text = f"no such file, nor a protocol that ships with SlipLab: {names}"
+    if (found := find_shipped(given, known := shipped_protocols())) is not None:
+        return found
+    text = f"no such file, nor a protocol that ships with SlipLab: {', '.join(known)}"
     raise InputError(str(given), "", None, text)

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from sliplab.protocols.errors import InputError
+from sliplab.protocols.shipped import find_shipped, shipped_files
 from sliplab.protocols.yaml_file import Document, parse_yaml, read_text
 
 KEY = "extends"
@@ -42,7 +43,7 @@ class RigSource:
 
 def shipped_rigs() -> dict[str, Path]:
     """The rig files that ship with the package, by name."""
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+    return shipped_files(Path(__file__).parent)
 
 
 def rig_path(given: Path) -> Path:
@@ -51,16 +52,10 @@ def rig_path(given: Path) -> Path:
     Raises:
         InputError: a bare name that is neither.
     """
-    if len(given.parts) != 1 or given.suffix or given.is_file():
-        return given
-    known = shipped_rigs()
-    name = given.name.replace("-", "_")
-    if name in known:
-        return known[name]
-    if given.exists():
-        return given  # a folder: reading it says so
-    names = ", ".join(known)
-    raise InputError("--rig", "", str(given), f"no such file, nor a rig that ships: {names}")
+    if (found := find_shipped(given, known := shipped_rigs())) is not None:
+        return found
+    text = f"no such file, nor a rig that ships: {', '.join(known)}"
+    raise InputError("--rig", "", str(given), text)
 
 
 def read_rig(path: Path) -> RigSource:

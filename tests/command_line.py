@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -47,6 +49,14 @@ def here(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[st
     code = ended.value.code
     assert isinstance(code, int)
     return subprocess.CompletedProcess(words, code, out.getvalue(), said.getvalue())
+
+
+def answer(*arguments: object) -> dict[str, Any]:
+    """What a command that succeeded in this process says as JSON."""
+    done = here(*arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
 def wait_for(condition: object, process: subprocess.Popen[str], limit_s: float = 120.0) -> None:

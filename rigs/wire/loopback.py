@@ -138,11 +138,11 @@ class Loopback:
     # -- tests -----------------------------------------------------------------------------
 
     def happen(self, device: str, kind: str) -> None:
-        """Make something go wrong now; see `Theatre.happen`."""
+        """Make something go wrong now; see `SimulationServer.happen`."""
         self._ask("happen", device, kind)
 
     def restore(self, device: str) -> None:
-        """A person puts it right; see `Theatre.restore`. Drivers have to be built anew."""
+        """A person puts it right; see `SimulationServer.restore`. Drivers have to be built anew."""
         self.sync_port, self.event_ports = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
@@ -203,32 +203,32 @@ def _serve(
     arm: ArmSettings,
 ) -> None:
     """The process: it ends with its parent, and never waits for a library to be taken down."""
-    from sliplab.rigs.wire.theatre import Theatre
+    from sliplab.rigs.wire.simulation_server import SimulationServer
 
     sys.setswitchinterval(0.0005)  # the stand-ins' threads answer while the scene computes
-    status, theatre = 1, None
+    status, server = 1, None
     try:
-        theatre = Theatre(settings, timing, arm, frames.send)
-        pipe.send((True, (theatre.sync_box.port, theatre.camera.ports)))
+        server = SimulationServer(settings, timing, arm, frames.send)
+        pipe.send((True, (server.sync_box.port, server.camera.ports)))
         while True:
             if pipe.poll(TURN_S):
                 what, arguments = pipe.recv()
-                pipe.send(_do(theatre, what, arguments))
-            theatre.turn()
+                pipe.send(_do(server, what, arguments))
+            server.turn()
     except (EOFError, BrokenPipeError, ConnectionError, pickle.UnpicklingError):
         status = 0
     except Exception as error:
         with suppress(OSError):
             pipe.send((False, ("stand-ins", f"failed: {error!r}")))
     with suppress(Exception):
-        if theatre is not None:
-            theatre.close()
+        if server is not None:
+            server.close()
     os._exit(status)
 
 
-def _do(theatre: Any, what: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+def _do(server: Any, what: str, arguments: tuple[Any, ...]) -> tuple[bool, Any]:
     try:
-        found = getattr(theatre, what)
+        found = getattr(server, what)
         return True, found(*arguments) if callable(found) else found
     except RigError as error:
         return False, (error.device, str(error).removeprefix(f"{error.device}: "))

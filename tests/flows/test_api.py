@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 import sliplab
 from sliplab.storage.derived import Derived
 from sliplab.storage.store import Store as TrialStore
-from tests.flows.test_older_store import FIXTURE
+from tests.flows.older import older_store
 
 FIRST = "depth=2.4mm,direction=0deg,speed=1.6mmps,r=1"
 
@@ -22,10 +21,7 @@ FIRST = "depth=2.4mm,direction=0deg,speed=1.6mmps,r=1"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four labelled slides and a network; nothing here changes them."""
-    folder = tmp_path_factory.mktemp("api") / "store"
-    with tarfile.open(FIXTURE) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
+    return older_store(tmp_path_factory.mktemp("api") / "store")
 
 
 @pytest.fixture(scope="module")

@@ -1,45 +1,27 @@
-"""A store with its model and rig file that SlipLab 0.1.0 made stays readable, with its figures.
-
-The fixture was made when the five packages were top-level ones:
-``sliplab study store --protocol small.yaml --rig rehearsal --check-labels 0``.
-"""
+"""A store with its model and rig file that SlipLab 0.1.0 made stays readable, with its figures."""
 
 from __future__ import annotations
 
-import json
 import shutil
-import tarfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
 from sliplab.storage.store import Store
-from tests.command_line import here
-
-FIXTURE = Path(__file__).parent / "fixtures" / "store-0.1.0.tar.xz"
+from tests.command_line import answer
+from tests.flows.older import older_store
 
 
 @pytest.fixture
 def older(tmp_path: Path) -> Path:
-    folder = tmp_path / "store"
-    with tarfile.open(FIXTURE) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
-
-
-def run(*arguments: object) -> dict[str, Any]:
-    done = here(*arguments, "--json")
-    assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    return older_store(tmp_path / "store")
 
 
 def test_everything_in_it_is_sound(older: Path) -> None:
-    assert run("verify", older)["problems"] == []
-    assert len(run("trials", older)["trials"]) == 4
+    assert answer("verify", older)["problems"] == []
+    assert len(answer("trials", older)["trials"]) == 4
 
 
 def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
@@ -47,7 +29,7 @@ def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
     labels = {path.name: read_json(path) for path in older.glob("derived/labels/small/*.json")}
     assert len(labels) == 4
     shutil.rmtree(older / "derived")
-    made = {step: run(step, older)["done"] for step in ("sync", "label")}
+    made = {step: answer(step, older)["done"] for step in ("sync", "label")}
     assert made == {"sync": 4, "label": 4}
     for name, label in labels.items():
         again = read_json(older / "derived" / "labels" / "small" / name)
@@ -56,7 +38,7 @@ def test_what_is_derived_anew_is_what_it_was(older: Path) -> None:
             assert again[onset] == pytest.approx(label[onset], abs=10_000)
         assert again["first_marker"] == label["first_marker"]
     for step in ("train", "evaluate", "report"):
-        run(step, older)
+        answer(step, older)
     after = read_json(older / "report" / "summary.json")
     assert after["kinematic"]["accuracy"] == before["kinematic"]["accuracy"]
     assert after["kinematic"]["confusion"] == before["kinematic"]["confusion"]

@@ -1,4 +1,4 @@
-"""Carried states against Sinabs' own layers, never reset."""
+"""Stateful inference against Sinabs' own layers, never reset."""
 
 import numpy as np
 import pytest

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,7 +20,7 @@ from sliplab.storage.lock import exclusive
 from sliplab.storage.process import this_process
 from sliplab.storage.store import Store
 from sliplab.storage.verify import verify
-from tests.command_line import SLIPLAB, here, wait_for
+from tests.command_line import SLIPLAB, answer, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
 
@@ -49,14 +48,6 @@ def collecting(protocol: Path, store: Path, log: Path) -> Iterator[subprocess.Po
         process.wait(timeout=60)
 
 
-def asked(*arguments: object) -> dict[str, Any]:
-    """What a control command that succeeded says as JSON."""
-    done = here(*arguments, "--json")
-    assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
-
-
 def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
     data = tiny()
     data["collection"]["factors"]["direction"]["values"] = [*range(0, 360, 2)]
@@ -66,7 +57,7 @@ def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
     trials = store / "campaigns" / "tiny" / "trials"
     with collecting(protocol, store, log) as process:
         wait_for(lambda: trials.is_dir() and any(trials.iterdir()), process)
-        paused = asked("pause", store, "--who", "anna", "--why", "lunch")
+        paused = answer("pause", store, "--who", "anna", "--why", "lunch")
         assert (paused["done"], paused["who"], paused["why"]) == (True, "anna", "lunch")
         assert paused["did"] == {"paused": True, "running": True}
         assert paused["holder"]["pid"] == process.pid
@@ -76,13 +67,13 @@ def test_a_campaign_is_led_from_another_terminal(tmp_path: Path) -> None:
         assert second.returncode == 1
         assert f"is paused (pause by anna, {paused['when']} (lunch))" in second.stderr
         first = min(there)
-        anew = asked("again", store, first, "--why", "dust")
+        anew = answer("again", store, first, "--why", "dust")
         assert anew["did"]["trials"][first].endswith("will be taken again")
         assert {path.name for path in trials.iterdir()} == there - {first}
-        resumed = asked("resume", store)
+        resumed = answer("resume", store)
         assert resumed["did"] == {"paused": False, "running": True}
         wait_for(lambda: len(list(trials.iterdir())) > len(there), process)
-        stopped = asked("stop", store, "--why", "enough")
+        stopped = answer("stop", store, "--why", "enough")
         assert stopped["did"] == {"stopped": True, "running": True}
         assert process.wait(timeout=60) == 130, log.read_text()
     assert "every committed trial is kept" in log.read_text()
@@ -103,12 +94,12 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     store = tmp_path / "store"
     collect = ("collect", protocol, "--rig", RIG, "--store", store)
     assert here("pause", store).returncode == 2  # no store yet
-    one = asked(*collect, "--trials", 1)
+    one = answer(*collect, "--trials", 1)
     assert (one["committed"], one["causes"]) == (1, [])
-    assert asked("stop", store)["holder"] is None
-    assert asked("pause", store)["did"] == {"paused": True, "running": False}
+    assert answer("stop", store)["holder"] is None
+    assert answer("pause", store)["did"] == {"paused": True, "running": False}
     assert here(*collect).returncode == 1
-    assert asked("resume", store)["did"] == {"paused": False, "running": False}
+    assert answer("resume", store)["did"] == {"paused": False, "running": False}
     ids = {f"depth=2.4mm,direction={deg}deg,speed=1.6mmps,r=1" for deg in (0, 60, 120)}
     (done,) = (path.name for path in (store / "campaigns" / "tiny" / "trials").iterdir())
     skipped = min(ids - {done})
@@ -117,7 +108,7 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     assert f"did you mean '{skipped}'" in wrong.stderr
     assert here("skip", store, skipped).returncode == 2
     assert here("again", store, skipped, "--why", " ").returncode == 2
-    did = asked("skip", store, skipped, "--why", "cable in the way", "--who", "anna")["did"]
+    did = answer("skip", store, skipped, "--why", "cable in the way", "--who", "anna")["did"]
     assert did["trials"] == {skipped: "set aside"}
     rest = here(*collect)
     assert rest.returncode == 1  # not every trial was taken
@@ -125,15 +116,15 @@ def test_between_collections_the_commands_act_themselves(tmp_path: Path) -> None
     assert "1trialssetaside" in words
     assert "anna" in words
     assert "cableintheway" in words
-    listed = asked("trials", store)
+    listed = answer("trials", store)
     assert listed["count"] == 2
     (aside,) = listed["set_aside"]
     assert (aside["trial"], aside["by"], aside["cause"]) == (skipped, "anna", "cable in the way")
     assert "cable in the way" in " ".join(here("trials", store).stdout.split())
-    asked("again", store, skipped, done, "--why", "new cable")
-    whole = asked(*collect)
+    answer("again", store, skipped, done, "--why", "new cable")
+    whole = answer(*collect)
     assert (whole["committed"], whole["taken"], whole["quarantined"]) == (3, 2, 1)
-    assert asked("trials", store)["set_aside"] == []
+    assert answer("trials", store)["set_aside"] == []
     assert verify(Store.open(store)) == []
 
 
@@ -145,7 +136,7 @@ def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
     trials = store / "campaigns" / "tiny" / "trials"
     with collecting(protocol, store, tmp_path / "messages") as process:
         wait_for(lambda: trials.is_dir() and any(trials.iterdir()), process)
-        assert asked("pause", store)["did"]["running"]
+        assert answer("pause", store)["did"]["running"]
         process.kill()
         process.wait(timeout=60)
     first = min(path.name for path in trials.iterdir())
@@ -153,9 +144,9 @@ def test_a_pause_and_what_was_asked_for_outlive_a_kill(tmp_path: Path) -> None:
     control.ask(opened, "again", campaign="tiny", trials=(first,), why="dust")  # and killed, too
     collect = ("collect", protocol, "--rig", RIG, "--store", store, "--trials", 1)
     assert here(*collect).returncode == 1
-    assert asked("resume", store)["did"] == {"paused": False, "running": False}
+    assert answer("resume", store)["did"] == {"paused": False, "running": False}
     assert not (trials / first).exists()
-    assert asked(*collect)["taken"] == 1
+    assert answer(*collect)["taken"] == 1
     assert (trials / first).exists()
     assert verify(opened) == []
 

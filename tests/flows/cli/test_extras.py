@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import tarfile
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 
 from sliplab.flows.running.extras import EXTRAS, lacking
 from tests.conftest import ROOT
-from tests.flows.test_older_store import FIXTURE
+from tests.flows.older import older_store
 
 BLOCKED = """
 import sys
@@ -60,10 +59,7 @@ def run(code: str, extras: tuple[str, ...], *arguments: object) -> subprocess.Co
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four labelled slides, a network and a report; nothing here changes them."""
-    folder = tmp_path_factory.mktemp("extras") / "store"
-    with tarfile.open(FIXTURE) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
+    return older_store(tmp_path_factory.mktemp("extras") / "store")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,11 +166,16 @@ def test_stuck_tips_and_the_plate_are_a_damped_oscillator_at_second_order() -> N
     assert orders == pytest.approx([2.0, 2.0], abs=0.05)
 
 
+Flow = Callable[[float, np.ndarray], Any]
+
+
 class Hanging:
     """Rings of tips under a plate that is let down and then loses its hold, in continuous time."""
 
     mass, depth, ramp_s, still_s, retract = 0.165, 3.4, 0.3, 0.2, 3.0
     damping_s = 0.01
+    states = 5
+    """Height and speed of the plate, and each ring's stretch."""
 
     def __init__(self, springs: Springs) -> None:
         which = [int(np.flatnonzero(SKIN.ring == ring)[0]) for ring in (0, 1, 2)]
@@ -204,20 +210,23 @@ class Hanging:
             ends.terminal = True  # type: ignore[attr-defined]
             return ends
 
+        return self.solve(flow, [lets_go(ring) for ring in range(3)], t, y)
+
+    def solve(self, flow: Flow, changes: list[Flow], t: float, y: np.ndarray, **how: float):
+        """Integrate until a ring changes or the plate has fallen 25 mm, or to the next corner."""
+
         def lands(_: float, y: np.ndarray) -> float:
             return float(y[0]) + 25.0
 
         lands.terminal = True  # type: ignore[attr-defined]
         # the rates have corners where the weight is whole and where the retraction begins
         corners = [c for c in (self.ramp_s, self.ramp_s + self.still_s, 10.0) if c > t + 1e-12]
-        return solve_ivp(
-            flow, (t, corners[0]), y, method="DOP853", rtol=1e-10, atol=1e-11,
-            events=[lets_go(0), lets_go(1), lets_go(2), lands],
-        )  # fmt: skip
+        how = {"rtol": 1e-10, "atol": 1e-11} | how
+        return solve_ivp(flow, (t, corners[0]), y, method="DOP853", events=[*changes, lands], **how)
 
     def onsets(self) -> tuple[list[float], float]:
-        """When each ring lets go, and when the plate has fallen 25 mm, s."""
-        t, y, slips, found = 0.0, np.zeros(5), np.zeros(3, bool), [math.nan] * 3
+        """When each ring first lets go, and when the plate has fallen 25 mm, s."""
+        t, y, slips, found = 0.0, np.zeros(self.states), np.zeros(3, bool), [math.nan] * 3
         while True:
             part = self.part(t, y, slips)
             t, y = float(part.t[-1]), part.y[:, -1]
@@ -225,7 +234,8 @@ class Hanging:
                 return found, t
             for ring in range(3):
                 if len(part.t_events[ring]):
-                    found[ring], slips = t, slips | (np.arange(3) == ring)
+                    found[ring] = t if math.isnan(found[ring]) else found[ring]
+                    slips = slips ^ (np.arange(3) == ring)
 
 
 def test_rings_let_go_and_the_plate_lands_when_an_integration_says_at_second_order() -> None:

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from benchmarks import contact_error as rough
 from sliplab.analysis.labels.change_point import change_point, departure
@@ -24,6 +23,8 @@ class RichHanging(Hanging):
     lets go where its force meets the static cone, then slides at the speed w for which spring,
     branch and damper together give mu N (1 + a ln(1 + w / w0)), and sticks where w falls to zero.
     """
+
+    states = 8
 
     def __init__(self, springs: Springs, tips: Tips) -> None:
         super().__init__(springs)
@@ -88,28 +89,8 @@ class RichHanging(Hanging):
             ends.terminal, ends.direction = True, 1  # type: ignore[attr-defined]
             return ends
 
-        def lands(_: float, y: np.ndarray) -> float:
-            return float(y[0]) + 25.0
-
-        lands.terminal = True  # type: ignore[attr-defined]
-        corners = [c for c in (self.ramp_s, self.ramp_s + self.still_s, 10.0) if c > t + 1e-12]
-        return solve_ivp(
-            flow, (t, corners[0]), y, method="DOP853", rtol=1e-10, atol=1e-12, max_step=0.01,
-            events=[changes(0), changes(1), changes(2), lands],
-        )  # fmt: skip
-
-    def onsets(self) -> tuple[list[float], float]:
-        """When each ring first lets go, and when the plate has fallen 25 mm, s."""
-        t, y, slips, found = 0.0, np.zeros(8), np.zeros(3, bool), [math.nan] * 3
-        while True:
-            part = self.part(t, y, slips)
-            t, y = float(part.t[-1]), part.y[:, -1]
-            if len(part.t_events[3]):
-                return found, t
-            for ring in range(3):
-                if len(part.t_events[ring]):
-                    found[ring] = t if math.isnan(found[ring]) else found[ring]
-                    slips = slips ^ (np.arange(3) == ring)
+        kinds = [changes(ring) for ring in range(3)]
+        return self.solve(flow, kinds, t, y, atol=1e-12, max_step=0.01)
 
 
 def test_onsets_with_all_of_l3_are_of_second_order_in_the_step() -> None:

@@ -53,7 +53,7 @@ NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE
 """What is sent when no more frames come."""
 
 
-class Theatre:
+class SimulationServer:
     """The scene and its stand-ins; `turn` lets it follow the clock, from one thread.
 
     Args:
