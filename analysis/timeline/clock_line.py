@@ -147,7 +147,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
     local = max(1.4826 * median(np.abs(rough[1:] - rough[:-1])) / 2**0.5, floor)
     knots, all_x, all_y = x[[0, -1]], x, y
     values, moved = slope * knots + level, True
-    left_out = 0
+    left_out, mistaken = 0, 0.0
     while True:
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _ROUGHLY)
         noise = min(local, sigma)
@@ -179,6 +179,9 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         if not step:
             if pieces > min(_MOST_KNOTS, int(inside.sum()) // _PIECE_PULSES - 1):
                 break
+            if found.step > found.knot:
+                # a step may be taken for a change of drift, and hides in the knot from then on
+                mistaken = max(mistaken, abs(found.step_size))
             knots = np.sort(np.append(knots, x[found.knot_at]))
         # a knot beside its place leaves a step there
         moved = bool(step) or pieces <= _MOVED_KNOTS
@@ -192,7 +195,10 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
         values, residuals, inside, sigma = _robust(x, y, knots, values, floor, _EXACTLY)
     line = _judged(x, knots, at, values, residuals, inside, sigma, resolution, bend_per_ns)
     line = replace(
-        line, uncertainty=line.uncertainty + _doubt(found), jump=step, straightened=bool(straight)
+        line,
+        uncertainty=line.uncertainty + max(_doubt(found), mistaken),
+        jump=step,
+        straightened=bool(straight),
     )
     return _followed(line, all_x, all_y) if left_out else line
 

@@ -35,7 +35,7 @@ from sliplab.storage.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 
-VERSION = 3
+VERSION = 4
 """Of what fitting does; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
