@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.clock_kinds import HOPELESS, KINDS, faulty_train, tally
+from benchmarks.clocks import DRIFT_PPM
 from sliplab.analysis.timeline.clocks import ClockRefused, fit_clock
 from tests.analysis.timeline.test_clock_faults import fitted
 from tests.analysis.timeline.test_clocks import TICK_NS, code
@@ -42,6 +43,16 @@ def test_the_table(kind: str) -> None:
         _, low, high = found.coverage
         assert low <= 0.97
         assert high >= 0.93
+
+
+@pytest.mark.parametrize("seed", [2412, 2494])
+def test_a_jump_taken_for_a_bend_is_within_the_stated_uncertainty(seed: int) -> None:
+    """A jump of 20 us that a change of drift explains nearly as well is accepted, and stated."""
+    made = faulty_train(np.random.default_rng([11, seed]), "jump_20us")
+    fit = fit_clock(made.device, made.reference, max_drift_ppm=DRIFT_PPM)
+    vouched = (made.true >= fit.first_ns) & (made.true <= fit.last_ns)
+    error = np.abs(fit.map.to_reference(made.true) - made.sent)[vouched].max()
+    assert 5_000 < error <= fit.uncertainty_ns
 
 
 def test_a_stretch_that_two_trials_share_is_not_enough() -> None:
