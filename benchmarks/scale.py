@@ -52,7 +52,7 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
             figures[f"{prefix}bytes"] = (
                 sum(said["bytes"] for files in sizes for said in files.values()) / each
             )
-            figures[f"{prefix}events"] = sum(r.record["counts"]["events"] for r in found) / each
+            figures[f"{prefix}events"] = sum(r.record.counts.events for r in found) / each
             steps: dict[str, Callable[[Recording], object]] = {
                 "sync": lambda item: fit_again(item, None),
                 "label": lambda item: labelling.label_results(item, settings.labelling),

@@ -126,29 +126,24 @@ def _anew(
 
 
 def _row(campaign: str, recording: Recording) -> dict[str, Any]:
-    record = recording.record
+    record, uncertainty_ns = recording.record, recording.clocks.against_events_ns("events")
     return {
         "campaign": campaign,
-        "trial": record["trial"],
-        "experiment": record["experiment"],
-        "role": record["role"],
-        "repetition": record["repetition"],
-        "block": record["block"],
-        "attempt": record["attempt"],
-        "simulated": record["simulated"],
-        "recorded_s": record["recorded_s"],
-        "events": record["counts"]["events"],
-        "frames": record["counts"]["frames"],
+        "trial": record.trial,
+        "experiment": record.experiment,
+        "role": record.role,
+        "repetition": record.repetition,
+        "block": record.block,
+        "attempt": record.attempt,
+        "simulated": record.simulated,
+        "recorded_s": record.recorded_s,
+        "events": record.counts.events,
+        "frames": record.counts.frames,
         "frame_source": recording.frame_source,
-        "sync_uncertainty_us": _us(recording.clocks["events"].get("uncertainty_ns")),
-        "passed": record["quality"]["passed"],
-        **condition_columns(record["condition"]),
+        "sync_uncertainty_us": None if uncertainty_ns is None else uncertainty_ns / 1000,
+        "passed": record.quality.passed,
+        **condition_columns(record.condition),
     }
-
-
-def _us(ns: float | None) -> float | None:
-    """Unknown where a trial was imported."""
-    return None if ns is None else ns / 1000
 
 
 def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:

@@ -10,16 +10,20 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.hashing import hash_data
+from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json, write_bytes, write_json
 from sliplab.storage.names import inside, safe_name
+from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.store import Store
 from sliplab.storage.streams import Json
+
+DocumentT = TypeVar("DocumentT", bound=Document)
 
 
 def make_key(step: str, version: int, inputs: Any, parameters: Any) -> str:
@@ -67,6 +71,22 @@ class Derived:
             FileNotFoundError: it was never made.
         """
         return read_json(self.folder / f"{safe_name(name)}.json")
+
+    def load(self, name: str, kind: type[DocumentT]) -> DocumentT:
+        """Read a result's JSON as a document.
+
+        Raises:
+            FileNotFoundError: it was never made.
+            StoreError: it is damaged, or was written by a newer version.
+        """
+        try:
+            return kind.load(self.folder / f"{safe_name(name)}.json")
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
+            raise StoreError(
+                f"{error}; it is damaged: delete it, and its step makes it again"
+            ) from None
 
     def arrays_path(self, name: str) -> Path:
         """The file that holds a result's arrays."""

@@ -13,16 +13,13 @@ import numpy as np
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.fetching import fetch
-from sliplab.storage.files import read_json
 from sliplab.storage.hdf5 import StreamReader
-from sliplab.storage.record_shape import check_clocks, check_record
+from sliplab.storage.schema.document import DocumentError, NewerFormat
+from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
 from sliplab.storage.streams import F64, I64, U8, EventChunk, Json
 from sliplab.storage.video import FrameReader, read_frame, read_frames
 from sliplab.storage.whole import byte_problem, read_sums, to_fetch
 from sliplab.storage.writer import DATA, FRAMES, RECORD
-
-RECORD_FORMAT = 1
-"""What this version writes into a record as its ``format``."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Recording:
         return Recording, (self.folder, self.sync_file)
 
     @cached_property
-    def record(self) -> Json:
+    def record(self) -> TrialRecord:
         """The trial's record.
 
         Raises:
@@ -66,25 +63,16 @@ class Recording:
         """
         path = self._sound(RECORD)
         try:
-            found = read_json(path)
-            written = found.get("format", RECORD_FORMAT)
-            if not isinstance(written, int):
-                raise ValueError("format: must be an integer")
-            if written <= RECORD_FORMAT:
-                check_record(found)
-        except ValueError as error:
-            raise self._damaged(_named(path, error)) from None
-        if written > RECORD_FORMAT:
-            raise StoreError(
-                f"{path}: format = {written}: was written by a newer version of SlipLab; "
-                f"this one reads formats up to {RECORD_FORMAT}: update it"
-            )
-        return found
+            return TrialRecord.load(path)
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
+            raise self._damaged(str(error)) from None
 
     @property
     def trial_id(self) -> str:
         """The trial's id."""
-        return str(self.record["trial"])
+        return self.record.trial
 
     @cached_property
     def raw_checksum(self) -> str:
@@ -127,13 +115,14 @@ class Recording:
     def checksum(self) -> str:
         """What stands for all that analysis reads of this trial: raw data and clocks in use."""
         refitted = self._refitted
-        return self.raw_checksum if refitted is None else self.raw_checksum + str(refitted["key"])
+        return self.raw_checksum if refitted is None else self.raw_checksum + refitted.key
 
     @cached_property
-    def clocks(self) -> Json:
-        """What is known of every device's clock: fitted again, or else as the record has it."""
+    def clocks(self) -> Clocks:
+        """The clocks of the trial: fitted again, or else as the record has them."""
         refitted = self._refitted
-        return dict(self.record["clocks"] if refitted is None else refitted["clocks"])
+        found = None if refitted is None else refitted.clocks
+        return self.record.clocks if found is None else found
 
     @property
     def refitted(self) -> bool:
@@ -141,31 +130,31 @@ class Recording:
         return self._refitted is not None
 
     @cached_property
-    def _refitted(self) -> Json | None:
+    def _refitted(self) -> SyncResult | None:
         """The result of fitting again, where it holds other clocks than the record's."""
         if self.sync_file is None or not self.sync_file.exists():
             return None
         try:
-            found = read_json(self.sync_file)
+            found = SyncResult.load(self.sync_file)
             # a trial that was taken anew under this id has nothing to do with it
-            if found.get("raw") != self.raw_checksum or found.get("clocks") is None:
+            if found.raw != self.raw_checksum or found.clocks is None:
                 return None
-            check_clocks(found["clocks"])
-            if not isinstance(found.get("key"), str):
-                raise ValueError("key: must be text")
-        except ValueError as error:
+            if found.clocks.events is None:
+                raise DocumentError(f"{self.sync_file}: clocks.events: is missing")
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
             raise StoreError(
-                f"{_named(self.sync_file, error)}; it is damaged: delete it, and `sliplab sync` "
-                "makes it again"
+                f"{error}; it is damaged: delete it, and `sliplab sync` makes it again"
             ) from None
         return found
 
     @property
-    def clocks_elsewhere(self) -> Json | None:
+    def clocks_elsewhere(self) -> SyncResult | None:
         """What another process needs to use the same clocks (`use_clocks`): None, the record's."""
         return self._refitted
 
-    def use_clocks(self, refitted: Json | None) -> None:
+    def use_clocks(self, refitted: SyncResult | None) -> None:
         """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
         self.__dict__.pop("clocks", None)
         self.__dict__["_refitted"] = refitted
@@ -192,7 +181,45 @@ class Recording:
         if self.has_video:
             return "video"
         # frames that are in no video are tracks, and the record is a small file
-        return "tracks" if self.record["counts"]["frames"] else "none"
+        return "tracks" if self.record.counts.frames else "none"
+
+    @property
+    def event_px(self) -> tuple[int, int]:
+        """Columns and rows of the event camera.
+
+        Raises:
+            StoreError: they are unknown, as of an imported trial.
+        """
+        found = self.record.geometry.event_px
+        if found is None:
+            raise StoreError(f"{self.folder}: the size of its event camera is unknown")
+        return found
+
+    @property
+    def frame_px(self) -> tuple[int, int]:
+        """Columns and rows of the frames.
+
+        Raises:
+            StoreError: the trial was recorded without frames.
+        """
+        found = self.record.geometry.frame_px
+        if found is None:
+            raise StoreError(f"{self.folder}: was recorded without frames")
+        return found
+
+    @property
+    def layout_px(self) -> F64:
+        """Places of the markers at rest from the frame's centre, pixels; float64 (m, 2).
+
+        Raises:
+            StoreError: the trial holds no scale.
+        """
+        geometry = self.record.geometry
+        if geometry.px_per_mm is None:
+            raise StoreError(f"{self.folder}: the scale of its frames is unknown")
+        layout = np.asarray(geometry.skin_mm, np.float64) * geometry.px_per_mm
+        layout[:, 1] *= -1  # rows count downwards
+        return layout
 
     def open(self) -> StreamReader:
         """The HDF5 file, as a context manager."""
@@ -204,11 +231,11 @@ class Recording:
         Raises:
             StoreError: the trial has no such clock.
         """
-        known = self.clocks
+        known = self.clocks.devices()
         if device not in known:
             names = ", ".join(sorted(known)) or "none"
             raise StoreError(f"{self.folder}: the trial has no clock '{device}'; it has: {names}")
-        return ClockMap.from_json(known[device]["map"])
+        return known[device].map
 
     def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
         """Events between two times of the time line, on the camera's own clock."""
@@ -261,32 +288,22 @@ class Recording:
             KeyError: the motion has no such phase.
         """
         clock = self.clock("arm")
-        for step in reversed(self.record.get("steps", [])):
-            if step["phase"] == phase:
-                return (
-                    int(clock.to_reference(int(step["start_ns"]))),
-                    int(clock.to_reference(int(step["end_ns"]))),
-                )
+        for step in reversed(self.record.steps):
+            if step.phase == phase:
+                return clock.to_reference(step.start_ns), clock.to_reference(step.end_ns)
         raise KeyError(f"{self.trial_id}: no step '{phase}'")
 
     @property
     def motion_phase(self) -> str:
         """``slide`` or ``retract``: the phase in which slip is looked for."""
-        phases = {step["phase"] for step in self.record.get("steps", [])}
+        phases = {step.phase for step in self.record.steps}
         return "slide" if "slide" in phases else "retract"
 
     @property
     def simulated(self) -> bool:
         """Whether a mock rig made this."""
-        return bool(self.record["simulated"])
+        return self.record.simulated
 
     def simulation_truth(self) -> dict[str, Any] | None:
         """What really happened, on the time line; only for tests and error reports."""
-        truth = self.record.get("simulation_truth")
-        return dict(truth) if isinstance(truth, dict) else None
-
-
-def _named(path: Path, error: ValueError) -> str:
-    """What is wrong with a file, which not every message names."""
-    said = str(error)
-    return said if said.startswith(str(path)) else f"{path}: {said}"
+        return self.record.simulation_truth

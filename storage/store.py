@@ -36,6 +36,7 @@ from sliplab.storage.files import (
 )
 from sliplab.storage.names import inside, safe_name
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.secrets import masked
 from sliplab.storage.streams import Json
 from sliplab.storage.whole import partial, write_sums
@@ -237,9 +238,9 @@ class Campaign:
         number = max(there, default=0) + 1
         write_json(folder / f"{number:04d}.json", data)
 
-    def provenance(self, recording: Recording) -> Json:
+    def provenance(self, recording: Recording) -> Provenance:
         """When, where and with which versions a trial was taken."""
-        return read_json(recording.folder / PROVENANCE)
+        return Provenance.load(recording.folder / PROVENANCE)
 
     def _sync_file(self, trial_id: str) -> Path:
         """Where the sync step keeps what it found of a trial."""

@@ -14,8 +14,8 @@ from sliplab.storage.columns import TIMING, TRACKS
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import own_fault, read_json, temporary_files
 from sliplab.storage.hdf5 import StreamReader
-from sliplab.storage.record_shape import check_record
-from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.schema.document import NewerFormat
+from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
 from sliplab.storage.streams import Json
 from sliplab.storage.video import count_frames
@@ -113,7 +113,7 @@ def _trial(folder: Path) -> Found:
         if path.name not in _KNOWN or (path.name == FRAMES and FRAMES not in sums)
     ]
     try:
-        read_json(folder / PROVENANCE)
+        Provenance.load(folder / PROVENANCE)
     except (OSError, ValueError) as error:
         if own_fault(error):
             raise
@@ -181,12 +181,12 @@ def _temporary(folder: Path, campaign: str) -> list[Problem]:
 
 def _contents(folder: Path) -> Found:
     problems: Found = []
-    record = read_json(folder / RECORD)
-    if record.get("format", RECORD_FORMAT) > RECORD_FORMAT:
-        return [(folder / RECORD, f"was written by a newer version (format {record['format']})")]
-    check_record(record)
-    if record["trial"] != folder.name:
-        problems.append((folder / RECORD, f"is of trial {record['trial']}"))
+    try:
+        record = TrialRecord.load(folder / RECORD)
+    except NewerFormat as error:
+        return [(folder / RECORD, f"was written by a newer version (format {error.format})")]
+    if record.trial != folder.name:
+        problems.append((folder / RECORD, f"is of trial {record.trial}"))
     with StreamReader(folder / DATA) as reader:
         counts = reader.counts()
         made = [name for name in TIMING if reader.has(name)]
@@ -201,11 +201,11 @@ def _contents(folder: Path) -> Found:
         "pulses": counts["sync_pulses/t"],
     }
     for name, count in found.items():
-        said = record["counts"][name]
+        said = getattr(record.counts, name)
         if count != said:
             problems.append((folder / DATA, f"{count} {name}, the record says {said}"))
     problems += _frame_problems(folder, tracks, counts)
-    if not record["quality"]["passed"]:
+    if not record.quality.passed:
         problems.append((folder / RECORD, "was committed although a gate failed"))
     return problems
 

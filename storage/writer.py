@@ -11,6 +11,7 @@ import numpy as np
 
 from sliplab.storage.files import sha256, sync_file, sync_folder, write_json_aside
 from sliplab.storage.hdf5 import StreamFile
+from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.secrets import masked
 from sliplab.storage.spool import Spool
 from sliplab.storage.streams import (
@@ -146,7 +147,7 @@ class TrialWriter:
         del frames
         spool.unlink()
 
-    def commit(self, record: Json, provenance: Json) -> Path:
+    def commit(self, record: TrialRecord, provenance: Provenance) -> Path:
         """Write record and checksums, flush everything, and make the trial visible.
 
         Returns:
@@ -163,7 +164,9 @@ class TrialWriter:
         sync_folder(self.target.parent)
         return self.target
 
-    def set_aside(self, quarantine: Path, record: Json, provenance: Json, cause: Json) -> None:
+    def set_aside(
+        self, quarantine: Path, record: TrialRecord, provenance: Provenance, cause: Json
+    ) -> None:
         """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
         self.seal()
         write_json_aside(
@@ -173,9 +176,9 @@ class TrialWriter:
         os.rename(self.folder, quarantine)
         sync_folder(quarantine.parent)
 
-    def _finish_folder(self, record: Json, provenance: Json) -> None:
-        write_json_aside(self.folder / RECORD, record)
-        write_json_aside(self.folder / PROVENANCE, provenance)
+    def _finish_folder(self, record: TrialRecord, provenance: Provenance) -> None:
+        write_json_aside(self.folder / RECORD, record.to_json())
+        write_json_aside(self.folder / PROVENANCE, provenance.to_json())
         sums = {}
         for name in (DATA, FRAMES, RECORD):
             path = self.folder / name

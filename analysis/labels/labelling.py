@@ -211,14 +211,14 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
     """
     frame_ns = recording.frame_times()
     motion_ns = recording.step(recording.motion_phase)
-    timing = recording.record.get("timing") or {}
+    timing = recording.record.timing
     return label_places(
         places_of(recording),
         frame_ns,
         motion_ns,
         settings,
-        centre=int(recording.record["geometry"]["centre"]),
-        exposure_ns=2 * int(timing.get("mid_exposure_ns") or 0),
+        centre=recording.record.geometry.centre,
+        exposure_ns=0 if timing is None else 2 * (timing.mid_exposure_ns or 0),
         source=recording.frame_source,
     )
 

@@ -67,13 +67,10 @@ def places_of(recording: Recording) -> Places:
     Raises:
         ValueError: it has neither video nor tracks, or tracks without the plate that it has.
     """
-    with_plate = recording.record["experiment"] != "kinematic"
+    with_plate = recording.record.experiment != "kinematic"
     if recording.has_video:
-        geometry = recording.record["geometry"]
-        layout = np.asarray(geometry["skin_mm"], np.float64) * geometry["px_per_mm"]
-        layout[:, 1] *= -1  # rows count downwards
-        video = track_video(recording.frames(), layout, with_plate)
-        return from_tracks(video.markers, video.plate, tuple(geometry["frame_px"]))
+        video = track_video(recording.frames(), recording.layout_px, with_plate)
+        return from_tracks(video.markers, video.plate, recording.frame_px)
     if recording.has_tracks:
         tracks = recording.tracks()
         if with_plate and tracks.plate_px is None:

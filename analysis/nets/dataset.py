@@ -112,24 +112,20 @@ def cut_windows(
     """
     events = recording.events()
     starts_us = np.asarray(recording.clock("events").to_device(starts_ns)) // 1000
-    width, height = recording.record["geometry"]["event_px"]
+    width, height = recording.event_px
     return list_events(events, starts_us, windows, width, height, crop_centre_px(recording))
 
 
 def crop_centre_px(recording: Recording) -> tuple[float, float] | None:
     """Where the event camera saw the skin's centre, column and row; None where nobody looked."""
-    centre = recording.record["geometry"].get("event_centre_px")
-    return None if centre is None else (float(centre[0]), float(centre[1]))
+    return recording.record.geometry.event_centre_px
 
 
 def recorded_span(recording: Recording) -> tuple[int, int]:
     """Start and end of the recording on its time line, ns."""
-    recorded = [step for step in recording.record["steps"] if step["recorded"]]
+    recorded = [step for step in recording.record.steps if step.recorded]
     clock = recording.clock("arm")
-    return (
-        int(clock.to_reference(int(recorded[0]["start_ns"]))),
-        int(clock.to_reference(int(recorded[-1]["end_ns"]))),
-    )
+    return clock.to_reference(recorded[0].start_ns), clock.to_reference(recorded[-1].end_ns)
 
 
 def trial_samples(

@@ -30,8 +30,10 @@ from sliplab.analysis.timeline.clocks import (
 from sliplab.analysis.timeline.counters import split_at_restarts
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.errors import StoreError
 from sliplab.storage.hdf5 import StreamReader
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Clocks, DeviceRecord
 
 I64 = npt.NDArray[np.int64]
 
@@ -95,8 +97,8 @@ class DeviceSync:
     fit: ClockFit | None = None
     bounds: BoundedClock | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """For the trial's record."""
+    def record(self) -> DeviceRecord:
+        """Return the part of the trial's record."""
         known: dict[str, Any] = {"grade": self.grade}
         if self.fit is not None:
             known |= {"kind": "95 %", **self.fit.to_json()}
@@ -107,7 +109,7 @@ class DeviceSync:
                 "drift_error_ppm": self.bounds.drift_error_ppm,
                 "pairs": self.bounds.pairs,
             }
-        return known | {"map": self.map.to_json(), "uncertainty_ns": self.uncertainty_ns}
+        return DeviceRecord(**{**known, "map": self.map, "uncertainty_ns": self.uncertainty_ns})
 
 
 @dataclass(frozen=True)
@@ -126,18 +128,18 @@ class TrialSync:
     refused: dict[str, str]
     pieces: dict[str, list[DeviceSync | str]]
 
-    def to_json(self) -> dict[str, Any]:
-        """The record's ``clocks``: what each device has, by its name."""
+    def record(self) -> Clocks:
+        """Return the part of the trial's record."""
         known: dict[str, Any] = {"reference": "sync box", "code": self.code}
-        known |= {name: device.to_json() for name, device in self.devices.items()}
+        known |= {name: device.record() for name, device in self.devices.items()}
         if self.refused:
             known["refused"] = self.refused
         if self.pieces:
             known["pieces"] = {
-                name: [part if isinstance(part, str) else part.to_json() for part in parts]
+                name: [part if isinstance(part, str) else part.record() for part in parts]
                 for name, parts in self.pieces.items()
             }
-        return known
+        return Clocks(**known)
 
     def against_events_ns(self, device: str) -> float | None:
         """Uncertainty of events against another device, both maps together; None if unknown."""
@@ -172,11 +174,17 @@ def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams
 
 
 def synchronise_recording(recording: Recording) -> TrialSync:
-    """Fit a stored trial's clocks again, by what its record says of its rig."""
-    timing = recording.record["timing"]
+    """Fit a stored trial's clocks again, by the timing in its record.
+
+    Raises:
+        StoreError: the record holds no timing.
+    """
+    timing = recording.record.timing
+    if timing is None:
+        raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
     with recording.open() as reader:
-        streams = streams_of(reader, timing["mid_exposure_ns"])
-    return synchronise(streams, Timing.model_validate(timing["rig"]), float(timing["rate_hz"]))
+        streams = streams_of(reader, timing.mid_exposure_ns)
+    return synchronise(streams, timing.rig, timing.rate_hz)
 
 
 def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSync:

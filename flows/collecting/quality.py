@@ -23,6 +23,7 @@ from sliplab.protocols.timing import Timing
 from sliplab.rigs.rig import TrialRun
 from sliplab.storage.columns import TRACKS
 from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.schema.trial import Clocks, Counts, Gate
 from sliplab.storage.streams import I64, StepTimes
 from sliplab.storage.writer import DATA
 
@@ -35,30 +36,35 @@ BURST_US = 10_000
 
 @dataclass(frozen=True)
 class Assessment:
-    """Clock maps and gates of one attempt, as JSON data."""
+    """Clock maps, gates and counts of one attempt."""
 
-    clocks: dict[str, Any]
-    gates: dict[str, dict[str, Any]]
-    counts: dict[str, int]
+    clocks: Clocks
+    gates: dict[str, Gate]
+    counts: Counts
 
     @property
     def passed(self) -> bool:
         """Whether every gate is passed."""
-        return all(bool(gate["passed"]) for gate in self.gates.values())
+        return all(gate.passed for gate in self.gates.values())
 
     @property
     def causes(self) -> str:
         """The failed gates in words."""
-        failed = {name: gate for name, gate in self.gates.items() if not gate["passed"]}
+        failed = {name: gate for name, gate in self.gates.items() if not gate.passed}
         return "; ".join(_cause(name, gate) for name, gate in failed.items())
 
 
-def _cause(name: str, gate: dict[str, Any]) -> str:
+def _cause(name: str, gate: Gate) -> str:
     """Why one gate was not passed: its figure, or why there is none."""
-    value, limit = gate["value"], gate["limit"]
-    if isinstance(value, str):  # why a clock was refused
+    value, limit = gate.value, gate.limit
+    if value is None or isinstance(value, str):  # why a clock was refused
         return f"{name}: {value}"
     return f"{name}: cannot be told" if value < 0 else f"{name} = {value} (limit {limit})"
+
+
+def _gate(value: float, limit: float) -> Gate:
+    """A gate with an upper limit; a negative figure is one that is unknown."""
+    return Gate(value=value, limit=limit, passed=0 <= value <= limit)
 
 
 def assess(
@@ -84,78 +90,42 @@ def assess(
     results = _sync_gates(sync, gates, run, mid_exposure_ns is not None)
     if mid_exposure_ns is not None:
         lost = _frames_lost(streams.frame_number, run, rate_hz)
-        results["frames_lost"] = {
-            "value": lost,
-            "limit": gates.frames_lost,
-            "passed": lost <= gates.frames_lost,
-        }
-    gap = _event_gap(event_us, sync, run)
-    gap_limit = float(gates.event_gap)
-    results["event_gap_s"] = {"value": gap, "limit": gap_limit, "passed": 0 <= gap <= gap_limit}
-    burst = _event_burst(event_us)
-    results["event_burst"] = {
-        "value": burst,
-        "limit": gates.event_burst,
-        "passed": burst <= gates.event_burst,
-    }
+        results["frames_lost"] = _gate(lost, gates.frames_lost)
+    results["event_gap_s"] = _gate(_event_gap(event_us, sync, run), float(gates.event_gap))
+    results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
     if gates.hold_slip is not None and tracks:
-        slip, slip_limit = _hold_slip_px(streams.frame_ns, tracks, sync, run), gates.hold_slip
-        results["hold_slip_px"] = {
-            "value": slip,
-            "limit": float(slip_limit),
-            "passed": 0 <= slip <= float(slip_limit),
-        }
+        slip = _hold_slip_px(streams.frame_ns, tracks, sync, run)
+        results["hold_slip_px"] = _gate(slip, float(gates.hold_slip))
     away = path_deviation_mm(streams.pose_ns, pose_mm, run.ways)
-    away_limit = float(gates.path_deviation)
-    results["path_deviation_mm"] = {
-        "value": away,
-        "limit": away_limit,
-        "passed": 0 <= away <= away_limit,
-    }
+    results["path_deviation_mm"] = _gate(away, float(gates.path_deviation))
     off = speed_deviation_percent(streams.pose_ns, streams.pose_host_ns, pose_mm, run.ways)
-    off_limit = float(gates.speed_deviation)
-    results["speed_deviation_percent"] = {
-        "value": off,
-        "limit": off_limit,
-        "passed": 0 <= off <= off_limit,
-    }
-    return Assessment(
-        sync.to_json(),
-        results,
-        {
-            "events": len(event_us),
-            "frames": len(streams.frame_ns),
-            "poses": len(streams.pose_ns),
-            "pulses": len(streams.sync_pulses),
-        },
+    results["speed_deviation_percent"] = _gate(off, float(gates.speed_deviation))
+    counts = Counts(
+        events=len(event_us),
+        frames=len(streams.frame_ns),
+        poses=len(streams.pose_ns),
+        pulses=len(streams.sync_pulses),
     )
+    return Assessment(sync.record(), results, counts)
 
 
-def _sync_gates(
-    sync: TrialSync, gates: Gates, run: TrialRun, video: bool
-) -> dict[str, dict[str, Any]]:
+def _sync_gates(sync: TrialSync, gates: Gates, run: TrialRun, video: bool) -> dict[str, Gate]:
     """Every device has a clock map, good enough for its grade and for all of the recording."""
     limits = gates.sync_uncertainty
-    results: dict[str, dict[str, Any]] = {}
+    results: dict[str, Gate] = {}
     for device in ("events", "arm", "frames")[: 3 if video else 2]:
         name = f"sync_uncertainty_{device}_s"
         known = sync.devices.get(device)
         if known is None:
-            results[name] = {"value": sync.refused[device], "limit": None, "passed": False}
+            results[name] = Gate(value=sync.refused[device], limit=None, passed=False)
             continue
         grade = "digital input" if device == "events" else known.grade
         # a latency is a difference: both maps count
         both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
         value = (known.uncertainty_ns if both is None else both) / 1e9
         limit = limits.limit_s(grade)
-        passed = value <= limit
-        results[name] = {"value": value, "limit": limit, "grade": known.grade, "passed": passed}
-    beyond = _unvouched_s(sync, run)
-    results["sync_unvouched_s"] = {
-        "value": beyond,
-        "limit": UNVOUCHED_S,
-        "passed": 0 <= beyond <= UNVOUCHED_S,
-    }
+        results[name] = Gate(value=value, limit=limit, grade=known.grade, passed=value <= limit)
+    results["sync_unvouched_s"] = _gate(_unvouched_s(sync, run), UNVOUCHED_S)
     return results
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
+from typing import Any
 
 from sliplab.flows.collecting.quality import Assessment, assess
 from sliplab.flows.collecting.trial_gate import TrialGate
@@ -26,7 +27,14 @@ from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig import Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.errors import translated_disk_errors
-from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.schema.trial import (
+    Geometry,
+    Provenance,
+    Quality,
+    RecordedTiming,
+    Step,
+    TrialRecord,
+)
 from sliplab.storage.store import Campaign
 from sliplab.storage.streams import Json
 from sliplab.storage.writer import TrialWriter
@@ -204,7 +212,7 @@ class Session:
         attempt: int,
         writer: TrialWriter,
         found: Assessment,
-        provenance: Json,
+        provenance: Provenance,
         run: TrialRun,
         frame_px: tuple[int, int] | None,
     ) -> None:
@@ -220,70 +228,71 @@ class Session:
         run: TrialRun,
         found: Assessment,
         frame_px: tuple[int, int] | None,
-    ) -> Json:
+    ) -> TrialRecord:
         """The trial's record: everything that follows from protocol, seed and versions."""
         recorded = run.recorded_ns
         first, last = run.steps[0][0], run.steps[-1][0]
-        record: Json = {
-            "format": RECORD_FORMAT,
-            "trial": trial.id,
-            "campaign": self.campaign.name,
-            "experiment": self.plan.protocol.collection.experiment,
-            "role": trial.role,
-            "block": trial.block,
-            "repetition": trial.repetition,
-            "attempt": attempt,
-            "condition": self.plan.describe(trial),
-            "seed": trial.seed,
-            "rig": self.rig.name,
-            "simulated": self.rig_file.simulated,
-            "recorded_s": (recorded[1] - recorded[0]) / 1e9,
-            "motion_s": (last.end_ns - first.start_ns) / 1e9,
-            "depth_zero_mm": run.zero_mm,
-            "counts": found.counts,
-            "clocks": found.clocks,
-            "timing": {
-                "rig": self.rig.timing.model_dump(mode="json"),
-                "rate_hz": self.plan.protocol.collection.recording.sync_rate,
-                "mid_exposure_ns": self.rig.frames.mid_exposure_ns if frame_px else None,
-            },
-            "quality": {"passed": found.passed, "gates": found.gates},
-            "steps": [
-                {
-                    "phase": step.phase,
-                    "start_ns": step.start_ns,
-                    "end_ns": step.end_ns,
-                    "recorded": kept,
-                }
-                for step, kept in run.steps
-            ],
-            "geometry": {
-                "event_px": [self.rig.events.width, self.rig.events.height],
-                "frame_px": list(frame_px) if frame_px is not None else None,
-                "px_per_mm": self.rig_file.frame_camera.scale_px_per_mm,
-                "skin_mm": [list(place) for place in self.rig_file.skin.layout_mm()],
-                "centre": 0,
-            },
-        }
-        if (centre := self.rig_file.calibration.centre_px) is not None:
-            record["geometry"]["event_centre_px"] = list(centre)
+        given: dict[str, Any] = {}
         if described := self.rig.describe():
-            record["devices"] = described
+            given["devices"] = described
         if run.truth is not None:
-            record["simulation_truth"] = run.truth
-        return record
+            given["simulation_truth"] = run.truth
+        return TrialRecord(
+            format=TrialRecord.FORMAT,
+            trial=trial.id,
+            campaign=self.campaign.name,
+            experiment=self.plan.protocol.collection.experiment,
+            role=trial.role,
+            block=trial.block,
+            repetition=trial.repetition,
+            attempt=attempt,
+            condition=self.plan.describe(trial),
+            seed=trial.seed,
+            rig=self.rig.name,
+            simulated=self.rig_file.simulated,
+            recorded_s=(recorded[1] - recorded[0]) / 1e9,
+            motion_s=(last.end_ns - first.start_ns) / 1e9,
+            depth_zero_mm=run.zero_mm,
+            counts=found.counts,
+            clocks=found.clocks,
+            timing=RecordedTiming(
+                rig=self.rig.timing,
+                rate_hz=self.plan.protocol.collection.recording.sync_rate,
+                mid_exposure_ns=self.rig.frames.mid_exposure_ns if frame_px else None,
+            ),
+            quality=Quality(passed=found.passed, gates=found.gates),
+            steps=tuple(
+                Step(phase=step.phase, start_ns=step.start_ns, end_ns=step.end_ns, recorded=kept)
+                for step, kept in run.steps
+            ),
+            geometry=self._geometry(frame_px),
+            **given,
+        )
 
-    def _provenance(self, started: datetime) -> Json:
+    def _geometry(self, frame_px: tuple[int, int] | None) -> Geometry:
+        given: dict[str, Any] = {}
+        if (centre := self.rig_file.calibration.centre_px) is not None:
+            given["event_centre_px"] = centre
+        return Geometry(
+            event_px=(self.rig.events.width, self.rig.events.height),
+            frame_px=frame_px,
+            px_per_mm=self.rig_file.frame_camera.scale_px_per_mm,
+            skin_mm=tuple(self.rig_file.skin.layout_mm()),
+            centre=0,
+            **given,
+        )
+
+    def _provenance(self, started: datetime) -> Provenance:
         """When, where and with what: outside the checksums."""
-        return {
-            "started": started.isoformat(timespec="milliseconds"),
-            "ended": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "host": socket.gethostname(),
+        return Provenance(
+            started=started.isoformat(timespec="milliseconds"),
+            ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
+            host=socket.gethostname(),
+            operator=self.operator,
+            skin=self.rig_file.skin.serial,
+            disk_free=shutil.disk_usage(self.campaign.folder).free,
             **_installed(),
-            "operator": self.operator,
-            "skin": self.rig_file.skin.serial,
-            "disk_free": shutil.disk_usage(self.campaign.folder).free,
-        }
+        )
 
 
 @cache

@@ -187,7 +187,7 @@ class _Page:
             with suppress(StoreError):
                 record = campaign.recording(trial.id).record
                 numbers.append(number)
-                rates.append(record["counts"]["events"] / record["recorded_s"])
+                rates.append(record.counts.events / record.recorded_s)
         return numbers, rates
 
     def _title(self, what: str) -> str:

@@ -143,7 +143,7 @@ def _cases(store: Store, campaigns: list[Collected]) -> Any:
         for trial, recording in item.trials:
             truth = recording.simulation_truth()
             label = labels.read(trial.id)
-            centre = int(recording.record["geometry"]["centre"])
+            centre = recording.record.geometry.centre
             for rule, keys in _TRUTH.items():
                 known = truth
                 if truth is not None and rule == "paper" and label.get("reference") == "hold_start":

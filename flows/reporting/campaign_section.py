@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from sliplab.protocols import Trial
 from sliplab.protocols.factors import Level
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Gate
 from sliplab.storage.store import Store
 
 Json = dict[str, Any]
@@ -143,8 +144,8 @@ def quality(store: Store, campaigns: list[Collected], simulated: bool) -> Sectio
 def _over_campaign(item: Collected, simulated: bool) -> Figure:
     numbers = [trial.index + 1 for trial, _ in item.trials]
     records = [recording.record for _, recording in item.trials]
-    rates = [record["counts"]["events"] / record["recorded_s"] for record in records]
-    nearest = [_nearest(record["quality"]["gates"]) for record in records]
+    rates = [record.counts.events / record.recorded_s for record in records]
+    nearest = [_nearest(record.quality.gates) for record in records]
     places = {trial.id: trial.index + 1 for trial in item.plan}
     failed = Counter(
         places[known["trial"]] for known in item.campaign.quarantined() if known["trial"] in places
@@ -169,12 +170,12 @@ def _over_campaign(item: Collected, simulated: bool) -> Figure:
     )
 
 
-def _nearest(gates: Json) -> tuple[float, str]:
+def _nearest(gates: Mapping[str, Gate]) -> tuple[float, str]:
     """The largest share of its limit that any gate used, and which; a limit of 0 uses nothing."""
     shares = [
-        (gate["value"] / gate["limit"], name)
+        (gate.value / gate.limit, name)
         for name, gate in gates.items()
-        if gate["limit"] and not isinstance(gate["value"], str)
+        if gate.limit and gate.value is not None and not isinstance(gate.value, str)
     ]
     return max(shares, default=(0.0, ""))
 
@@ -183,9 +184,9 @@ def _gates(item: Collected) -> list[Table]:
     """The worst committed trial of every gate, and why attempts are in quarantine."""
     worst: dict[str, tuple[float, float, str]] = {}
     for trial, recording in item.trials:
-        for name, gate in recording.record["quality"]["gates"].items():
-            value, limit = gate["value"], gate["limit"]
-            if isinstance(value, str) or limit is None:
+        for name, gate in recording.record.quality.gates.items():
+            value, limit = gate.value, gate.limit
+            if value is None or isinstance(value, str) or limit is None:
                 continue
             if name not in worst or value > worst[name][0]:
                 worst[name] = (value, limit, trial.id)

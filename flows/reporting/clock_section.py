@@ -8,9 +8,8 @@ from sliplab.analysis.pictures import figures_campaign
 from sliplab.analysis.pictures.report import Figure, Link, Section, number
 from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_page import PAGE
+from sliplab.storage.schema.trial import DEVICES
 from sliplab.storage.store import Store
-
-_DEVICES = ("events", "frames", "arm")
 
 
 def section(
@@ -40,18 +39,15 @@ def _figure(campaigns: list[Collected], grades: dict[str, str], simulated: bool)
     """The uncertainty of each device in each trial."""
     starts: dict[str, int] = {}
     names: list[str] = []
-    found: dict[str, list[float | None]] = {device: [] for device in _DEVICES}
+    found: dict[str, list[float | None]] = {device: [] for device in DEVICES}
     for item in campaigns:
         if item.trials:
             starts[item.name] = len(names) + 1
         for trial, recording in item.trials:
             names.append(trial.id)
             clocks = recording.clocks
-            of_events = clocks.get("events", {}).get("uncertainty_ns")
-            for device in _DEVICES:
-                known = clocks.get(device, {}).get("uncertainty_ns")
-                if known is not None and device != "events" and of_events is not None:
-                    known += of_events
+            for device in DEVICES:
+                known = clocks.against_events_ns(device)
                 found[device].append(None if known is None else known / 1e3)
     drawn = {}
     for device, values in found.items():

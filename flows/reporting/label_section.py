@@ -97,7 +97,7 @@ def _figure(store: Store, campaigns: list[Collected], simulated: bool) -> Figure
         labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
             found = labels.read(trial.id)["change_point"]
-            centre = int(recording.record["geometry"]["centre"])
+            centre = recording.record.geometry.centre
             for kind, marker in (("incipient", found["first_marker"]), ("gross", centre)):
                 if found["doubts"][kind] is None and found[f"{kind}_ns"] is not None:
                     width = found["high_ns"][marker] - found["low_ns"][marker]

@@ -204,11 +204,9 @@ def _sync(campaigns: list[Collected]) -> dict[str, Any]:
     for item in campaigns:
         for _, recording in item.trials:
             clocks = recording.clocks
-            for device in ("events", "frames", "arm"):
-                if device in clocks:
-                    grades.setdefault(device, set()).add(clocks[device]["grade"])
-                    both = clocks[device]["uncertainty_ns"]
-                    both += clocks["events"]["uncertainty_ns"] if device != "events" else 0.0
+            for device, known in clocks.devices().items():
+                grades.setdefault(device, set()).add(known.grade)
+                if (both := clocks.against_events_ns(device)) is not None:
                     worst[device] = max(worst.get(device, 0.0), both / 1e3)
     named = {device: " or ".join(sorted(found)) for device, found in grades.items()}
     return {
@@ -238,7 +236,7 @@ def _planned(item: Collected) -> dict[str, Any]:
     missing = {trial.id for trial in item.plan} - done
     return {
         "seconds": sum(item.plan.seconds(trial) for trial, _ in item.trials),
-        "seconds_collected": sum(r.record["motion_s"] for _, r in item.trials),
+        "seconds_collected": sum(r.record.motion_s or 0.0 for _, r in item.trials),
         "bytes": round(plan_bytes(rig, item.plan, missing)),
         "bytes_collected": sum(
             path.stat().st_size

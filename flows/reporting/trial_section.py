@@ -96,7 +96,7 @@ def _events(item: Collected, recording: Recording, start: int) -> tuple[F64, F64
     """Positive events inside the crop: seconds since the recording began, and cell rows."""
     events = recording.events()
     windows = item.settings.windows
-    _, height = recording.record["geometry"]["event_px"]
+    _, height = recording.event_px
     centre = dataset.crop_centre_px(recording)
     top = first_pixel(height, windows.crop_px, None if centre is None else centre[1])
     cell = (events.y.astype(np.int64) - top) / windows.pool_px

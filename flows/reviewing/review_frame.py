@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
 from bokeh.palettes import grey
@@ -9,6 +11,7 @@ from bokeh.plotting import figure
 
 from sliplab.analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
 from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.storage.schema.trial import Point
 from sliplab.storage.streams import U8
 
 _TAIL_FRAMES = 60
@@ -47,7 +50,7 @@ class FramePlot:
 
     def frame_to(self, shown: Shown) -> None:
         """Fit the plot to another trial's frames."""
-        width, height = shown.recording.record["geometry"]["frame_px"]
+        width, height = shown.recording.frame_px
         self._size = (int(width), int(height))
         for axis, size in ((self.plot.x_range, width), (self.plot.y_range, height)):
             axis.update(start=0, end=int(size), reset_start=0, reset_end=int(size))
@@ -72,8 +75,8 @@ class FramePlot:
             self._picture.data = {"image": [picture[::-1]], "w": [width], "h": [height]}
         places = shown.places(index)
         seen = np.isfinite(places).all(axis=1)
-        geometry = shown.recording.record["geometry"]
-        radius = _RING * geometry["px_per_mm"] * _spacing_mm(geometry["skin_mm"])
+        geometry = shown.recording.record.geometry
+        radius = _RING * (geometry.px_per_mm or 1.0) * _spacing_mm(geometry.skin_mm)
         self._rings.data = {
             **self._there(places[seen]),
             "r": np.full(int(seen.sum()), radius),
@@ -95,7 +98,7 @@ class FramePlot:
         return {"x": places[:, 0] + 0.5, "y": self._size[1] - places[:, 1] - 0.5}
 
 
-def _spacing_mm(skin_mm: list[list[float]]) -> float:
+def _spacing_mm(skin_mm: Sequence[Point]) -> float:
     """Distance of the centre's nearest neighbour."""
     skin = np.asarray(skin_mm)
     away = np.hypot(*(skin[1:] - skin[0]).T) if len(skin) > 1 else np.array([5.6])

@@ -58,7 +58,7 @@ class Shown:
     @property
     def centre(self) -> int:
         """Index of the centre marker."""
-        return int(self.recording.record["geometry"]["centre"])
+        return self.recording.record.geometry.centre
 
     @property
     def threshold_px(self) -> float:

@@ -23,7 +23,7 @@ def keys() -> str:
 def heading(shown: Shown, position: str) -> str:
     """Which trial it is, what it was taken under, and why it is in doubt."""
     row = shown.row
-    condition = shown.recording.record["condition"]
+    condition = shown.recording.record.condition
     levels = ", ".join(f"{name} {text}" for name, text in condition.items())
     who = f" by {escape(row.who)}" if row.who else ""
     badges = [f"<span class='state {row.state}'>{row.state}{who}</span>"]
@@ -73,10 +73,10 @@ def lines(shown: Shown, onsets: Onsets) -> str:
 def flags(shown: Shown) -> str:
     """The gates that the trial passed, and what the label says of its quality."""
     cells = []
-    for name, gate in shown.recording.record["quality"]["gates"].items():
-        mark = "" if gate["passed"] else " class='doubt'"
-        limit = "" if gate["limit"] is None else f" (limit {gate['limit']:g})"
-        cells.append((f"<td{mark}>{escape(name)}</td>", f"{_plain(gate['value'])}{limit}"))
+    for name, gate in shown.recording.record.quality.gates.items():
+        mark = "" if gate.passed else " class='doubt'"
+        limit = "" if gate.limit is None else f" (limit {gate.limit:g})"
+        cells.append((f"<td{mark}>{escape(name)}</td>", f"{_plain(gate.value)}{limit}"))
     label = shown.label
     for name in ("source", "rule", "reference", "markers_lost", "plate_lost", "camera_moved_px"):
         if label.get(name) is not None:

@@ -93,7 +93,7 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     fresh = derived.fresh(subject.trial, key)
     label = derived.read(subject.trial) if fresh else {}
     arrays = derived.arrays(subject.trial) if fresh else {}
-    condition = ", ".join(f"{name} {text}" for name, text in recording.record["condition"].items())
+    condition = ", ".join(f"{name} {text}" for name, text in recording.record.condition.items())
     kind = "**simulated**" if recording.simulated else "recorded"
     text = f"# {condition}\n\n{kind}\n\n{subject.item.name} / {subject.trial}"
     document = library.TextDocument(text, media_type=library.MediaType.MARKDOWN)
@@ -121,7 +121,7 @@ def _events(to: _Columns, subject: Subject) -> None:
         for name, polarity in (("on", 1), ("off", 0)):
             _points(to, f"events/{name}", events, time_ns, events.p == polarity)
     else:
-        _pictures(to, recording.record["geometry"]["event_px"], events, time_ns)
+        _pictures(to, recording.event_px, events, time_ns)
     start, end = recorded_span(recording)
     rate_s, rate = event_rate(recording, start, end)
     to.scalars("events/rate", np.round(rate_s * 1e9).astype(np.int64), rate)
@@ -140,7 +140,7 @@ def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: An
     to.send(path, times[first], columns)
 
 
-def _pictures(to: _Columns, size: list[int], events: EventChunk, time_ns: I64) -> None:
+def _pictures(to: _Columns, size: tuple[int, int], events: EventChunk, time_ns: I64) -> None:
     """Counts of events on pooled pixels, uint16, in so many bins of equal length."""
     shape = (-(-size[1] // POOL), -(-size[0] // POOL))
     length = max(BIN_NS, -(-int(time_ns[-1] - time_ns[0] + 1) // MOST_PICTURES))

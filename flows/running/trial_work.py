@@ -20,8 +20,8 @@ from sliplab.flows.running.timing import timed
 from sliplab.storage.derived import Derived
 from sliplab.storage.mirror import place_of, reach
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import SyncResult
 from sliplab.storage.store import Store, StoreError
-from sliplab.storage.streams import Json
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
@@ -74,7 +74,7 @@ class _Job:
     campaign: str
     trial: str
     checksum: str
-    clocks: Json | None
+    clocks: SyncResult | None
     make: Make
     settings: Any
 

@@ -187,7 +187,7 @@ class Guesses:
         """Windows and trials at one setting, by the study's network and settings."""
         judged = judge(self.fitted, self.detection, store, campaigns)
         rows = [
-            {**row, "depth_zero_mm": recording.record["depth_zero_mm"]}
+            {**row, "depth_zero_mm": recording.record.depth_zero_mm}
             for row, recording in judged.trials
         ]
         used = training_campaigns(campaigns)

@@ -5,7 +5,6 @@ Runs in processes of its own, so nothing here loads what only the command line n
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -13,10 +12,10 @@ import numpy as np
 
 from sliplab.analysis.timeline import synchronise
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import SyncResult
 
 POINTS = 200
 """So many residuals are kept of a device in a trial, evenly spread over it."""
-DEVICES = ("events", "frames", "arm")
 _SAME = 1e-9
 """Figures that differ by less than this share came from the same fit on another processor."""
 _SAME_DRIFT = 10**6
@@ -28,16 +27,14 @@ def fit_again(recording: Recording, _: None) -> tuple[dict[str, Any], dict[str, 
     residuals.
     """
     found = synchronise.synchronise_recording(recording)
-    # as a file gives them back, which is how the record has them
-    clocks = json.loads(json.dumps(found.to_json()))
-    known = recording.record["clocks"]
+    clocks, known = found.record(), recording.record.clocks
     data: dict[str, Any] = {"raw": recording.raw_checksum, "refused": found.refused}
     # a clock that is refused now is told to people; it is no better one
-    if all(name in found.devices for name in DEVICES if name in known) and not same_clocks(
-        clocks, known
+    if known.devices().keys() <= found.devices.keys() and not same_clocks(
+        clocks.to_json(), known.to_json()
     ):
         data["clocks"] = clocks
-    return data, _residuals(found)
+    return SyncResult(**data).to_json(), _residuals(found)
 
 
 def _residuals(found: synchronise.TrialSync) -> dict[str, Any]:

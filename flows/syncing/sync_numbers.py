@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.flows.syncing.sync_fit import DEVICES
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
+from sliplab.storage.schema.trial import DEVICES
 
 PULSES = ("missed", "late", "spurious")
 

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from sliplab.analysis.pictures.sync_figures import Gate, OverTrials, Residuals
-from sliplab.flows.syncing.sync_fit import DEVICES
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
+from sliplab.storage.schema.trial import DEVICES
 
 
 class All:

@@ -8,11 +8,10 @@ from typing import Any
 
 from sliplab.analysis.pictures.report import Table, number
 from sliplab.flows.running.campaigns import Collected
-from sliplab.flows.syncing.sync_fit import DEVICES
 from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
 from sliplab.flows.syncing.sync_series import All
 from sliplab.flows.syncing.sync_trials import TrialClocks
-from sliplab.storage.files import read_json
+from sliplab.storage.schema.trial import DEVICES, Gate, TrialRecord
 from sliplab.storage.writer import RECORD
 
 ROWS = 10
@@ -121,8 +120,8 @@ def _reason(folder: Path, known: dict[str, Any]) -> str:
     """Why, as far as clocks go; empty where it was something else."""
     if "gate: " not in str(known["cause"]) or not (folder / RECORD).exists():
         return ""
-    gates = read_json(folder / RECORD)["quality"]["gates"]
-    failed = {name: gate for name, gate in gates.items() if not gate["passed"]}
+    gates = TrialRecord.load(folder / RECORD).quality.gates
+    failed = {name: gate for name, gate in gates.items() if not gate.passed}
     return "; ".join(
         words(name, gate)
         for start, words in _WORDS.items()
@@ -131,26 +130,26 @@ def _reason(folder: Path, known: dict[str, Any]) -> str:
     )
 
 
-def _uncertainty(name: str, gate: dict[str, Any]) -> str:
+def _uncertainty(name: str, gate: Gate) -> str:
     device = name.removeprefix("sync_uncertainty_").removesuffix("_s")
-    if isinstance(gate["value"], str):
-        return f"{device} has no clock: {gate['value']}"
+    if gate.value is None or isinstance(gate.value, str) or gate.limit is None:
+        return f"{device} has no clock: {gate.value}"
     return (
-        f"{device} ({gate['grade']}): uncertain by {1e6 * gate['value']:.1f} µs, "
-        f"{1e6 * gate['limit']:g} µs are allowed"
+        f"{device} ({gate.grade}): uncertain by {1e6 * gate.value:.1f} µs, "
+        f"{1e6 * gate.limit:g} µs are allowed"
     )
 
 
-def _unvouched(name: str, gate: dict[str, Any]) -> str:
-    if gate["value"] < 0:
+def _unvouched(name: str, gate: Gate) -> str:
+    if gate.value is None or isinstance(gate.value, str) or gate.value < 0:
         return "nobody knows which part of the recording the pulses vouch for"
     return (
-        f"the recording goes on for {gate['value']:.2f} s beyond the pulses on which a clock "
-        f"stands, {gate['limit']:g} s are allowed"
+        f"the recording goes on for {gate.value:.2f} s beyond the pulses on which a clock "
+        f"stands, {gate.limit:g} s are allowed"
     )
 
 
-_WORDS: dict[str, Callable[[str, dict[str, Any]], str]] = {
+_WORDS: dict[str, Callable[[str, Gate], str]] = {
     "sync_uncertainty_": _uncertainty,
     "sync_unvouched_s": _unvouched,
 }

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.flows.running.campaigns import Collected
-from sliplab.flows.syncing.sync_fit import DEVICES
-from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Clocks, Gate, SyncResult
 from sliplab.storage.store import SYNC, Store
 
 F64 = npt.NDArray[np.float64]
@@ -97,41 +96,42 @@ def read_trials(store: Store, item: Collected) -> list[TrialClocks]:
     results = Derived.of(store, SYNC, item.name)
     taken = sorted(
         (recording for _, recording in item.trials),
-        key=lambda recording: str(item.campaign.provenance(recording)["started"]),
+        key=lambda recording: item.campaign.provenance(recording).started or "",
     )
     return [_read(item, recording, k + 1, results) for k, recording in enumerate(taken)]
 
 
 def _read(item: Collected, recording: Recording, number: int, results: Derived) -> TrialClocks:
-    clocks, gates = recording.clocks, recording.record["quality"]["gates"]
+    clocks, gates = recording.clocks, recording.record.quality.gates
     name = recording.folder.name
-    known = recording.record["clocks"]
-    refused = results.read(name)["refused"]
+    known = recording.record.clocks.devices()
+    refused = results.load(name, SyncResult).refused
+    lost = gates["frames_lost"].value if "frames_lost" in gates else None
     return TrialClocks(
         item.name,
         name,
         number,
-        {device: _device(clocks, gates, device) for device in DEVICES if device in clocks},
+        {device: _device(clocks, gates, device) for device in clocks.devices()},
         recording.refitted,
         {device: reason for device, reason in refused.items() if device in known},
-        gates["frames_lost"]["value"] if "frames_lost" in gates else None,
+        int(lost) if isinstance(lost, int) else None,
         results,
     )
 
 
-def _device(clocks: Mapping[str, Any], gates: Mapping[str, Any], name: str) -> DeviceClocks:
-    known = clocks[name]
-    both = known["uncertainty_ns"]
-    both += clocks["events"]["uncertainty_ns"] if name != "events" else 0.0
-    limit = gates.get(f"sync_uncertainty_{name}_s", {}).get("limit")
-    wired = "pulses_seen" in known
+def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClocks:
+    known = clocks.devices()[name]
+    both = clocks.against_events_ns(name)
+    gate = gates.get(f"sync_uncertainty_{name}_s")
+    limit = None if gate is None else gate.limit
     kinds = ("seen", "missed", "late", "spurious")
+    # through the host, the recorded drift is of one step of the way
+    drift_ppm = known.drift_ppm if known.wired else None
     return DeviceClocks(
-        known["grade"],
-        known["kind"],
-        both / 1e3,
+        known.grade,
+        known.kind or "",
+        math.nan if both is None else both / 1e3,
         None if limit is None else 1e6 * limit,
-        # through the host, what is recorded is the drift of one step of the way
-        known["drift_ppm"] if wired else ClockMap.from_json(known["map"]).drift_ppm(),
-        {kind: known[f"pulses_{kind}"] for kind in kinds} if wired else None,
+        known.map.drift_ppm() if drift_ppm is None else drift_ppm,
+        {kind: getattr(known, f"pulses_{kind}") for kind in kinds} if known.wired else None,
     )

@@ -65,12 +65,14 @@ def export_trials(
 
 def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
     record = recording.record
-    kept = {key: record[key] for key in ("experiment", "role", "clocks", "steps") if key in record}
+    kept = record.model_dump(
+        mode="json", include={"experiment", "role", "clocks", "steps"}, exclude_unset=True
+    )
     return {
         "trial": recording.trial_id,
         "file": name,
-        "condition": record["condition"],
-        "repetition": record["repetition"],
+        "condition": record.condition,
+        "repetition": record.repetition,
         "record": kept,
         **counts,
     }
@@ -142,9 +144,8 @@ def _triggers(recording: Recording) -> Triggers:
 
 def _size(recording: Recording) -> tuple[int, int]:
     """Columns and rows of the event camera, or what its events need."""
-    told = recording.record.get("geometry", {}).get("event_px")
-    if told:
-        return int(told[0]), int(told[1])
+    if (known := recording.record.geometry.event_px) is not None:
+        return known
     with recording.open() as reader:
         events = reader.events()
     return (

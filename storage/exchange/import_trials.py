@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
@@ -19,7 +20,16 @@ from sliplab.storage.exchange.foreign import ForeignTrial, FormatError
 from sliplab.storage.files import json_text
 from sliplab.storage.names import safe_name
 from sliplab.storage.process import now
-from sliplab.storage.recording import RECORD_FORMAT
+from sliplab.storage.schema.document import first_fault
+from sliplab.storage.schema.trial import (
+    Clocks,
+    Counts,
+    DeviceRecord,
+    Geometry,
+    Provenance,
+    Quality,
+    TrialRecord,
+)
 from sliplab.storage.store import IMPORTED, Campaign, Store
 from sliplab.storage.streams import EventChunk, Json, PulseChunk
 from sliplab.storage.writer import TrialWriter
@@ -104,20 +114,13 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str,
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
         counts = writer.counts
-        told = {
-            "events": counts["events/t"],
-            "frames": counts["frames/t"],
-            "poses": 0,
-            "pulses": 0,
-        }
-        record = _record(campaign, trial, kind, told, (last_us - first_us) / 1e6)
-        if warnings:
-            record[IMPORTED]["warnings"] = warnings
-        writer.commit(record, {"imported": now(), "from": trial.source})
+        rows = Counts(events=counts["events/t"], frames=counts["frames/t"], poses=0, pulses=0)
+        record = _record(campaign, trial, kind, rows, (last_us - first_us) / 1e6, warnings)
+        writer.commit(record, Provenance.model_validate({"imported": now(), "from": trial.source}))
     except BaseException:
         writer.discard()
         raise
-    return {"events": told["events"], "frames": told["frames"]}, warnings
+    return {"events": rows.events, "frames": rows.frames}, warnings
 
 
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
@@ -179,15 +182,29 @@ def _gap_warnings(gap_us: int, end_us: int) -> list[str]:
 
 
 def _record(
-    campaign: Campaign, trial: ForeignTrial, kind: str, counts: Json, seconds: float
-) -> Json:
-    clock = {"grade": "unknown", "map": IDENTITY.to_json(), "uncertainty_ns": None}
+    campaign: Campaign,
+    trial: ForeignTrial,
+    kind: str,
+    counts: Counts,
+    seconds: float,
+    warnings: list[str],
+) -> TrialRecord:
+    clock = DeviceRecord(grade="unknown", map=IDENTITY, uncertainty_ns=None)
     event_px = trial.event_px()
     clocks: Json = {"reference": "event camera", "events": clock}
     if trial.frames is not None:
         clocks["frames"] = clock
-    return {
-        "format": RECORD_FORMAT,
+    origin = {
+        "format": kind,
+        "from": trial.source,
+        "epoch": trial.epoch,
+        "unknown": [*trial.unknown, *([] if event_px else ["sensor size"])],
+        **trial.about,
+    }
+    if warnings:
+        origin["warnings"] = warnings
+    fields = {
+        "format": TrialRecord.FORMAT,
         "trial": trial.name,
         "campaign": campaign.name,
         "experiment": "imported",
@@ -199,18 +216,14 @@ def _record(
         "simulated": trial.simulated,
         "recorded_s": seconds,
         "counts": counts,
-        "clocks": clocks,
-        "quality": {"passed": True, "gates": {}},
-        "steps": [],
-        "geometry": {
-            "event_px": list(event_px) if event_px else None,
-            "frame_px": list(trial.frame_px) if trial.frame_px else None,
-        },
-        IMPORTED: {
-            "format": kind,
-            "from": trial.source,
-            "epoch": trial.epoch,
-            "unknown": [*trial.unknown, *([] if event_px else ["sensor size"])],
-            **trial.about,
-        },
+        "clocks": Clocks(**clocks),
+        "quality": Quality(passed=True, gates={}),
+        "steps": (),
+        "geometry": Geometry(event_px=event_px, frame_px=trial.frame_px),
+        "imported": origin,
     }
+    try:
+        return TrialRecord.model_validate(fields)
+    except ValidationError as error:
+        key, value, expected = first_fault(error)
+        raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None

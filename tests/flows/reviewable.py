@@ -14,6 +14,7 @@ from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.files import sha256
+from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.store import Campaign, Store
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
 from tests.conftest import ROOT
@@ -143,7 +144,9 @@ class Reviewable:
         numbers = np.arange(FRAMES, dtype=np.int64)
         level = np.zeros(FRAMES, np.uint8)
         writer.add_frames(FrameChunk(pictures(), numbers, frame_times(), frame_times(), level))
-        self._first = writer.commit(record(trial, condition), {"host": "test"})
+        self._first = writer.commit(
+            TrialRecord.model_validate(record(trial, condition)), Provenance(host="test")
+        )
         self._sums = json.loads((self._first / "checksums.json").read_text())
 
     def _link(self, campaign: Campaign, trial: str, condition: dict[str, str]) -> None:

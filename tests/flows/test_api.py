@@ -60,7 +60,7 @@ def test_a_trials_arrays_share_one_time_line(store: sliplab.Store, folder: Path)
     stored = TrialStore.open(folder).campaign("small").recording(FIRST)
     events, poses = trial.events(), trial.poses()
     raw = stored.events()
-    assert len(events) == len(events.t_ns) == stored.record["counts"]["events"]
+    assert len(events) == len(events.t_ns) == stored.record.counts.events
     assert (events.t_ns == stored.clock("events").to_reference(raw.t_us * 1000)).all()
     assert (np.diff(events.t_ns) >= 0).all()
     assert set(np.unique(events.p)) == {0, 1}

@@ -149,8 +149,8 @@ def look_through(folder: Path, with_trials: bool = True) -> None:
 
 def read_recording(recording: Any) -> None:
     """All streams of a trial, and its clocks."""
-    json.dumps(recording.record)
-    if "events" in recording.clocks:
+    json.dumps(recording.record.to_json())
+    if recording.clocks.events is not None:
         recording.clock("events")
     _ = recording.motion_phase, recording.simulated, recording.frame_source
     recording.simulation_truth()

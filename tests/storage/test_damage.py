@@ -12,6 +12,7 @@ from sliplab.storage.catalogue import catalogue
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.store import Campaign, Store, StoreError
 from sliplab.storage.verify import DAMAGED, UNFINISHED, set_aside, verify
 from tests.storage.trials import campaign, commit, fill, record
@@ -105,7 +106,7 @@ def test_what_is_damaged_is_never_read(tmp_path: Path) -> None:
     _flip(commit(where, "u") / "record.json")
     commit(where, "whole")
     recording = where.recording("t")
-    assert recording.record["trial"] == "t"
+    assert recording.record.trial == "t"
     with pytest.raises(StoreError, match=r"does not match its checksum.*verify .* --quarantine"):
         recording.events()
     unreadable: list[str] = []
@@ -207,7 +208,7 @@ def test_data_that_point_out_of_their_file_are_refused(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["arm_pulses/t"]
         file["arm_pulses/t"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/t")
-    writer.commit(record("t"), {})
+    writer.commit(record("t"), Provenance())
     with (
         pytest.raises(ValueError, match="points out of the file"),
         where.recording("t").open() as reader,

@@ -8,6 +8,7 @@ import pytest
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.lock import Locked, exclusive
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.store import Store, StoreError
 from sliplab.storage.verify import verify
 from tests.storage.trials import FRAME, campaign, commit, fail, fill, record
@@ -17,7 +18,7 @@ def test_a_committed_trial_reads_as_it_was_written(tmp_path: Path) -> None:
     where = campaign(tmp_path / "s")
     recording = Recording(commit(where, "a=1mm,r=1"))
     assert where.committed() == {"a=1mm,r=1"}
-    assert recording.record["counts"]["events"] == 1000
+    assert recording.record.counts.events == 1000
     assert len(recording.events()) == 1000
     assert len(list(recording.frames())) == 12
     assert verify(Store.open(tmp_path / "s")) == []
@@ -34,7 +35,7 @@ def test_spooled_frames_are_the_same_video(tmp_path: Path) -> None:
     for name, spool in (("live", False), ("spooled", True)):
         writer = where.begin(name, FRAME, 100, spool=spool)
         fill(writer)
-        folders.append(writer.commit(record(name), {}))
+        folders.append(writer.commit(record(name), Provenance()))
     videos = [(folder / "frames.mkv").read_bytes() for folder in folders]
     assert videos[0] == videos[1]
     assert not (folders[1] / "frames.raw").exists()
@@ -70,7 +71,7 @@ def test_a_trial_is_never_committed_twice(tmp_path: Path) -> None:
     writer = where.begin("t", FRAME, 100)
     fill(writer)
     with pytest.raises(FileExistsError, match="committed already"):
-        writer.commit(record("t"), {})
+        writer.commit(record("t"), Provenance())
 
 
 def _flip(path: Path) -> None:
@@ -85,7 +86,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut short": (lambda t: (t / "data.h5").write_bytes(b"x"), "has 1 bytes"),
     "file gone": (lambda t: (t / "frames.mkv").unlink(), "is missing"),
     "record changed": (
-        lambda t: write_json(t / "record.json", record("t", block=7)),
+        lambda t: write_json(t / "record.json", record("t", block=7).to_json()),
         "does not match",
     ),
     "checksums gone": (lambda t: (t / "checksums.json").unlink(), "cannot be read"),
@@ -109,7 +110,7 @@ def test_verify_sees_a_record_that_does_not_fit_its_data(tmp_path: Path) -> None
     where = campaign(tmp_path / "s")
     writer = where.begin("t", FRAME, 100)
     fill(writer, count=900)
-    writer.commit(record("t"), {})
+    writer.commit(record("t"), Provenance())
     (problem,) = verify(Store.open(tmp_path / "s"))
     assert problem.what == "900 events, the record says 1000"
 

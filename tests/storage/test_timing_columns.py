@@ -9,6 +9,7 @@ import pytest
 
 from sliplab.storage.columns import TIMING
 from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.store import Store
 from sliplab.storage.streams import ClockReads, PulseChunk
 from sliplab.storage.verify import verify
@@ -45,7 +46,7 @@ def write(writer: TrialWriter, pieces: int) -> Path:
             (writer.add_box_reads if chunk is BOX else writer.add_frame_camera_reads)(part)
     for part in np.array_split(EXPOSURES.t_ns, pieces):
         writer.add_exposures(PulseChunk(part))
-    return writer.commit(record("t"), {})
+    return writer.commit(record("t"), Provenance())
 
 
 @pytest.mark.parametrize("pieces", [1, 7])
@@ -81,7 +82,7 @@ def test_nothing_is_made_where_nothing_comes(tmp_path: Path) -> None:
             writer.add_box_reads(ClockReads(EMPTY, EMPTY, EMPTY))
             writer.add_frame_camera_reads(ClockReads(EMPTY, EMPTY, EMPTY))
         fill(writer)
-        data.append(writer.commit(record(name), {}) / "data.h5")
+        data.append(writer.commit(record(name), Provenance()) / "data.h5")
     assert data[0].read_bytes() == data[1].read_bytes()
     with StreamReader(data[0]) as reader:
         assert not any(reader.has(name) for name in TIMING)
@@ -97,6 +98,6 @@ def test_verify_sees_a_clock_that_was_read_backwards(tmp_path: Path) -> None:
     fill(writer)
     writer.add_box_reads(cut(BOX, slice(0, 2)))
     writer.add_box_reads(cut(BOX, slice(0, 1)))
-    writer.commit(record("t"), {})
+    writer.commit(record("t"), Provenance())
     said = [problem.what for problem in verify(Store.open(tmp_path / "s"))]
     assert said == [f"box_reads/{name} runs backwards" for name in ("t", "before", "after")]

@@ -10,6 +10,7 @@ import pytest
 from sliplab.storage.catalogue import catalogue
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.store import Campaign, Store
 from sliplab.storage.streams import FrameChunk
 from sliplab.storage.verify import verify
@@ -42,7 +43,7 @@ def take(where: Campaign, trial: str, chunks: list[FrameChunk], *, spool: bool =
     fill(writer, with_frames=False)
     frames = sum(map(len, chunks))
     counts = {"events": 1000, "frames": frames, "poses": 10, "pulses": 10}
-    return writer.commit(record(trial, counts=counts), {})
+    return writer.commit(record(trial, counts=counts), Provenance())
 
 
 @pytest.mark.parametrize("plate", [False, True])

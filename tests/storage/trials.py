@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.store import Campaign, Store
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
 from sliplab.storage.writer import TrialWriter
@@ -59,10 +60,10 @@ def fill(
         writer.add_frames(frames(12))
 
 
-def record(trial: str, **changes: Any) -> dict[str, Any]:
+def record(trial: str, **changes: Any) -> TrialRecord:
     """A record that fits what `fill` writes."""
     clock = {"map": IDENTITY, "uncertainty_ns": 1000.0}
-    return {
+    return TrialRecord.model_validate({
         "trial": trial,
         "campaign": "c",
         "experiment": "kinematic",
@@ -77,7 +78,7 @@ def record(trial: str, **changes: Any) -> dict[str, Any]:
         "clocks": {"reference": "sync box", "events": clock, "arm": clock, "frames": clock},
         "quality": {"passed": True, "gates": {}},
         **changes,
-    }
+    })  # fmt: skip
 
 
 def campaign(folder: Path, name: str = "c") -> Campaign:
@@ -91,7 +92,7 @@ def commit(where: Campaign, trial: str, **changes: Any) -> Path:
     """One committed trial."""
     writer = where.begin(trial, FRAME, 100)
     fill(writer)
-    return writer.commit(record(trial, **changes), {"host": "test"})
+    return writer.commit(record(trial, **changes), Provenance(host="test"))
 
 
 def fail(where: Campaign, trial: str, attempt: int) -> None:
@@ -99,4 +100,4 @@ def fail(where: Campaign, trial: str, attempt: int) -> None:
     writer = where.begin(trial, FRAME, 100)
     fill(writer)
     cause = {"cause": "gate: frames_lost = 3", "trial": trial, "attempt": attempt}
-    writer.set_aside(where.quarantine_path(trial), record(trial), {}, cause)
+    writer.set_aside(where.quarantine_path(trial), record(trial), Provenance(), cause)

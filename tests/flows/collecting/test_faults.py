@@ -14,7 +14,8 @@ import pytest
 
 from sliplab.flows.collecting.session import Session
 from sliplab.rigs.capabilities import ArmFault, RigError
-from sliplab.storage.files import disk_full, read_json, write_json
+from sliplab.storage.files import disk_full, write_json
+from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.store import Campaign, Store, StoreError
 from sliplab.storage.verify import verify
 from tests.command_line import sliplab
@@ -186,7 +187,7 @@ def test_a_gate_sees_it_and_the_trial_is_taken_again(
     assert failed["cause"].startswith("gate: ")
     assert re.search(rf"{gate}(: | = )", failed["cause"])
     (recording,) = campaign.recordings()
-    assert recording.record["attempt"] == 1
+    assert recording.record.attempt == 1
     assert verify(Store.open(tmp_path / "store")) == []
 
 
@@ -194,9 +195,9 @@ def test_the_deviation_that_a_gate_measures_is_the_arms(tmp_path: Path) -> None:
     fault = {"kind": "arm_off_path", "trial": 1, "mm": 0.3, "seconds": 0.5, "at_s": 0.8}
     work, campaign = begin(tmp_path, [fault], slides(1))
     take_all(work)
-    failed = read_json(campaign.folder / "quarantine" / _only(campaign) / "record.json")
+    failed = TrialRecord.load(campaign.folder / "quarantine" / _only(campaign) / "record.json")
     found = {"bad": failed, "good": next(campaign.recordings()).record}
-    values = {k: v["quality"]["gates"]["path_deviation_mm"]["value"] for k, v in found.items()}
+    values = {k: v.quality.gates["path_deviation_mm"].value for k, v in found.items()}
     assert values["bad"] == pytest.approx(0.3, abs=0.015)
     assert values["good"] < 0.015  # noise of the poses
 
@@ -225,9 +226,9 @@ def test_an_arm_slower_than_it_was_told_is_taken_again(tmp_path: Path, part: flo
     assert (work.taken, work.retaken) == (2, 1)
     (failed,) = campaign.quarantined()
     assert "speed_deviation_percent = " in failed["cause"]
-    bad = read_json(campaign.folder / "quarantine" / _only(campaign) / "record.json")
+    bad = TrialRecord.load(campaign.folder / "quarantine" / _only(campaign) / "record.json")
     good = next(campaign.recordings()).record
-    values = [r["quality"]["gates"]["speed_deviation_percent"]["value"] for r in (bad, good)]
+    values = [r.quality.gates["speed_deviation_percent"].value for r in (bad, good)]
     assert values[0] == pytest.approx(50.0, abs=3.0)
     assert 0 <= values[1] < 2.0
 
@@ -268,6 +269,6 @@ def test_what_costs_nothing_is_kept(tmp_path: Path, fault: dict[str, Any]) -> No
         }
     for device, t_ns in moments.items():
         times = [int(recording.clock(device).to_reference(t_ns)) for recording in (hit, plain)]
-        known = [r.record["clocks"][device]["uncertainty_ns"] for r in (hit, plain)]
+        known = [r.record.clocks.devices()[device].uncertainty_ns for r in (hit, plain)]
         drifted_ns = 20e-3 * 1e6 if (fault["kind"], device) == ("clock_drift", "events") else 0
         assert abs(times[0] - times[1]) <= sum(known) + drifted_ns

@@ -69,13 +69,13 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> Taken:
 
 def test_a_trial_through_real_drivers_is_committed(taken: Taken) -> None:
     record = taken.recording.record
-    assert record["simulated"] is True
-    assert record["attempt"] == 0
-    assert record["quality"]["passed"]
-    gates = record["quality"]["gates"]
-    assert gates["sync_uncertainty_frames_s"]["grade"] == "hardware trigger"
-    assert gates["sync_uncertainty_arm_s"]["grade"] == "digital input"
-    assert gates["frames_lost"]["value"] == 0
+    assert record.simulated is True
+    assert record.attempt == 0
+    assert record.quality.passed
+    gates = record.quality.gates
+    assert gates["sync_uncertainty_frames_s"].grade == "hardware trigger"
+    assert gates["sync_uncertainty_arm_s"].grade == "digital input"
+    assert gates["frames_lost"].value == 0
     assert verify(Store.open(taken.run_request.store)) == []
 
 
@@ -103,7 +103,7 @@ def test_nothing_that_was_sent_is_lost(taken: Taken) -> None:
         assert len(reader.pulses("arm_pulses")) == stored["box_pulses"]
         assert len(reader.event_times()) == taken.events_sent
     assert stored == {name: taken.sent[name] for name in stored}
-    assert taken.recording.record["counts"]["events"] == taken.events_sent
+    assert taken.recording.record.counts.events == taken.events_sent
 
 
 # -- other arms ----------------------------------------------------------------------------
@@ -135,10 +135,10 @@ def test_a_trial_with_an_abb_arm_passes_its_gates(tmp_path: Path, kind: str) -> 
         take_all(work)
     assert [failed["cause"] for failed in campaign.quarantined()] == []
     (recording,) = campaign.recordings()
-    assert recording.record["attempt"] == 0
-    gates = recording.record["quality"]["gates"]
-    assert gates["sync_uncertainty_arm_s"]["grade"] == "host time"
-    assert gates["sync_uncertainty_frames_s"]["grade"] == "hardware trigger"
+    assert recording.record.attempt == 0
+    gates = recording.record.quality.gates
+    assert gates["sync_uncertainty_arm_s"].grade == "host time"
+    assert gates["sync_uncertainty_frames_s"].grade == "hardware trigger"
     # what is true is told from when this slide was asked for, by whatever clock the arm has
     truth = recording.simulation_truth()
     assert truth is not None

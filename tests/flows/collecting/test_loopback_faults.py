@@ -206,7 +206,7 @@ def test_frames_that_are_lost_are_noticed_and_the_trial_is_taken_again(
     assert (work.taken, work.retaken) == (2, 1)
     failed = new_in_quarantine(campaign, aside)
     assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
-    assert campaign.recording(failed["trial"]).record["attempt"] == 1
+    assert campaign.recording(failed["trial"]).record.attempt == 1
     assert verify(Store.open(run_request.store)) == []
 
 

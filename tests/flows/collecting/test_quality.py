@@ -48,18 +48,18 @@ def take(folder: Path, data: dict[str, Any], level: str = "tracks") -> Recording
 
 def test_a_plate_that_slips_in_the_hold_fails_its_gate(tmp_path: Path) -> None:
     still = take(tmp_path / "still", heavy("4 mm"))
-    gate = still.record["quality"]["gates"]["hold_slip_px"]
-    assert gate["passed"]
-    assert gate["limit"] == 1.0
-    assert gate["value"] < 0.1
+    gate = still.record.quality.gates["hold_slip_px"]
+    assert gate.passed
+    assert gate.limit == 1.0
+    assert gate.value < 0.1
     slipping = take(tmp_path / "slipping", heavy("3.4 mm"))
     record = slipping.record
-    gates = record["quality"]["gates"]
-    assert [name for name, gate in gates.items() if not gate["passed"]] == ["hold_slip_px"]
-    truth = record["simulation_truth"]["from_hold"]["hold_slip_mm"]
+    gates = record.quality.gates
+    assert [name for name, gate in gates.items() if not gate.passed] == ["hold_slip_px"]
+    truth = record.simulation_truth["from_hold"]["hold_slip_mm"]
     # means over 0.2 s at either end of a slip that slows down
-    most = max(truth) * record["geometry"]["px_per_mm"]
-    assert 0.5 * most < gates["hold_slip_px"]["value"] <= most
+    most = max(truth) * record.geometry.px_per_mm
+    assert 0.5 * most < gates["hold_slip_px"].value <= most
 
 
 def test_without_its_gate_or_with_a_video_the_label_doubts_the_trial(tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_without_its_gate_or_with_a_video_the_label_doubts_the_trial(tmp_path: P
     del data["collection"]["gates"]["hold_slip"]
     without = take(tmp_path / "without", data)
     for recording in (with_video, without):
-        assert "hold_slip_px" not in recording.record["quality"]["gates"]
+        assert "hold_slip_px" not in recording.record.quality.gates
         kept = label_recording(recording, Labelling()).as_json()
         assert kept["incipient_ns"] is kept["gross_ns"] is None
         assert "px in the hold" in kept["doubts"]["incipient"]

@@ -90,8 +90,8 @@ def test_a_trial_that_fails_a_gate_is_taken_again(tmp_path: Path) -> None:
     (failed,) = campaign.quarantined()
     assert failed["cause"] == "gate: frames_lost = 3 (limit 0)"
     again = campaign.recording(failed["trial"])
-    assert again.record["attempt"] == 1
-    assert again.record["quality"]["passed"]
+    assert again.record.attempt == 1
+    assert again.record.quality.passed
     assert verify(Store.open(tmp_path / "a" / "store")) == []
 
 

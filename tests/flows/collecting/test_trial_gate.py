@@ -176,7 +176,7 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert [trial.id for trial in again] == [first]
     work.take(again)
     assert work.gate.more() == []
-    assert campaign.recording(first).record["attempt"] == 1  # another take, another seed
+    assert campaign.recording(first).record.attempt == 1  # another take, another seed
     assert campaign.committed() == {first, third}
     assert verify(store) == []
     control.ask(store, "again", campaign="tiny", trials=(second,), why="cable is gone")
@@ -200,7 +200,7 @@ def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path)
     mended, campaign = session(tmp_path / "a", data)
     mended.take(list(mended.plan)[:1])
     assert mended.taken == 1
-    assert campaign.recording(aside["trial"]).record["attempt"] == 2
+    assert campaign.recording(aside["trial"]).record.attempt == 2
     assert len(campaign.quarantined()) == 2
 
 

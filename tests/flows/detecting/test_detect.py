@@ -130,7 +130,7 @@ def test_the_live_trial_is_the_stored_one(
     whole = detect_trial(counts, (starts_us + 30_000) * 1000, Detection(margin=1))
     names = ["no_slip", "incipient", "gross", "undecided"]
     assert [names.index(line["state"]) for line in lines] == (whole.valid_class % 4).tolist()
-    recorded_s = stored.record["recorded_s"]
+    recorded_s = stored.record.recorded_s
     assert len(lines) >= recorded_s / 0.03 - 2
     assert {line["phase"] for line in lines} == {"hold", "slide"}
     # the simulated camera hands over blocks of 32 ms, and they are read every 5 ms

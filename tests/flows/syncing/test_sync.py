@@ -82,7 +82,7 @@ def test_a_refit_equals_the_record_and_changes_nothing(store: Store) -> None:
     assert (result["done"], result["fresh"], result["changed"]) == (3, 0, 0)
     assert all("clocks" not in kept and kept["refused"] == {} for kept in results(store))
     for recording in recordings(store):
-        assert recording.clocks == recording.record["clocks"]
+        assert recording.clocks == recording.record.clocks
         assert not recording.refitted
     assert [recording.checksum for recording in recordings(store)] == before
     known = result["campaigns"]["tiny"]
@@ -101,8 +101,8 @@ def test_residuals_are_kept_over_the_time_of_the_trial(store: Store) -> None:
             time_s, residual_us = arrays[f"{device}_s"], arrays[f"{device}_us"]
             assert len(time_s) == len(residual_us) <= 200
             assert (np.diff(time_s) > 0).all()
-            assert 0 <= time_s[0] < 1 < time_s[-1] < recording.record["recorded_s"] + 2
-            most = recording.clocks[device]["residual_max_ns"] / 1e3
+            assert 0 <= time_s[0] < 1 < time_s[-1] < recording.record.recorded_s + 2
+            most = recording.clocks.devices()[device].residual_max_ns / 1e3
             assert 0 < np.abs(residual_us).max() <= most + 1e-9
 
 
@@ -150,7 +150,7 @@ def test_better_clocks_are_used_and_make_later_steps_stale(store: Store) -> None
     assert opened.clock("events").to_reference(10**9) == true
     assert opened.refitted
     assert opened.checksum != opened.raw_checksum
-    assert opened.record["clocks"]["events"]["map"] != opened.clocks["events"]["map"]
+    assert opened.record.clocks.events.map != opened.clocks.events.map
     sent = pickle.loads(pickle.dumps(opened))
     assert sent.clocks == opened.clocks
     assert label(store, campaigns)["done"] == 1
@@ -178,7 +178,7 @@ def test_a_refusal_keeps_the_record_and_is_told(
     assert (result["done"], result["campaigns"]["tiny"]["refused"]) == (0, 1)
     said = capsys.readouterr().err
     assert "frames cannot be fitted again (ambiguous: it fits twice)" in said
-    assert recordings(store)[0].clocks == first.record["clocks"]
+    assert recordings(store)[0].clocks == first.record.clocks
     (kept.folder / f"{first.folder.name}.json").unlink()
     assert sync(store, collected(store))["done"] == 1
 
@@ -188,7 +188,7 @@ def test_what_is_told_of_clocks_is_of_those_in_use(store: Store) -> None:
     path = Derived.of(store, "sync", "tiny").folder / f"{first.folder.name}.json"
     sync(store, collected(store))
     kept = read_json(path)
-    clocks = json.loads(json.dumps(first.record["clocks"]))
+    clocks = first.record.clocks.to_json()
     clocks["events"]["uncertainty_ns"] = 77_000.0
     write_json(path, {**kept, "clocks": clocks})
     table = catalogue(store)

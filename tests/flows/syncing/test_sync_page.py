@@ -19,6 +19,7 @@ from sliplab.storage.derived import Derived
 from sliplab.storage.files import write_json
 from sliplab.storage.store import Campaign
 from sliplab.storage.writer import RECORD
+from tests.storage.trials import record
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def set_aside(folder: Path, name: str, gates: dict[str, Any]) -> None:
     """An attempt in quarantine."""
     path = folder / "quarantine" / f"{name}.1"
     path.mkdir(parents=True)
-    write_json(path / RECORD, {"quality": {"gates": gates}})
+    write_json(path / RECORD, record(name, quality={"passed": False, "gates": gates}).to_json())
     write_json(path / "cause.json", {"cause": "gate: something", "trial": name, "attempt": 1})
 
 

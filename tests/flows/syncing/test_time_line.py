@@ -61,13 +61,13 @@ def slides() -> dict[str, Any]:
 
 def truth(recording: Recording, device: str) -> ClockMap:
     """What a device's clock and the box's really showed."""
-    pairs = recording.record["simulation_truth"]["clocks"][DEVICES[device]]
+    pairs = recording.record.simulation_truth["clocks"][DEVICES[device]]
     return ClockMap.through(*zip(*pairs, strict=True))
 
 
 def apart_ns(recording: Recording, device: str, fitted: ClockMap) -> int:
     """How far a map is from the truth anywhere in the recording, ns."""
-    pairs = np.array(recording.record["simulation_truth"]["clocks"][DEVICES[device]])
+    pairs = np.array(recording.record.simulation_truth["clocks"][DEVICES[device]])
     return int(np.abs(fitted.to_reference(pairs[:, 0]) - pairs[:, 1]).max())
 
 
@@ -107,18 +107,18 @@ def test_every_accepted_trial_agrees_with_the_truth(
     assert len(recordings) == 3
     wrong = []
     for recording in recordings:
-        clocks = recording.record["clocks"]
+        clocks = recording.record.clocks.devices()
         fitted = {device: recording.clock(device) for device in DEVICES}
         for device in DEVICES:
-            if clocks[device]["grade"] == "host arrival":
+            if clocks[device].grade == "host arrival":
                 continue  # its map is from arrivals to exposures, of which no clock tells
             error, stated = apart_ns(recording, device, fitted[device]), clocks[device]
-            assert error <= 1.5 * stated["uncertainty_ns"]
-            assert error < MS or stated["kind"] == "hard bound"
+            assert error <= 1.5 * stated.uncertainty_ns
+            assert error < MS or stated.kind == "hard bound"
         exact = {device: truth(recording, device) for device in DEVICES}
-        limit = MS if clocks["frames"]["kind"] == "95 %" else clocks["frames"]["uncertainty_ns"]
-        if clocks["frames"]["grade"] == "host arrival":
-            delay = 500 * (50_000 + 0) + recording.record["timing"]["mid_exposure_ns"]
+        limit = MS if clocks["frames"].kind == "95 %" else clocks["frames"].uncertainty_ns
+        if clocks["frames"].grade == "host arrival":
+            delay = 500 * (50_000 + 0) + recording.record.timing.mid_exposure_ns
             exact["frames"] = ClockMap.line(delay, 0).then(exact["frames"])
         found, right = (onsets(recording, maps, monkeypatch) for maps in (fitted, exact))
         assert len(found) == len(right) == 2
@@ -126,7 +126,7 @@ def test_every_accepted_trial_agrees_with_the_truth(
         naive = first_stamps(recording)
         wrong.append(max(apart_ns(recording, device, naive[device]) for device in DEVICES))
         # what was stored is enough to fit again
-        assert synchronise_recording(recording).to_json() == clocks
+        assert synchronise_recording(recording).record() == recording.record.clocks
     # lined up by their first stamps, streams are not on one time line
     assert max(wrong) > MS
 
@@ -139,15 +139,15 @@ def test_every_grade_is_named_with_its_gate(tmp_path: Path) -> None:
         work.take(list(work.plan)[:1])
         limits = work.plan.protocol.collection.gates.sync_uncertainty
         (recording,) = campaign.recordings()
-        clocks, gates = recording.record["clocks"], recording.record["quality"]["gates"]
-        assert clocks["code"] == timing.get("code", "lfsr")
-        assert clocks["events"]["grade"] == "trigger input"
+        clocks, gates = recording.record.clocks, recording.record.quality.gates
+        assert clocks.code == timing.get("code", "lfsr")
+        assert clocks.events.grade == "trigger input"
         for device, default in (("frames", "hardware trigger"), ("arm", "digital input")):
             grade = timing.get(device, default)
-            assert clocks[device]["grade"] == grade
+            assert clocks.devices()[device].grade == grade
             gate = gates[f"sync_uncertainty_{device}_s"]
-            assert gate["grade"] == grade
-            assert gate["limit"] == pytest.approx(limits.limit_s(grade))
+            assert gate.grade == grade
+            assert gate.limit == pytest.approx(limits.limit_s(grade))
 
 
 def test_a_clock_that_begins_anew_is_fitted_in_pieces_and_the_trial_taken_again(

@@ -77,9 +77,9 @@ def test_a_campaign_goes_out_and_comes_back(store: Store, tmp_path: Path, kind: 
     assert theirs.committed() == ours.committed()
     for one, other in zip(ours.recordings(), theirs.recordings(), strict=True):
         _same(_events(one), _events(other))
-        assert other.record["condition"] == one.record["condition"]
-        assert other.record["imported"]["exported"]["clocks"] == one.record["clocks"]
-        assert other.record["clocks"]["events"]["grade"] == "unknown"
+        assert other.record.condition == one.record.condition
+        assert other.record.imported.exported["clocks"] == one.record.clocks.to_json()
+        assert other.record.clocks.events.grade == "unknown"
         assert other.simulated
         if kind == "aedat4":
             np.testing.assert_array_equal(one.frame_times() // 1000 * 1000, other.frame_times())
@@ -313,7 +313,7 @@ def test_a_gap_of_years_is_imported_with_a_warning_and_exported(tmp_path: Path, 
     assert text.startswith("a.aedat4: ")
     assert f"between 0 and {later} us" in text
     found = made.campaign("theirs").recording("a")
-    assert [f"a.aedat4: {one}" for one in found.record["imported"]["warnings"]] == [text]
+    assert [f"a.aedat4: {one}" for one in found.record.imported.warnings] == [text]
     _same(_events(found), whole)
     assert verify(made) == []
     export_trials([found], tmp_path / "out", "aedat4", "theirs")
@@ -356,8 +356,8 @@ def test_the_labs_pickles(tmp_path: Path, by_columns: bool) -> None:
         (125, 0, 0, 0), (10_000, 3, 5, 1), (11_000, 7, 5, 1), (11_250, 3, 5, 0),
         (12_500, 3, 5, 1),
     ]  # fmt: skip
-    assert found.record["condition"] == {"depth": "3", "speed": "0.5", "direction": "back"}
-    assert {"sync grade", "poses", "epoch"} <= set(found.record["imported"]["unknown"])
+    assert found.record.condition == {"depth": "3", "speed": "0.5", "direction": "back"}
+    assert {"sync grade", "poses", "epoch"} <= set(found.record.imported.unknown)
     assert catalogue(made)["trial"].tolist() == [stem]
 
 

@@ -72,10 +72,10 @@ def test_the_labs_names_with_and_without_ending(
     assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
         [3, 7, 3], [5, 0, 5], [1, 0, 1],
     ]  # fmt: skip
-    assert found.record["geometry"]["event_px"] == list(SIZE)
-    assert "OFF events" not in found.record["imported"]["unknown"]
+    assert found.record.geometry.event_px == SIZE
+    assert "OFF events" not in found.record.imported.unknown
     if stem.startswith("d2"):
-        assert found.record["condition"] == {"depth": "2", "speed": "1.0", "direction": "right"}
+        assert found.record.condition == {"depth": "2", "speed": "1.0", "direction": "right"}
 
 
 def test_cameras_of_the_lab_and_lists_of_one_length(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_cameras_of_the_lab_and_lists_of_one_length(tmp_path: Path) -> None:
     assert [events.x[late].tolist(), events.y[late].tolist()] == [[7], [100]]
     off = np.flatnonzero(events.p == 0)
     assert [events.x[off].tolist(), events.y[off].tolist()] == [[1], [2]]
-    assert found.record["geometry"]["event_px"] == [240, 180]
+    assert found.record.geometry.event_px == (240, 180)
 
 
 @pytest.mark.usefixtures("small")
@@ -156,8 +156,8 @@ def test_the_resolution_of_the_labs_streams(
 ) -> None:
     _stream(tmp_path / "a.h5", resolution, x, y)
     (found,) = _import(tmp_path / "store", tmp_path / "a.h5")
-    assert found.record["geometry"]["event_px"] == size
-    assert ("sensor size" in found.record["imported"]["unknown"]) == (size is None)
+    assert found.record.geometry.event_px == (None if size is None else tuple(size))
+    assert ("sensor size" in found.record.imported.unknown) == (size is None)
     events = found.events()
     assert [events.p.tolist(), events.x.tolist(), events.y.tolist()] == [[1, 0], x, y]
 
@@ -289,7 +289,7 @@ def test_a_size_that_no_header_gives_is_unknown(
     pytest.importorskip("faery")
     _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
     (found,) = _import(tmp_path / "store", tmp_path / "a")
-    assert found.record["geometry"]["event_px"] == size
-    assert ("sensor size" in found.record["imported"]["unknown"]) == (size is None)
+    assert found.record.geometry.event_px == (None if size is None else tuple(size))
+    assert ("sensor size" in found.record.imported.unknown) == (size is None)
     events = found.events()
     assert [events.x.tolist(), events.y.tolist()] == [[5, 1500], [7, 1400]]

@@ -1,0 +1,1 @@
+"""The documents that a store holds, as models: one file each."""

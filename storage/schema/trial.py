@@ -1,0 +1,291 @@
+"""The record of a trial, the provenance beside it, and its clocks where they were fitted again.
+
+The record holds all that follows from protocol, seed and versions, and is under the trial's
+checksums. Who, when and where stand in the provenance, outside of them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    WithJsonSchema,
+)
+
+from sliplab.protocols.timing import Timing
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.schema.document import Bool, Document, DocumentError, Int, Number, Part
+from sliplab.storage.streams import Json
+
+DEVICES = ("events", "frames", "arm")
+"""Devices whose clocks have maps onto the time line."""
+
+
+def _clock_map(value: Any) -> ClockMap:
+    if isinstance(value, ClockMap):
+        return value
+    try:
+        return ClockMap.from_json(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"must be a clock map: {error}") from None
+
+
+_INTEGERS = {"type": "array", "items": {"type": "integer"}}
+Map = Annotated[
+    ClockMap,
+    PlainValidator(_clock_map),
+    PlainSerializer(ClockMap.to_json),
+    WithJsonSchema({
+        "type": "object",
+        "properties": dict.fromkeys(("device_ns", "reference_ns", "drift"), _INTEGERS),
+        "required": ["device_ns", "reference_ns", "drift"],
+        "additionalProperties": False,
+    }),
+]  # fmt: skip
+
+
+def _level(level: str) -> str:
+    """A word, or a number with its unit."""
+    number, _, unit = level.partition(" ")
+    if unit:
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if not abs(value) < float("inf"):
+            raise ValueError("must be a number with its unit")
+    return level
+
+
+Level = Annotated[str, AfterValidator(_level)]
+Point = tuple[Number, Number]
+Size = tuple[Int, Int]
+
+
+class Counts(Part):
+    """Rows of each stream."""
+
+    events: Int
+    frames: Int
+    poses: Int
+    pulses: Int
+
+
+class Gate(Part):
+    """One of the protocol's gates, as the trial met it."""
+
+    passed: Bool
+    value: Number | str | None
+    """The figure, negative where it is unknown; or why there is none, in words."""
+    limit: Number | None = None
+    grade: str | None = None
+    """Of a clock's gate: how the device is timed."""
+
+
+class Quality(Part):
+    """The gates of a trial."""
+
+    passed: Bool
+    gates: dict[str, Gate] = Field(default_factory=dict)
+
+
+class Step(Part):
+    """A phase of the motion, on the arm's clock."""
+
+    phase: str
+    start_ns: Int
+    end_ns: Int
+    recorded: Bool = True
+    """The streams were recorded meanwhile."""
+
+
+class DeviceRecord(Part):
+    """The clock of one device."""
+
+    map: Map
+    """From the device's clock to the time line."""
+    uncertainty_ns: Number | None = None
+    """How far the map may be off within the trial; null where that is unknown."""
+    grade: str = "unknown"
+    """How the device is timed."""
+    kind: str | None = None
+    """`95 %` or `hard bound`: the meaning of the uncertainty."""
+    drift_ppm: Number | None = None
+    drift_error_ppm: Number | None = None
+    pairs: Int | None = None
+    """Readings of the clock by the host."""
+    offset_ns: Int | None = None
+    first_ns: Int | None = None
+    """First pulse that was paired, on the device's clock."""
+    last_ns: Int | None = None
+    peak_ratio: Number | None = None
+    """Second correlation peak as a share of the first."""
+    residual_median_ns: Number | None = None
+    residual_p95_ns: Number | None = None
+    residual_max_ns: Number | None = None
+    pulses_seen: Int | None = None
+    """Pulses that the device saw, where it is wired to the sync box."""
+    pulses_missed: Int | None = None
+    pulses_late: Int | None = None
+    pulses_spurious: Int | None = None
+
+    @property
+    def wired(self) -> bool:
+        """True where the device sees the pulses of the sync box."""
+        return self.pulses_seen is not None
+
+
+class Clocks(Part):
+    """The clocks of one trial: the time line, and the map of each device onto it."""
+
+    reference: str | None = None
+    """The clock of the time line."""
+    code: str | None = None
+    """The train of pulses that the box sent."""
+    events: DeviceRecord | None = None
+    frames: DeviceRecord | None = None
+    arm: DeviceRecord | None = None
+    refused: dict[str, str] = Field(default_factory=dict)
+    """Why a device has no clock."""
+    pieces: dict[str, list[DeviceRecord | str]] = Field(default_factory=dict)
+    """Of a device that began anew within the trial: each piece, or why it was not fitted."""
+
+    def devices(self) -> dict[str, DeviceRecord]:
+        """The clocks that are known, by device."""
+        found = ((name, getattr(self, name)) for name in DEVICES)
+        return {name: known for name, known in found if known is not None}
+
+    def against_events_ns(self, device: str) -> float | None:
+        """Return the uncertainty of events against a device, ns; None where it is unknown.
+
+        Of the events themselves it is their own.
+        """
+        devices = self.devices()
+        names = {device, "events"}
+        known = [devices[name].uncertainty_ns if name in devices else None for name in names]
+        return None if None in known else float(sum(value for value in known if value is not None))
+
+
+class RecordedTiming(Part):
+    """The timing of the rig, from which the clocks are fitted again."""
+
+    rig: Annotated[Timing, PlainSerializer(lambda timing: timing.model_dump(mode="json"))]
+    """The section `timing` of the rig file."""
+    rate_hz: Number
+    """Ticks of the sync box a second."""
+    mid_exposure_ns: Int | None = None
+    """From the start of an exposure to its middle; null without frames."""
+
+
+class Geometry(Part):
+    """Sizes and places of sensors and skin."""
+
+    event_px: Size | None = None
+    """Columns and rows of the event camera; null where they are unknown."""
+    frame_px: Size | None = None
+    """Columns and rows of the frames; null without frames."""
+    px_per_mm: Number | None = None
+    """Of the frame camera."""
+    skin_mm: tuple[Point, ...] = ()
+    """Places of the markers at rest."""
+    centre: Int = 0
+    """Index of the marker in the centre."""
+    event_centre_px: Point | None = None
+    """Column and row where the event camera sees the skin's centre, if that was calibrated."""
+
+
+class Imported(Part):
+    """Origin of a trial that was not collected here."""
+
+    format: str
+    source: str = Field(alias="from")
+    """Name of the file."""
+    epoch: str | None = None
+    """The zero of its times, in words."""
+    unknown: tuple[str, ...] = ()
+    """What nobody knows of it any more."""
+    warnings: tuple[str, ...] = ()
+
+
+class TrialRecord(Document):
+    """The record of one attempt at a trial."""
+
+    format: Int = 1
+    trial: str
+    campaign: str | None = None
+    experiment: str
+    role: str
+    block: Int
+    repetition: Int
+    attempt: Int
+    condition: dict[str, Level]
+    """Levels by factor, with their units."""
+    seed: Annotated[int, Field(strict=True)] | None = None
+    rig: str | None = None
+    simulated: Bool
+    recorded_s: Number
+    motion_s: Number | None = None
+    """Seconds from the first step to the end of the last."""
+    depth_zero_mm: Number | None = None
+    """Where the arm found contact, from the rig's plane."""
+    counts: Counts
+    clocks: Clocks
+    timing: RecordedTiming | None = None
+    quality: Quality
+    steps: tuple[Step, ...] = ()
+    geometry: Geometry = Geometry()
+    devices: dict[str, Any] | None = None
+    """Settings that the devices reported, by device."""
+    simulation_truth: dict[str, Any] | None = None
+    """Of a simulated trial: its true onsets and clocks."""
+    imported: Imported | None = None
+
+    @classmethod
+    def parse(cls, data: Json, path: Path) -> TrialRecord:
+        """Check the record of a trial, committed or not.
+
+        Raises:
+            DocumentError, NewerFormat: as `load`.
+        """
+        found = super().parse(data, path)
+        if found.quality.passed and found.clocks.events is None:
+            raise DocumentError(f"{path}: clocks.events: is missing")
+        return found
+
+
+class Provenance(Document):
+    """When, where and with what a trial was taken."""
+
+    started: str | None = None
+    """UTC, ISO 8601."""
+    ended: str | None = None
+    host: str | None = None
+    system: str | None = None
+    python: str | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+    operator: str | None = None
+    skin: str | None = None
+    """Serial number of the skin."""
+    disk_free: Int | None = None
+    """Bytes."""
+    imported: str | None = None
+    """When it was imported; UTC, ISO 8601."""
+    source: str | None = Field(default=None, alias="from")
+    """Name of the file that it was imported from."""
+
+
+class SyncResult(Document):
+    """Result of fitting a trial's clocks again."""
+
+    key: str = ""
+    raw: str | None = None
+    """Checksum of the raw data that it is of."""
+    refused: dict[str, str] = Field(default_factory=dict)
+    """Why a device could not be fitted again."""
+    clocks: Clocks | None = None
+    """The clocks, where they differ from those of the record."""
