@@ -1,27 +1,34 @@
 """Pickles of foreign origin read as data: no import, no call of what they name.
 
-A pickle is a program. Python's own machine for it, held back by a list of allowed names, still
-allocates what a length or a memo's index says before a byte of it was seen, and hashes keys that
-take longer than the universe. So there is a machine of our own (`pickle_machine`).
+A pickle is a program. Python's own `Unpickler` carries it out with the names restricted to
+stand-ins, and because it still allocates what a length says, and hashes any key, it does so in a
+child process of limited memory and time (`pickle_child`).
 """
 
 from __future__ import annotations
 
-import struct
+import io
+import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sliplab.protocols.errors import InputError
-from sliplab.storage.exchange.pickle_depth import check_depth
-from sliplab.storage.exchange.pickle_machine import Machine
-from sliplab.storage.exchange.pickle_numpy import Refused
 
 MAX_BYTES = 1 << 29
+MEMORY = 4 << 30
+"""Address space of the child, bytes."""
+_CHILD = Path(__file__).with_name("pickle_child.py")
+_SECONDS, _BYTES_PER_SECOND = 3, 500_000
+"""Processor time that a file may take: ten times that of the lab's files."""
 _KINDS = "numbers, text, plain containers and numpy arrays"
 
 
 def read_pickle(path: Path) -> Any:
-    """The value of a pickle: numbers, text, bytes, lists, tuples, dictionaries, numpy arrays.
+    """Return the value of a pickle: numbers, text, bytes, containers and numpy arrays.
 
     Raises:
         InputError: it cannot be read, is damaged, or holds something else; nothing was run.
@@ -30,7 +37,7 @@ def read_pickle(path: Path) -> Any:
 
 
 def read_bounded(path: Path) -> bytes:
-    """All bytes of a file of at most `MAX_BYTES`.
+    """Return all bytes of a file of at most `MAX_BYTES`.
 
     Raises:
         InputError: it cannot be read, or is larger.
@@ -46,35 +53,63 @@ def read_bounded(path: Path) -> bytes:
 
 
 def parse_pickle(data: bytes, path: str | Path, before: int = 0) -> Any:
-    """As `read_pickle`, of bytes that came from `path`, where so many stand `before` them."""
-    machine = Machine(data)
+    """Return the value of a pickle in memory, as `read_pickle` does.
+
+    Args:
+        path: where it came from, for messages.
+        before: bytes that stand before it there.
+    """
+    answer = in_child(data, _SECONDS + len(data) // _BYTES_PER_SECOND)
+    kind, *found = _Answer(io.BytesIO(answer)).load()
+    if kind == "value":
+        return found[0]
+    at, text = found
+    if kind == "refused":
+        raise InputError(
+            path, f"byte {before + at}", None,
+            f"holds {text}; only {_KINDS} are read from a pickle, nothing was run",
+        )  # fmt: skip
+    raise InputError(
+        path, f"byte {before + at}", None,
+        f"is no whole pickle: {text}; a file as Python's pickle.dump writes it is read, with "
+        f"{_KINDS} in it",
+    )  # fmt: skip
+
+
+def in_child(data: bytes, seconds: int) -> bytes:
+    """Return `pickle_child.answer` from a child process; one that died refused the file."""
+    command = [sys.executable, "-I", "-S", "-B", str(_CHILD), str(MEMORY), str(seconds)]
     try:
-        found = machine.run()
-        check_depth(found)
-    except Refused as error:
-        raise InputError(
-            path, f"byte {before + machine.begun}", None,
-            f"holds {error}; only {_KINDS} are read from a pickle, nothing was run",
-        ) from None  # fmt: skip
-    except (ValueError, IndexError, KeyError, TypeError, struct.error, OverflowError) as error:
-        raise InputError(
-            path, f"byte {before + machine.begun}", None,
-            f"is no whole pickle: {_in_words(error, data, machine.begun)}; a file as Python's "
-            f"pickle.dump writes it is read, with {_KINDS} in it",
-        ) from None  # fmt: skip
-    return found
+        # a busy machine gives a process a part of its time
+        done = subprocess.run(
+            command, input=data, capture_output=True, timeout=60 + 20 * seconds, check=False
+        )
+    except subprocess.TimeoutExpired:
+        ended = "did not end"
+    else:
+        if done.returncode == 0:
+            return done.stdout
+        ended = f"ended with code {done.returncode}"
+    limits = f"{seconds} s or {MEMORY >> 30} GiB"
+    text = f"content that takes more than {limits} to read (its process {ended})"
+    return pickle.dumps(("refused", 0, text))
 
 
-def _in_words(error: Exception, data: bytes, at: int) -> str:
-    """The fault of a damaged pickle, for people."""
-    if not data:
-        return "the file is empty"
-    if at >= len(data):
-        return f"it ends after {len(data)} bytes without its last instruction, as a copy cut short"
-    if isinstance(error, KeyError):
-        return f"it asks for value {error} of its memo, which was never stored"
-    if isinstance(error, IndexError):
-        return "it takes a value from its stack, which is empty"
-    if isinstance(error, UnicodeError):
-        return "it has text that is not in its encoding"
-    return str(error)
+class _Answer(pickle.Unpickler):
+    """The child's answer, in which arrays are the only name."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if name != "array":
+            raise pickle.UnpicklingError(f"{module}.{name}")
+        return _array
+
+
+def _array(kind: str, byte_order: str, shape: tuple[int, ...], order: Any, content: Any) -> Any:
+    """Return an array that the child described; it checked that the sizes agree."""
+    if kind == "O":
+        objects = np.empty(len(content), object)
+        for index, item in enumerate(content):  # a slice would look into lists of equal length
+            objects[index] = item
+        return objects.reshape(shape)  # numpy lists objects in C order, whatever the array's is
+    dtype: np.dtype[Any] = np.dtype(kind).newbyteorder(byte_order)  # type: ignore[arg-type]
+    return np.frombuffer(bytes(content), dtype).reshape(shape, order=order)

@@ -165,9 +165,17 @@ def read_recording(recording: Any) -> None:
 
 def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
     """A pickle of the lab's kind."""
-    from sliplab.storage.exchange.pickles import parse_pickle
+    from sliplab.storage.exchange import pickles
 
-    parse_pickle(data, name)
+    _read_pickles_here()
+    pickles.parse_pickle(data, name)
+
+
+def _read_pickles_here() -> None:
+    """Read pickles without the child process: the worker watches and limits this one."""
+    from sliplab.storage.exchange import pickle_child, pickles
+
+    pickles.in_child = lambda data, seconds: pickle_child.answer(data)
 
 
 def read_foreign(box: Path, name: str, data: bytes) -> None:
@@ -176,6 +184,7 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
     from sliplab.storage.exchange.find import kind_of, trials_in
     from sliplab.storage.exchange.foreign import FormatError
 
+    _read_pickles_here()
     folder = box / "foreign"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()

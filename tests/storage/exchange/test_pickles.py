@@ -1,14 +1,15 @@
-"""The machine for foreign pickles, held against Python's own, and against pickles that attack."""
+"""The reader of foreign pickles, held against Python's own, and against pickles that attack."""
 
 from __future__ import annotations
 
+import io
 import pickle
-import pickletools
 import struct
+import subprocess
 import time
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplab.protocols.errors import InputError
+from sliplab.storage.exchange import pickle_child, pickles
 from sliplab.storage.exchange.pickles import parse_pickle, read_pickle
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
@@ -35,7 +37,13 @@ VALUES = st.recursive(
 
 @given(VALUES, st.sampled_from(PROTOCOLS))
 def test_plain_values_are_what_python_reads(value: Any, protocol: int) -> None:
-    assert parse_pickle(pickle.dumps(value, protocol), "x") == value
+    data = pickle.dumps(value, protocol)
+    assert pickle.loads(pickle_child.answer(data)) == ("value", value)
+
+
+def test_the_child_process_gives_what_the_reader_gives() -> None:
+    value = {"a": [1, 2.5, "x", None, True], "b": (1, (2, 3)), "d": b"x", 3: []}
+    assert parse_pickle(pickle.dumps(value), "x") == value
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -166,7 +174,13 @@ ATTACKS = {
     "append below a mark": b"](Na.",
     "pop of nothing": b"0.",
     "memo of nothing": b"h\x05.",
-    "two values": b"NN.",
+    "memo of 34 GB": b"Nr\xff\xff\xff\xffj\xff\xff\xff\xff\x86.",
+    "key of 100,000 tuples": b"})" + b"\x85" * 100_000 + b"Ns.",
+    "state with the code of a function": b"cnumpy\ndtype\nN}S'__code__'\nNs\x86b.",
+    "new object of a stand-in": b"cnumpy\ndtype\n)\x81.",
+    "instance of a stand-in": b"(inumpy\ndtype\n.",
+    "state for a dictionary": b"}}S'a'\nNsb.",
+    "persistent id of the answer": b"carray\narray\n)R.",
     "behind the end": b"N.N.",
     "nothing": b"",
     "no end": b"N",
@@ -188,11 +202,55 @@ def test_a_hostile_or_damaged_file_is_refused_at_once(name: str) -> None:
     assert time.process_time() - begun < 5
 
 
-def test_every_instruction_is_either_known_or_refused() -> None:
-    for code in pickletools.opcodes:
-        if code.name in {"INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "PERSID", "BINPERSID"}:
-            with pytest.raises(InputError, match=f"the instruction {code.name}"):
-                parse_pickle(code.code.encode("latin1"), "x")
+@pytest.mark.parametrize("name", ["memo of 34 GB", "bytearray of 1 TB"])
+def test_memory_is_limited(name: str) -> None:
+    with pytest.raises(InputError, match="more than the memory"):
+        parse_pickle(ATTACKS[name], "x")
+
+
+def test_memory_is_limited_for_what_is_small_in_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickles, "MEMORY", 100 << 20)
+    with pytest.raises(InputError, match="more than the memory"):
+        parse_pickle(b"(" + b"]" * 2_000_000 + b"l.", "x")
+
+
+def test_a_reader_that_runs_on_is_ended() -> None:
+    with pytest.raises(InputError, match=r"byte 0: .*more than 3 s or 4 GiB .*ended with code -\d"):
+        parse_pickle(ATTACKS["key of tuples"], "x")
+
+
+def test_a_reader_that_crashes_harms_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    child = tmp_path / "child.py"
+    child.write_text("import os; os.abort()")
+    monkeypatch.setattr(pickles, "_CHILD", child)
+    with pytest.raises(InputError, match=r"byte 0: .*ended with code -6"):
+        parse_pickle(pickle.dumps(1), "x")
+
+
+def test_a_reader_that_sleeps_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hang(*_: Any, timeout: float, **__: Any) -> Any:
+        raise subprocess.TimeoutExpired("x", timeout)
+
+    monkeypatch.setattr(pickles.subprocess, "run", hang)
+    with pytest.raises(InputError, match="its process did not end"):
+        parse_pickle(pickle.dumps(1), "x")
+
+
+def test_names_get_stand_ins_that_are_no_classes_and_keep_no_state() -> None:
+    for name in cast(dict[Any, Any], pickle_child._NAMES).values():
+        assert not isinstance(name, type)
+        assert not hasattr(name, "__dict__")
+        with pytest.raises(pickle_child.Refused):
+            name.__setstate__((None, {"_make": None}))
+
+
+def test_the_refused_name_has_its_place() -> None:
+    with pytest.raises(InputError, match=r"byte 2: holds the name 'os\.system'; only numbers"):
+        parse_pickle(b"N0" + ATTACKS["system"], "x")
+    with pytest.raises(InputError, match=r"byte 12: holds"):
+        parse_pickle(b"N0" + ATTACKS["system"], "x", before=10)
 
 
 def test_nothing_is_run(tmp_path: Path) -> None:
@@ -203,8 +261,8 @@ def test_nothing_is_run(tmp_path: Path) -> None:
     assert not made.exists()
 
 
-def test_a_memos_index_costs_nothing() -> None:
-    assert parse_pickle(b"Nr\xff\xff\xff\xffj\xff\xff\xff\xff\x86.", "x") == (None, None)
+def test_a_second_value_is_left_as_python_leaves_it() -> None:
+    assert parse_pickle(b"NK\x01.", "x") == pickle.loads(b"NK\x01.") == 1
 
 
 def test_what_is_told_twice_stays_one_thing() -> None:
@@ -214,9 +272,9 @@ def test_what_is_told_twice_stays_one_thing() -> None:
 
 
 def test_too_many_containers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sliplab.storage.exchange.pickle_machine.MAX_CONTAINERS", 1000)
-    with pytest.raises(InputError, match="containers"):
-        parse_pickle(b"(" + b"]" * 1001 + b"l.", "x")
+    monkeypatch.setattr(pickle_child, "MAX_CONTAINERS", 1000)
+    with pytest.raises(pickle_child.Refused, match="more than 1,000 containers"):
+        pickle_child.read(io.BytesIO(b"(" + b"]" * 1001 + b"l."))
 
 
 def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
