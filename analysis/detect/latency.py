@@ -1,23 +1,88 @@
-"""How late a detector is, and how far ahead of gross slip, without rewarding false alarms.
+"""Latency and lead of a detector against a trial's true slip, without rewarding false alarms.
 
 A detector that cries slip at once would have the best latency and the longest lead. So each
 detection is first judged: missed, false early, late, or counted; only the counted ones have times,
-and the four numbers always add up to the trials. Without the bound on late ones a detector that
-says gross slip for as long as the plate lies still would miss nothing.
+and the four numbers always add up to the trials. Incipient slip ends where gross slip begins, and
+gross slip ends where the sensor and the plate stop moving on each other: a detection after that
+warns of nothing, however long the recording goes on, and without this bound a detector that says
+gross slip for as long as the plate lies still would miss nothing. Each evaluation, choice and
+search judges by `is_false_early` and `is_late`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sliplab.analysis.detect.detection import Found
-from sliplab.analysis.detect.true_slip import TrueSlip, is_false_early, is_late
 
 Summary = dict[str, float | int | None]
+
+NEVER = int(np.iinfo(np.int64).max)
+"""The time of what was not detected, where times are held in an array."""
+
+
+@dataclass(frozen=True)
+class TrueSlip:
+    """True onsets and end of a trial's slip, nanoseconds on the time line of its windows.
+
+    Attributes:
+        incipient_ns, gross_ns: the onsets.
+        end_ns: where gross slip ended.
+
+    Raises:
+        ValueError: not in this order.
+    """
+
+    incipient_ns: int
+    gross_ns: int
+    end_ns: int
+
+    def __post_init__(self) -> None:
+        """The three are in order, or refused."""
+        if self.gross_ns < self.incipient_ns:
+            raise ValueError(
+                f"gross onset {self.gross_ns} ns is before incipient onset {self.incipient_ns} ns"
+            )
+        if self.end_ns < self.gross_ns:
+            raise ValueError(f"end {self.end_ns} ns is before gross onset {self.gross_ns} ns")
+
+
+def true_slip(label: Mapping[str, Any]) -> TrueSlip | None:
+    """The slip that a label tells of; None where it lacks an onset.
+
+    Args:
+        label: with ``incipient_ns``, ``gross_ns`` and ``end_ns``. A person may have set the gross
+            onset after the end: the slip then ends as it begins.
+    """
+    incipient, gross = label["incipient_ns"], label["gross_ns"]
+    if incipient is None or gross is None:
+        return None
+    return TrueSlip(incipient, gross, max(label["end_ns"], gross))
+
+
+def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:
+    """Check if a detection comes before the onset by MORE than the tolerance.
+
+    Args:
+        found_ns: an integer or an array of them, `NEVER` where nothing was detected; likewise:
+        onset_ns: true onset.
+        tolerance_ns: of a detection before it.
+    """
+    return found_ns < onset_ns - tolerance_ns
+
+
+def is_late(found_ns: Any, end_ns: Any) -> Any:
+    """Check if a detection comes at the end of its event or after it.
+
+    Args:
+        found_ns: an integer or an array of them, `NEVER` where nothing was detected (not late).
+        end_ns: likewise: gross onset for incipient slip, the slip's end for gross slip.
+    """
+    return (found_ns >= end_ns) & (found_ns != NEVER)
 
 
 @dataclass(frozen=True)
@@ -62,7 +127,7 @@ class TrialLatency:
 
 
 def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
-    """Judge one trial; see `analysis.detect.true_slip`.
+    """Judge one trial; see the module.
 
     Args:
         detections: what the detector said.

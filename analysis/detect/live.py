@@ -17,18 +17,123 @@ events give the same windows, counts and decisions. What a stream does that a fi
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.live_decision import Decision, Losses
-from sliplab.analysis.detect.live_rule import StepRule
+from sliplab.analysis.nets.metrics import CLASSES, GROSS, INCIPIENT, winners
 from sliplab.analysis.nets.training import Fitted, engine
 from sliplab.analysis.nets.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Decision on one window. Times on the camera's clock, microseconds.
+
+    Attributes:
+        number: of the window, from 0; gaps leave numbers out.
+        counts: output spikes in the order of `analysis.nets.metrics.CLASSES`.
+        smoothed, valid_class, onset: as `Step`.
+        events: events of the window, all over the sensor and of both polarities.
+        last_event_us: the latest of them; None in a window without events.
+        by_event: an event ended the window, and not the clock alone.
+        decided_ns: monotonic clock when the decision was there.
+    """
+
+    number: int
+    start_us: int
+    end_us: int
+    counts: tuple[int, int, int]
+    smoothed: tuple[float, float, float]
+    valid_class: int
+    onset: str | None
+    events: int
+    last_event_us: int | None
+    by_event: bool
+    decided_ns: int = field(compare=False)
+
+
+@dataclass
+class Losses:
+    """Faults of a stream that a stored trial has not."""
+
+    late: int = 0
+    """Events left out: their window had been judged."""
+    disordered: int = 0
+    """Events that came after a younger one, the late ones among them."""
+    gaps: int = 0
+    longest_gap_us: int = 0
+
+
+@dataclass(frozen=True)
+class Step:
+    """Answer of the rule after one more window.
+
+    Attributes:
+        smoothed: trailing mean counts in the order of `analysis.nets.metrics.CLASSES`, over the
+            windows there are.
+        valid_class: the detected class; -1 where none is valid.
+        onset: ``incipient`` or ``gross`` where this window is the first such detection.
+    """
+
+    smoothed: tuple[float, float, float]
+    valid_class: int
+    onset: str | None
+
+
+class StepRule:
+    """The rule of `analysis.detect.detection.detect`, window by window, to the bit.
+
+    `detect` sees a whole trial at once; this holds the last `smoothing` rows and no more.
+    """
+
+    def __init__(self, settings: Detection) -> None:
+        self._width = settings.smoothing
+        self._lead = settings.margin * settings.smoothing
+        self._held: deque[npt.NDArray[np.int64]] = deque()
+        self._sum = np.zeros(len(CLASSES), np.int64)
+        self._incipient = self._gross = False
+
+    def step(self, counts: npt.NDArray[np.integer[Any]]) -> Step:
+        """Take the counts, integer (3,), of the window after the last one.
+
+        Raises:
+            ValueError: another shape or type.
+        """
+        row = np.asarray(counts)
+        if row.shape != (len(CLASSES),) or not np.issubdtype(row.dtype, np.integer):
+            raise ValueError(f"counts are {row.dtype} {row.shape}; expected integers (3,)")
+        row = row.astype(np.int64)
+        self._held.append(row)
+        self._sum = self._sum + row
+        if len(self._held) > self._width:
+            self._sum = self._sum - self._held.popleft()
+        valid = -1
+        if len(self._held) == self._width:
+            valid = int(winners(self._sum[None], self._lead)[0])
+        a, b, c = (self._sum / len(self._held)).tolist()
+        return Step((a, b, c), valid, self._onset(valid))
+
+    def interrupt(self) -> None:
+        """Forget the windows so far: the next one does not follow them. Onsets found stay found."""
+        self._held.clear()
+        self._sum = np.zeros(len(CLASSES), np.int64)
+
+    def _onset(self, valid: int) -> str | None:
+        if not self._incipient:
+            self._incipient = valid == INCIPIENT
+            return CLASSES[INCIPIENT] if self._incipient else None
+        if not self._gross and valid == GROSS:
+            self._gross = True
+            return CLASSES[GROSS]
+        return None
+
 
 Counting = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.int64]]
 """Output spikes int64 (1, 3) of one window, uint8 (1, steps, channels, cells, cells)."""
@@ -280,3 +385,45 @@ class LiveDetector:
 _NO_EVENTS = EventChunk(
     np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8), np.empty(0, np.int64)
 )
+
+
+SPAN_NS = 5_000_000_000
+"""How long an arrival counts at least; twice that at most. 100 ppm of drift are 1 ms then."""
+
+
+class FreshestArrival:
+    """Camera time against the host's monotonic clock, by the freshest thing that has arrived.
+
+    Nothing is fitted while a stream runs. What arrives with the least delay bounds the camera's
+    clock from below, so the freshest arrival of the last seconds counts as having taken no time;
+    the part of the delay that no arrival is without cannot be seen from here.
+    """
+
+    def __init__(self) -> None:
+        self._began_ns: int | None = None
+        self._before: int | None = None
+        self._here: int | None = None
+
+    def observe(self, camera_us: int, host_ns: int) -> None:
+        """Something that happened at `camera_us` was here at `host_ns`."""
+        ahead_ns = camera_us * 1000 - host_ns
+        if self._began_ns is None or host_ns - self._began_ns >= SPAN_NS:
+            self._began_ns, self._before, self._here = host_ns, self._here, ahead_ns
+        elif self._here is None or ahead_ns > self._here:
+            self._here = ahead_ns
+
+    def camera_us(self, host_ns: int) -> int | None:
+        """What the camera's clock has come to, at the least; None before the first arrival."""
+        ahead_ns = self._ahead_ns
+        return None if ahead_ns is None else (host_ns + ahead_ns) // 1000
+
+    def host_ns(self, camera_us: int) -> int | None:
+        """When a thing of that time could have been here at the earliest."""
+        ahead_ns = self._ahead_ns
+        return None if ahead_ns is None else camera_us * 1000 - ahead_ns
+
+    @property
+    def _ahead_ns(self) -> int | None:
+        if self._here is None:
+            return None
+        return self._here if self._before is None else max(self._before, self._here)

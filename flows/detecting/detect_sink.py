@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.detect.live import LiveDetector
-from sliplab.analysis.detect.live_clock import FreshestArrival
-from sliplab.analysis.detect.live_decision import Decision
+from sliplab.analysis.detect.live import Decision, FreshestArrival, LiveDetector
 from sliplab.analysis.nets.metrics import CLASSES, INCIPIENT
 from sliplab.rigs.capabilities import Clock
 from sliplab.rigs.reacting import SlipSeen

@@ -7,8 +7,8 @@ from typing import Any
 
 from sliplab.analysis.detect.detector_comparison import Parts, compare
 from sliplab.analysis.detect.detectors import Labelled, Predictions
-from sliplab.analysis.detect.smoothing_choice import Choice, Counted, choose_smoothing
-from sliplab.analysis.detect.true_slip import TrueSlip, true_slip
+from sliplab.analysis.detect.latency import TrueSlip, true_slip
+from sliplab.analysis.detect.rule_sweep import Choice, Counted, choose_smoothing
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.flows.running.campaigns import Collected, training_campaigns

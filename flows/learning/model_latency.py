@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import score_trial, summarise_latency
-from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.analysis.detect.latency import score_trial, summarise_latency, true_slip
 from sliplab.analysis.nets import dataset, training
 from sliplab.analysis.nets.quantised import Quantised, chip_run, quantised_net
 from sliplab.analysis.nets.training import Fitted

@@ -14,8 +14,8 @@ from sliplab.analysis.detect.latency import (
     score_trial,
     summarise_latency,
     summarise_lead,
+    true_slip,
 )
-from sliplab.analysis.detect.true_slip import true_slip
 from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
@@ -34,7 +34,7 @@ def score_row(
     """Onsets, detections and latency of a trial; ``latency`` is None without both onsets.
 
     Args:
-        label: see `analysis.detect.true_slip.true_slip`.
+        label: see `analysis.detect.latency.true_slip`.
         counts, end_ns: spikes of consecutive windows (n, 3), and where these end (n,), ns.
     """
     detections = detect(counts, end_ns, settings)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.detect.latency import true_slip
 from sliplab.analysis.detect.rule_sweep import Trials
-from sliplab.analysis.detect.true_slip import true_slip
 from sliplab.analysis.nets import dataset
 from sliplab.analysis.nets.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels

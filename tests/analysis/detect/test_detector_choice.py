@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detect.detector_choice import (
+from sliplab.analysis.detect.detector_comparison import (
     Judged,
     allowed_early,
     merit,
@@ -13,9 +13,8 @@ from sliplab.analysis.detect.detector_choice import (
     set_levels,
 )
 from sliplab.analysis.detect.detectors import Evidence, Levels
-from sliplab.analysis.detect.latency import TrialLatency
-from sliplab.analysis.detect.smoothing_choice import Counted, choose_smoothing, settled
-from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.analysis.detect.latency import TrialLatency, TrueSlip
+from sliplab.analysis.detect.rule_sweep import Counted, choose_smoothing, settled
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.analysis.detect.detector_comparison import Parts, compare, thinned
 from sliplab.analysis.detect.detectors import Labelled, Predictions
-from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.analysis.detect.latency import TrueSlip
 from sliplab.protocols.settings import Comparison, Detection, Windows
 
 MS = 1_000_000

@@ -18,7 +18,7 @@ from sliplab.analysis.detect.detectors import (
     first_above,
     learn,
 )
-from sliplab.analysis.detect.true_slip import TrueSlip
+from sliplab.analysis.detect.latency import TrueSlip
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detect.hidden_markov import Chain, fit_chain, forward, log_odds
+from sliplab.analysis.detect.detectors import Chain, fit_chain, forward, log_odds
 
 LOGS = st.floats(-30, 5, allow_nan=False)
 

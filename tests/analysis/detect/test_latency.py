@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from sliplab.analysis.detect.detection import Detections, detect
 from sliplab.analysis.detect.latency import (
     TrialLatency,
+    TrueSlip,
     score_trial,
     summarise_latency,
     summarise_lead,
+    true_slip,
 )
-from sliplab.analysis.detect.true_slip import TrueSlip, true_slip
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -11,10 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.live import ClockFellBack, LiveDetector
-from sliplab.analysis.detect.live_clock import SPAN_NS, FreshestArrival
-from sliplab.analysis.detect.live_decision import Decision
-from sliplab.analysis.detect.live_rule import StepRule
+from sliplab.analysis.detect.live import (
+    SPAN_NS,
+    ClockFellBack,
+    Decision,
+    FreshestArrival,
+    LiveDetector,
+    StepRule,
+)
 from sliplab.analysis.nets.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk

@@ -6,10 +6,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import score_trial, summarise_latency, summarise_lead
-from sliplab.analysis.detect.rule_sweep import Trials, choose_pair, score, sweep
-from sliplab.analysis.detect.smoothing_choice import Counted, choose_smoothing
-from sliplab.analysis.detect.true_slip import NEVER, TrueSlip
+from sliplab.analysis.detect.latency import (
+    NEVER,
+    TrueSlip,
+    score_trial,
+    summarise_latency,
+    summarise_lead,
+)
+from sliplab.analysis.detect.rule_sweep import (
+    Counted,
+    Trials,
+    choose_pair,
+    choose_smoothing,
+    score,
+    sweep,
+)
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.detect.sequential import cusum
+from sliplab.analysis.detect.detectors import cusum
 
 
 @given(st.lists(st.integers(-50, 50), max_size=60))

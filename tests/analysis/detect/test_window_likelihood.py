@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detect.window_likelihood import ADDED, fit_histograms, fit_logistic
+from sliplab.analysis.detect.detectors import ADDED, fit_histograms, fit_logistic
 
 COUNTS = st.lists(st.tuples(*[st.integers(0, 6)] * 3, st.integers(0, 2)), min_size=3, max_size=40)
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import score_trial, summarise_latency
-from sliplab.analysis.detect.true_slip import true_slip
+from sliplab.analysis.detect.latency import score_trial, summarise_latency, true_slip
 from sliplab.analysis.nets import dataset, training
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import stopping
