@@ -28,7 +28,7 @@ from pyxdf.pyxdf import _robust_fit
 from scipy import fft, optimize
 
 from benchmarks.measure import SEED, Figures, spread
-from sliplab.analysis.timeline.clocks import ClockFit, ClockRefused, fit_clock
+from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock
 from sliplab.rigs.pulse_code import SEEDS, U8, code_bits
 from sliplab.storage.streams import F64, I64
 

@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.measure import SEED, Figures, one_core, resident_mb
 from benchmarks.network import gridded
 from benchmarks.slides import slide_events
-from sliplab.analysis.detect.live import LiveDetector
-from sliplab.analysis.nets.spiking import Engine
+from sliplab.analysis.detectors.live import LiveDetector
+from sliplab.analysis.networks.spiking import Engine
 from sliplab.protocols.settings import Detection, Windows
 
 PACKET_US = 5_000

@@ -23,8 +23,7 @@ from torch import nn
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.network_rivals import Rival, installed
 from benchmarks.slides import slide_events
-from sliplab.analysis.nets.dataset import SampleSet, TrialId
-from sliplab.analysis.nets.network import (
+from sliplab.analysis.networks.network import (
     build,
     by_class,
     by_parameter,
@@ -34,10 +33,11 @@ from sliplab.analysis.nets.network import (
     set_weights,
     spike_counts,
 )
-from sliplab.analysis.nets.sparse import SparseWindows
-from sliplab.analysis.nets.spiking import Engine
-from sliplab.analysis.nets.training import fit
-from sliplab.analysis.nets.windows import bin_events, list_events
+from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.training import fit
+from sliplab.analysis.windows.dataset import SampleSet, TrialId
+from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.analysis.windows.windows import bin_events, list_events
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.streams import I64, U8, EventChunk
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from sliplab.analysis.nets.network import WEIGHTED, build, by_class
+from sliplab.analysis.networks.network import WEIGHTED, build, by_class
 from sliplab.protocols.settings import Network, Windows
 
 Neuron = Callable[[torch.Tensor], torch.Tensor]

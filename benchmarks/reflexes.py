@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from sliplab.analysis.statistics.intervals import exact_interval
+from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.flows.detecting.detect import detect
 from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
 from sliplab.protocols import Plan, Trial

@@ -20,8 +20,9 @@ import numpy.typing as npt
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
 from benchmarks.trials import run_session
 from sliplab.analysis.labels import labelling
-from sliplab.analysis.nets import dataset, training
-from sliplab.analysis.nets.network import build, weights
+from sliplab.analysis.networks import training
+from sliplab.analysis.networks.network import build, weights
+from sliplab.analysis.windows import dataset
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.protocols import load_plan
 from sliplab.storage.manifest import of_trial

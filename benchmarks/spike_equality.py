@@ -4,7 +4,7 @@
 
 takes the samples that `sliplab train` keeps in the store, counts the output spikes of each by
 Sinabs' layers and by the event-driven network, and prints how many differ as one line of JSON.
-Exit 1 where one does. tests/analysis/nets/test_spiking.py does the same on few windows and on
+Exit 1 where one does. tests/analysis/networks/test_spiking.py does the same on few windows and on
 extremes.
 """
 
@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sliplab.analysis.nets import model_file
-from sliplab.analysis.nets.dataset import SampleSet
-from sliplab.analysis.nets.network import exact, matrices, spike_counts
-from sliplab.analysis.nets.training import engine, restore
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.network import exact, matrices, spike_counts
+from sliplab.analysis.networks.training import engine, restore
+from sliplab.analysis.windows.dataset import SampleSet
 
 PART = 2048
 

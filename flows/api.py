@@ -26,7 +26,7 @@ from sliplab.storage.streams import EventChunk
 if TYPE_CHECKING:
     import pandas as pd
 
-    from sliplab.analysis.nets.training import Fitted
+    from sliplab.analysis.networks.training import Fitted
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
@@ -338,7 +338,8 @@ class Model:
         Raises:
             StoreError: the trial is damaged, or has no events.
         """
-        from sliplab.analysis.nets import dataset, training
+        from sliplab.analysis.networks import training
+        from sliplab.analysis.windows import dataset
 
         windows, end_ns = dataset.trial_windows(trial.recording, self.fitted.windows)
         return WindowCounts(training.predict_counts(self.fitted, windows), end_ns)
@@ -360,8 +361,8 @@ class Model:
             ValueError: events are not in time order or lie outside of the camera, or the network's
                 crop is larger than it.
         """
-        from sliplab.analysis.nets import training
-        from sliplab.analysis.nets.windows import list_events
+        from sliplab.analysis.networks import training
+        from sliplab.analysis.windows.windows import list_events
 
         windows = list_events(
             EventChunk(events.x, events.y, events.p, events.t_ns // 1000),
@@ -398,7 +399,7 @@ def load_model(path: str | Path) -> Model:
     from sliplab.flows.running import extras
 
     with extras.named("load_model"):
-        from sliplab.analysis.nets import model_file
+        from sliplab.analysis.networks import model_file
 
     return Model(model_file.load(Path(path)))
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from sliplab.analysis.clocks.synchronise import TrialSync, streams_of, synchronise
 from sliplab.analysis.labels.places import handed_over
 from sliplab.analysis.labels.rest import offsets
-from sliplab.analysis.timeline.synchronise import TrialSync, streams_of, synchronise
 from sliplab.flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling

@@ -13,8 +13,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.detect.live import ClockFellBack, Counting, LiveDetector, counting_of
-from sliplab.analysis.nets import training
+from sliplab.analysis.detectors.live import ClockFellBack, Counting, LiveDetector, counting_of
+from sliplab.analysis.networks import training
 from sliplab.flows.detecting.detect_order import DetectOrder
 from sliplab.flows.detecting.detect_sink import DetectSink, Timed
 from sliplab.flows.detecting.detect_view import DetectView

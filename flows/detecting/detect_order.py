@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.nets import model_file
-from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.training import Fitted
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.program import Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection

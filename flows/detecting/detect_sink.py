@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.detect.live import Decision, FreshestArrival, LiveDetector
-from sliplab.analysis.nets.metrics import CLASSES, INCIPIENT
+from sliplab.analysis.detectors.live import Decision, FreshestArrival, LiveDetector
+from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
 from sliplab.rigs.capabilities import Clock
 from sliplab.rigs.reacting import SlipSeen
 from sliplab.storage.streams import EventChunk, PulseChunk, Unheeded

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sliplab.analysis.nets.metrics import CLASSES, GROSS, INCIPIENT
+from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT
 from sliplab.flows.detecting.detect_sink import Timed
 from sliplab.flows.running import console
 

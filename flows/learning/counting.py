@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.nets import dataset, model_file, training
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.windows import dataset
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
 from sliplab.storage.recording import Recording

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.stateful import stateful_spikes, trailing_sums
-from sliplab.analysis.nets import dataset, model_file, training
-from sliplab.analysis.nets.samples import strided_windows
+from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.samples import strided_windows
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
 from sliplab.storage.derived import Derived, make_key

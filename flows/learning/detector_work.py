@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sliplab.analysis.detect.detector_comparison import Parts, compare
-from sliplab.analysis.detect.detectors import Labelled, Predictions
-from sliplab.analysis.detect.latency import TrueSlip, true_slip
-from sliplab.analysis.detect.rule_sweep import Choice, Counted, choose_smoothing
+from sliplab.analysis.detectors.detector_comparison import Parts, compare
+from sliplab.analysis.detectors.detectors import Labelled, Predictions
+from sliplab.analysis.detectors.latency import TrueSlip, true_slip
+from sliplab.analysis.detectors.rule_sweep import Choice, Counted, choose_smoothing
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.flows.running.campaigns import Collected, training_campaigns
@@ -86,7 +86,7 @@ class DetectorWork:
     def compare(
         self, store: Store, settings: AnalysisSettings, detection: Detection
     ) -> dict[str, Any] | None:
-        """The comparison as `analysis.detect.detector_comparison` gives it; None without one.
+        """The comparison as `analysis.detectors.detector_comparison` gives it; None without one.
 
         Args:
             settings: windows and strides; detection: what the paper's rule is set to.

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.analysis.detect.rule_sweep import settled
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.detectors.rule_sweep import settled
+from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.label_errors import label_errors, rules_compared
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import counting, window_scores

@@ -16,15 +16,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import metrics, training
-from sliplab.analysis.nets.activity import activity
-from sliplab.analysis.nets.dataset import SampleSet
-from sliplab.analysis.nets.model_card import SplitResult, card_markdown, model_card
-from sliplab.analysis.nets.network import SPIKING, WEIGHTED
-from sliplab.analysis.nets.quantised import Quantised, chip_run, compare, quantise, quantised_net
-from sliplab.analysis.nets.speck import speck_fit
-from sliplab.analysis.nets.speck_page import speck_markdown
-from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import training
+from sliplab.analysis.networks.activity import activity
+from sliplab.analysis.networks.model_card import SplitResult, card_markdown, model_card
+from sliplab.analysis.networks.network import SPIKING, WEIGHTED
+from sliplab.analysis.networks.quantised import (
+    Quantised,
+    chip_run,
+    compare,
+    quantise,
+    quantised_net,
+)
+from sliplab.analysis.networks.speck import speck_fit
+from sliplab.analysis.networks.speck_page import speck_markdown
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.model_latency import latencies
 from sliplab.flows.learning.samples import load_samples
@@ -184,7 +191,7 @@ def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
 
 def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[bytes, int]:
     """The ONNX file, and on how many windows it was found right."""
-    from sliplab.analysis.nets.onnx_file import OnnxDiffers, check_onnx, to_onnx
+    from sliplab.analysis.networks.onnx_file import OnnxDiffers, check_onnx, to_onnx
 
     windows = source.fitted.windows
     about = {

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import score_trial, summarise_latency, true_slip
-from sliplab.analysis.nets import dataset, training
-from sliplab.analysis.nets.quantised import Quantised, chip_run, quantised_net
-from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
+from sliplab.analysis.networks import training
+from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_net
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.windows import dataset
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.train import rules_of
 from sliplab.flows.running.campaigns import Collected

@@ -17,13 +17,15 @@ import numpy as np
 import numpy.typing as npt
 from prefect import flow
 
-from sliplab.analysis.nets import dataset, metrics, model_file, training
-from sliplab.analysis.nets.external_model import Description, ExternalModel, load_external
-from sliplab.analysis.nets.network import spike_counts
-from sliplab.analysis.nets.samples import strided_windows
-from sliplab.analysis.nets.sparse import SparseWindows
-from sliplab.analysis.nets.spiking import Engine
-from sliplab.analysis.statistics import window_groups
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
+from sliplab.analysis.networks.network import spike_counts
+from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.samples import strided_windows
+from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.train import comparison_models, rules_of, training_settings

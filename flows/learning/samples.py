@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sliplab.analysis.nets import dataset
-from sliplab.analysis.nets.dataset import SampleSet, TrialId
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.trial_work import TrialWork, each_trial

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.analysis.nets import dataset, model_file, training, training_device
-from sliplab.analysis.nets.dataset import SampleSet
-from sliplab.analysis.nets.epoch_record import EpochRecord
-from sliplab.analysis.pictures.figures import training_curves
+from sliplab.analysis.networks import model_file, training, training_device
+from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.report.figures import training_curves
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import (
+from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.detectors.latency import (
     TrialLatency,
     score_trial,
     summarise_latency,
@@ -34,7 +34,7 @@ def score_row(
     """Onsets, detections and latency of a trial; ``latency`` is None without both onsets.
 
     Args:
-        label: see `analysis.detect.latency.true_slip`.
+        label: see `analysis.detectors.latency.true_slip`.
         counts, end_ns: spikes of consecutive windows (n, 3), and where these end (n,), ns.
     """
     detections = detect(counts, end_ns, settings)

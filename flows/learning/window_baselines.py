@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.nets import metrics
-from sliplab.analysis.nets.baseline_nets import EPOCHS, KINDS, trained_net
-from sliplab.analysis.nets.baseline_trees import ROUNDS, boosted
-from sliplab.analysis.nets.baselines import RIDGE, logistic_cells
-from sliplab.analysis.nets.dataset import SampleSet
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
+from sliplab.analysis.networks.baseline_trees import ROUNDS, boosted
+from sliplab.analysis.networks.baselines import RIDGE, logistic_cells
+from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.samples import STEP as SAMPLES

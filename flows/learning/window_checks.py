@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.nets import metrics, model_file
-from sliplab.analysis.nets.window_checks import (
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.window_checks import (
     CheckFailed,
     check_chance,
     check_permutations,

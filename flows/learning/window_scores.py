@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import metrics, model_file, synaptic, training
-from sliplab.analysis.nets.baselines import evaluate_baselines
-from sliplab.analysis.nets.dataset import SampleSet, recorded_span
-from sliplab.analysis.statistics import reliability, window_groups
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.metrics import reliability, window_groups
+from sliplab.analysis.networks import model_file, synaptic, training
+from sliplab.analysis.networks.baselines import evaluate_baselines
+from sliplab.analysis.windows.dataset import SampleSet, recorded_span
 from sliplab.flows.learning.samples import (
     TrialRef,
     by_id,
@@ -202,7 +203,7 @@ def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
         evaluated: the evaluation's key.
 
     Returns:
-        what `analysis.statistics.window_groups.share` gives, by name; empty where the evaluation
+        what `analysis.metrics.window_groups.share` gives, by name; empty where the evaluation
         kept none.
     """
     found = kept_counts(store, evaluated)

@@ -86,7 +86,7 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
 
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's would be."""
-    from sliplab.analysis.timeline.synchronise import streams_of, synchronise
+    from sliplab.analysis.clocks.synchronise import streams_of, synchronise
     from sliplab.storage.hdf5 import StreamReader
     from sliplab.storage.writer import DATA, TrialWriter
 

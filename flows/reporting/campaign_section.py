@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import theilslopes
 
-from sliplab.analysis.pictures import figures, figures_campaign
-from sliplab.analysis.pictures.report import Figure, Section, Table, number
+from sliplab.analysis.report import figures, figures_campaign
+from sliplab.analysis.report.report import Figure, Section, Table, number
 from sliplab.flows.collecting.reference_watch import hold_rate
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results

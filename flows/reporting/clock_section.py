@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.analysis.pictures import figures_campaign
-from sliplab.analysis.pictures.report import Figure, Link, Section, number
+from sliplab.analysis.report import figures_campaign
+from sliplab.analysis.report.report import Figure, Link, Section, number
 from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_page import PAGE
 from sliplab.storage.schema.trial import DEVICES

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sliplab.analysis.pictures.report import Section, Table, number, percent
-from sliplab.analysis.statistics.intervals import exact_interval
+from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.analysis.report.report import Section, Table, number, percent
 from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
 from sliplab.flows.reporting.report_trials import intervals, trial_summary
 from sliplab.storage.store import Store

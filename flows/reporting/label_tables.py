@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sliplab.analysis.pictures.report import Table
+from sliplab.analysis.report.report import Table
 
 Json = dict[str, Any]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sliplab.analysis.pictures.figure_style import BLUE, GREEN, ORANGE, RED
-from sliplab.analysis.pictures.figures_conditions import Panel, by_condition
-from sliplab.analysis.pictures.published import DISTURBANCE_LEAD_STD_MS, PAPER
-from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent
-from sliplab.analysis.statistics.intervals import difference, exact_interval, interval
+from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
+from sliplab.analysis.report.figure_style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.report.figures_conditions import Panel, by_condition
+from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER
+from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note
 from sliplab.flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values

@@ -12,8 +12,8 @@ from typing import Any
 
 from prefect import flow
 
-from sliplab.analysis.nets import model_file
-from sliplab.analysis.pictures import report as page
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.report import report as page
 from sliplab.flows.labelling import label_errors
 from sliplab.flows.learning import evaluate, other_networks
 from sliplab.flows.learning.train import wanted_models

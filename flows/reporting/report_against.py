@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sliplab.analysis.statistics.intervals import (
+from sliplab.analysis.metrics.intervals import (
     STATISTICS,
     between_seeds,
     difference,

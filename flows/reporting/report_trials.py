@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sliplab.analysis.statistics.intervals import interval
+from sliplab.analysis.metrics.intervals import interval
 from sliplab.flows.running.campaigns import Collected
 
 Json = dict[str, Any]

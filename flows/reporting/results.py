@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.nets import dataset
-from sliplab.analysis.pictures import figures
-from sliplab.analysis.pictures.report import Figure, Section, Table, number
+from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.report import figures
+from sliplab.analysis.report.report import Figure, Section, Table, number
+from sliplab.analysis.windows import dataset
 from sliplab.flows.learning.evaluate import trial_counts
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note

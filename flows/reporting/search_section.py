@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.pictures.figures_front import Point, cost_and_error
-from sliplab.analysis.pictures.report import Figure, Table, number
+from sliplab.analysis.report.figures_front import Point, cost_and_error
+from sliplab.analysis.report.report import Figure, Table, number
 
 Json = dict[str, Any]
 

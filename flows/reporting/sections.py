@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sliplab.analysis.nets.training import Fitted
-from sliplab.analysis.pictures.report import Number, Section, number, percent
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report.report import Number, Section, number, percent
 from sliplab.flows.reporting import (
     campaign_section,
     clock_section,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import dataset
-from sliplab.analysis.nets.windows import first_pixel
-from sliplab.analysis.pictures import figures
-from sliplab.analysis.pictures.published import PAPER
-from sliplab.analysis.pictures.report import Figure, Section
+from sliplab.analysis.report import figures
+from sliplab.analysis.report.published import PAPER
+from sliplab.analysis.report.report import Figure, Section
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.windows import first_pixel
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
 from sliplab.flows.running.campaigns import Collected

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.nets.metrics import CLASSES
-from sliplab.analysis.nets.training import Fitted
-from sliplab.analysis.pictures import figures, window_figures
-from sliplab.analysis.pictures.published import PAPER
-from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report import figures, window_figures
+from sliplab.analysis.report.published import PAPER
+from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.reporting import others_section, work_section
 from sliplab.flows.reporting.work_section import METHODS
 

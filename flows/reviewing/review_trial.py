@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.nets.dataset import recorded_span
+from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import STEP
 from sliplab.flows.reviewing.review_list import Row
 from sliplab.flows.running.campaigns import Collected

@@ -21,8 +21,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sliplab.analysis.nets.dataset import recorded_span
-from sliplab.analysis.nets.metrics import CLASSES
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of

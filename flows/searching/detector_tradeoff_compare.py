@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from sliplab.analysis.statistics.paired import paired_difference
+from sliplab.analysis.metrics.paired import paired_difference
 from sliplab.flows.searching.detector_tradeoff_grid import PAPER
 from sliplab.flows.searching.detector_tradeoff_rows import RULES, Row
 from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS
@@ -41,7 +41,7 @@ def comparisons(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     Returns:
         one for each value: ``factor``, ``value``, ``paper``, ``row`` (the place among `rows`), and
-        by figure the differences from the paper's value as `analysis.statistics.paired.Difference`
+        by figure the differences from the paper's value as `analysis.metrics.paired.Difference`
         has them.
     """
     found = []

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 
-from sliplab.analysis.nets import dataset, training
+from sliplab.analysis.networks import training
+from sliplab.analysis.windows import dataset
 from sliplab.flows.searching.detector_tradeoff_data import Data
 from sliplab.flows.searching.detector_tradeoff_grid import counted_stride
 from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run

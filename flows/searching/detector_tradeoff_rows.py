@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.latency import NEVER
-from sliplab.analysis.detect.rule_sweep import Figures, Trials, choose_pair, score, sweep
-from sliplab.analysis.statistics.pareto import front
+from sliplab.analysis.detectors.latency import NEVER
+from sliplab.analysis.detectors.rule_sweep import Figures, Trials, choose_pair, score, sweep
+from sliplab.analysis.metrics.pareto import front
 from sliplab.flows.searching.detector_tradeoff_data import Data, true_onsets
 from sliplab.flows.searching.detector_tradeoff_grid import PAPER, Setting, counted_stride, strides
 from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, Kept, Run, trial_counts

@@ -18,16 +18,18 @@ import numpy as np
 import numpy.typing as npt
 from torch import nn
 
-from sliplab.analysis.nets import dataset, metrics, model_file, training
-from sliplab.analysis.nets.dataset import SampleSet
-from sliplab.analysis.nets.epoch_record import EpochRecord
-from sliplab.analysis.nets.quantised import quantise
-from sliplab.analysis.nets.quantised_engine import common_net
-from sliplab.analysis.nets.samples import strided_windows
-from sliplab.analysis.nets.sparse import SparseWindows
-from sliplab.analysis.nets.spiking import Engine
-from sliplab.analysis.nets.synaptic import count_net_work
-from sliplab.analysis.nets.training import Fitted, restore
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.networks.quantised import quantise
+from sliplab.analysis.networks.quantised_engine import common_net
+from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.networks.synaptic import count_net_work
+from sliplab.analysis.networks.training import Fitted, restore
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.analysis.windows.samples import strided_windows
+from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.flows.searching.detector_tradeoff_data import Ask, Data, Used
 from sliplab.flows.searching.detector_tradeoff_grid import Setting, counted_stride
 from sliplab.protocols.settings import Network, Training, Windows

@@ -17,10 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import dataset, metrics, model_file, training
-from sliplab.analysis.nets.dataset import SampleSet
-from sliplab.analysis.nets.epoch_record import EpochRecord
-from sliplab.analysis.statistics import window_groups
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels

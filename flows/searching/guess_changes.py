@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.statistics.intervals import difference, share_difference
+from sliplab.analysis.metrics.intervals import difference, share_difference
 
 Json = dict[str, Any]
 

@@ -19,8 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.labels import labelling
-from sliplab.analysis.nets import dataset, model_file, training
-from sliplab.analysis.statistics import window_groups
+from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.windows import dataset
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning import evaluate

@@ -15,8 +15,10 @@ from importlib.metadata import version
 from typing import Any
 
 from sliplab.analysis.labels import labelling
-from sliplab.analysis.nets import dataset, metrics, model_file
-from sliplab.analysis.statistics import window_groups
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.metrics import window_groups
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.windows import dataset
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import choose_model, evaluation_of

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.nets import dataset, training
-from sliplab.analysis.nets.samples import strided_windows
+from sliplab.analysis.networks import training
+from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.samples import strided_windows
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.trial_scores import score_row

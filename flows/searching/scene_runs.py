@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sliplab.analysis.statistics.scene_error import Onsets, Seen
+from sliplab.analysis.sweeps.scene_error import Onsets, Seen
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.program import Move

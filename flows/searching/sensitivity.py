@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.statistics.scene_error import Seen
-from sliplab.analysis.statistics.scene_windows import PHASES, SceneWindows, look, pooled
+from sliplab.analysis.sweeps.scene_error import Seen
+from sliplab.analysis.sweeps.scene_windows import PHASES, SceneWindows, look, pooled
 from sliplab.flows.searching.scene_runs import Variant, changed, run, sample_trials, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move

@@ -13,13 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliplab.analysis.statistics.scene_error import (
+from sliplab.analysis.sweeps.scene_error import (
     SceneError,
     choose_by_windows,
     compare,
     mean_error,
 )
-from sliplab.analysis.statistics.scene_windows import pooled
+from sliplab.analysis.sweeps.scene_windows import pooled
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.cluster import connected
 from sliplab.flows.searching.scene_runs import Variant, closed_form, sample_trials, timed

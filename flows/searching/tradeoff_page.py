@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sliplab.analysis.nets.metrics import CLASSES
-from sliplab.analysis.pictures import figures
-from sliplab.analysis.pictures.report import Figure, Section, Table, number, percent, render_page
-from sliplab.analysis.statistics.scene_windows import PHASES
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.report import figures
+from sliplab.analysis.report.report import Figure, Section, Table, number, percent, render_page
+from sliplab.analysis.sweeps.scene_windows import PHASES
 
 FAMILIES = {
     "levels": "level of physics",

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from sliplab.analysis.statistics.scene_error import SceneError, Seen, compare
-from sliplab.analysis.statistics.scene_windows import SceneWindows, look
+from sliplab.analysis.sweeps.scene_error import SceneError, Seen, compare
+from sliplab.analysis.sweeps.scene_windows import SceneWindows, look
 from sliplab.flows.searching.scene_runs import Variant, ideal, run, timed
 from sliplab.protocols import Plan, Trial
 from sliplab.rigs.levels import HIGHEST

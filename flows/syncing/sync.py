@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliplab.analysis.timeline import synchronise
+from sliplab.analysis.clocks import synchronise
 from sliplab.flows.running import console
 from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials

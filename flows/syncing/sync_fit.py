@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.timeline import synchronise
+from sliplab.analysis.clocks import synchronise
 from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import SyncResult
 

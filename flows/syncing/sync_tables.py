@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.pictures.report import Table, number
+from sliplab.analysis.report.report import Table, number
 from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
 from sliplab.flows.syncing.sync_series import All

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.nets import training
-from sliplab.analysis.nets.dataset import recorded_span
-from sliplab.analysis.nets.metrics import CLASSES
-from sliplab.analysis.nets.window_checks import Chance
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks import training
+from sliplab.analysis.networks.window_checks import Chance
+from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label_check import check_labels, folder_of, wanted
 from sliplab.flows.labelling.label_errors import read_check
@@ -245,7 +245,9 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
 ) -> None:
     store = store_of(ran)
     monkeypatch.setattr("sliplab.flows.learning.train.Model.fresh", False)
-    monkeypatch.setattr("sliplab.analysis.nets.training_device.devices", lambda: ["cuda", "cuda:0"])
+    monkeypatch.setattr(
+        "sliplab.analysis.networks.training_device.devices", lambda: ["cuda", "cuda:0"]
+    )
     with pytest.raises(
         InputError,
         match=r"analysis\.training\.device = cpu: there is none here; must be one of cuda, cuda:0",
@@ -408,7 +410,7 @@ def test_the_model_goes_out_as_what_it_is(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
-    from sliplab.analysis.nets import onnx_file
+    from sliplab.analysis.networks import onnx_file
     from sliplab.flows.detecting.detect_order import load_model
     from sliplab.flows.learning.model_export import ExportFailed, export_model
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detect.live import Counting
-from sliplab.analysis.nets import model_file
-from sliplab.analysis.nets.epoch_record import EpochRecord
-from sliplab.analysis.nets.network import SPIKING, build, weights
-from sliplab.analysis.nets.training import Fitted
+from sliplab.analysis.detectors.live import Counting
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.networks.network import SPIKING, build, weights
+from sliplab.analysis.networks.training import Fitted
 from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.rigs.build import build_rig

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.detect.detection import detect as detect_trial
-from sliplab.analysis.detect.live import LiveDetector, counting_of
-from sliplab.analysis.nets.dataset import trial_windows
-from sliplab.analysis.nets.training import predict_counts
-from sliplab.analysis.nets.windows import bin_events
+from sliplab.analysis.detectors.detection import detect as detect_trial
+from sliplab.analysis.detectors.live import LiveDetector, counting_of
+from sliplab.analysis.networks.training import predict_counts
+from sliplab.analysis.windows.dataset import trial_windows
+from sliplab.analysis.windows.windows import bin_events
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.detecting.detect import detect
 from sliplab.flows.detecting.detect_order import make_detect_order

@@ -12,10 +12,11 @@ import pytest
 import torch
 import yaml
 
-from sliplab.analysis.nets import metrics, model_file
-from sliplab.analysis.nets.dataset import trial_windows
-from sliplab.analysis.nets.network import spike_counts
-from sliplab.analysis.nets.training import restore
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.network import spike_counts
+from sliplab.analysis.networks.training import restore
+from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import evaluate, evaluation_of
 from sliplab.flows.learning.other_networks import STEP, judge_model
@@ -29,7 +30,7 @@ from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
 from sliplab.storage.derived import Derived
 from sliplab.storage.store import Store
-from tests.analysis.nets.test_external_model import OURS, by_hand, papers
+from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
 
 

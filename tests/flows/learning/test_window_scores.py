@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplab.analysis.nets import metrics
-from sliplab.analysis.nets.dataset import TrialId
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.windows.dataset import TrialId
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels

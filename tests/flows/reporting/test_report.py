@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.nets.metrics import CLASSES
-from sliplab.analysis.statistics.scene_windows import PHASES
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import RunRequest, make_request

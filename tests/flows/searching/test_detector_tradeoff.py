@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.detect.detection import detect
-from sliplab.analysis.detect.latency import score_trial, summarise_latency, true_slip
-from sliplab.analysis.nets import dataset, training
+from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
+from sliplab.analysis.networks import training
+from sliplab.analysis.windows import dataset
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import stopping
 from sliplab.flows.running.campaigns import Collected, collected

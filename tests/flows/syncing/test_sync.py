@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.timeline import synchronise
+from sliplab.analysis.clocks import synchronise
 from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from sliplab.analysis.pictures.sync_figures import pooled
+from sliplab.analysis.report.sync_figures import pooled
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_page import render

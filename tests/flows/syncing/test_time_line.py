@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.clocks.synchronise import synchronise_recording
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.analysis.timeline.synchronise import synchronise_recording
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.recording import Recording

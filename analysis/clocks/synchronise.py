@@ -1,0 +1,345 @@
+"""All clocks of one trial on one time line, each by the best means that its rig has.
+
+The reference is the sync box's clock. A device on the wire is fitted to the box's pulses; one that
+is not is bounded by what the host knows: when it read a clock, when a message arrived. How a device
+was timed is its grade, and it goes wherever the result goes (docs/clocks.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.clocks.clock_bounds import (
+    MIN_PAIRS,
+    BoundedClock,
+    BoundsContradictError,
+    fit_bounds,
+)
+from sliplab.analysis.clocks.clocks import (
+    UNDISTURBED,
+    ClockFit,
+    ClockRefused,
+    fit_clock,
+    fit_numbered,
+)
+from sliplab.analysis.clocks.counters import split_at_restarts
+from sliplab.protocols.timing import DeviceClock, Timing
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.errors import StoreError
+from sliplab.storage.hdf5 import StreamReader
+from sliplab.storage.recording import Recording
+from sliplab.storage.schema.trial import Clocks, DeviceRecord
+
+I64 = npt.NDArray[np.int64]
+
+VERSION = 4
+"""Of what fitting does; results of another version are stale."""
+HOST_PPM = 200.0
+RESTART_NS = 1_000_000
+"""A clock that falls back by more than this began anew, or jumped."""
+
+
+@dataclass(frozen=True)
+class ClockReadings:
+    """A clock read by the host n times: between question and answer, ns; each (n,) int64."""
+
+    device_ns: I64
+    before_ns: I64
+    after_ns: I64
+
+
+@dataclass(frozen=True)
+class SyncStreams:
+    """What a trial holds of clocks, raw, ns; empty where there is nothing.
+
+    Attributes:
+        sync_pulses: pulses on the box's clock; event_pulses, arm_pulses: on the devices'.
+        exposures: starts of exposures, as the box stamped them.
+        frame_ns, frame_number, frame_sync: middle of exposure, counter, level of the sync line.
+        pose_ns, pose_host_ns: controller's and host's time of every pose.
+        box_reads, frame_camera_reads: clocks read by the host.
+        mid_exposure_ns: from the start of an exposure to its middle; None without frames.
+    """
+
+    sync_pulses: I64
+    event_pulses: I64
+    arm_pulses: I64
+    exposures: I64
+    frame_ns: I64
+    frame_number: I64
+    frame_sync: npt.NDArray[np.uint8]
+    pose_ns: I64
+    pose_host_ns: I64
+    box_reads: ClockReadings
+    frame_camera_reads: ClockReadings
+    mid_exposure_ns: int | None
+
+
+@dataclass(frozen=True)
+class DeviceSync:
+    """One device on the time line.
+
+    Attributes:
+        grade: how it is timed, see `protocols.timing`.
+        map: device ns to the box's ns.
+        uncertainty_ns: how far the map may be off within the trial: 95 % where `fit` is there,
+            a hard bound otherwise.
+    """
+
+    grade: str
+    map: ClockMap
+    uncertainty_ns: float
+    fit: ClockFit | None = None
+    bounds: BoundedClock | None = None
+
+    def record(self) -> DeviceRecord:
+        """Return the part of the trial's record."""
+        known: dict[str, Any] = {"grade": self.grade}
+        if self.fit is not None:
+            known |= {"kind": "95 %", **self.fit.to_json()}
+        elif self.bounds is not None:
+            known |= {
+                "kind": "hard bound",
+                "drift_ppm": self.bounds.drift_ppm,
+                "drift_error_ppm": self.bounds.drift_error_ppm,
+                "pairs": self.bounds.pairs,
+            }
+        return DeviceRecord(**{**known, "map": self.map, "uncertainty_ns": self.uncertainty_ns})
+
+
+@dataclass(frozen=True)
+class TrialSync:
+    """The clocks of one trial.
+
+    Attributes:
+        devices: what is known of ``events``, ``arm`` and ``frames``.
+        refused: why a device has no clock.
+        pieces: of a device whose clock began anew within the trial, each piece by itself, or why
+            it could not be fitted; such a device is refused all the same.
+    """
+
+    code: str
+    devices: dict[str, DeviceSync]
+    refused: dict[str, str]
+    pieces: dict[str, list[DeviceSync | str]]
+
+    def record(self) -> Clocks:
+        """Return the part of the trial's record."""
+        known: dict[str, Any] = {"reference": "sync box", "code": self.code}
+        known |= {name: device.record() for name, device in self.devices.items()}
+        if self.refused:
+            known["refused"] = self.refused
+        if self.pieces:
+            known["pieces"] = {
+                name: [part if isinstance(part, str) else part.record() for part in parts]
+                for name, parts in self.pieces.items()
+            }
+        return Clocks(**known)
+
+    def against_events_ns(self, device: str) -> float | None:
+        """Uncertainty of events against another device, both maps together; None if unknown."""
+        if device not in self.devices or "events" not in self.devices:
+            return None
+        return self.devices["events"].uncertainty_ns + self.devices[device].uncertainty_ns
+
+
+def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams:
+    """What a trial's file holds of clocks."""
+
+    def column(name: str) -> I64:
+        return reader.column(name) if reader.has(name) else np.empty(0, np.int64)
+
+    def reads(group: str) -> ClockReadings:
+        return ClockReadings(*(column(f"{group}/{name}") for name in ("t", "before", "after")))
+
+    return SyncStreams(
+        sync_pulses=column("sync_pulses/t"),
+        event_pulses=column("event_pulses/t"),
+        arm_pulses=column("arm_pulses/t"),
+        exposures=column("exposures/t"),
+        frame_ns=column("frames/t"),
+        frame_number=column("frames/number"),
+        frame_sync=column("frames/sync").astype(np.uint8),
+        pose_ns=column("poses/t"),
+        pose_host_ns=column("poses/host"),
+        box_reads=reads("box_reads"),
+        frame_camera_reads=reads("frame_camera_reads"),
+        mid_exposure_ns=mid_exposure_ns,
+    )
+
+
+def synchronise_recording(recording: Recording) -> TrialSync:
+    """Fit a stored trial's clocks again, by the timing in its record.
+
+    Raises:
+        StoreError: the record holds no timing.
+    """
+    timing = recording.record.timing
+    if timing is None:
+        raise StoreError(f"{recording.folder}: timing: is missing; its clocks cannot be fitted")
+    with recording.open() as reader:
+        streams = streams_of(reader, timing.mid_exposure_ns)
+    return synchronise(streams, timing.rig, timing.rate_hz)
+
+
+def synchronise(streams: SyncStreams, timing: Timing, rate_hz: float) -> TrialSync:
+    """Fit every device of a trial by the means that its rig has.
+
+    Args:
+        rate_hz: ticks of the box a second.
+    """
+    found = TrialSync(timing.code, {}, {}, {})
+    events, arm, camera = timing.event_camera, timing.arm_controller, timing.frame_camera
+    pulses = _Pulses(streams.sync_pulses, timing, rate_hz, found)
+    _try(
+        found, "events", lambda: pulses.fit("events", streams.event_pulses, events, "trigger input")
+    )
+    if timing.arm == "digital input":
+        _try(found, "arm", lambda: pulses.fit("arm", streams.arm_pulses, arm, timing.arm))
+    else:
+        _try(found, "arm", lambda: _arm_by_host(streams, timing))
+    if streams.mid_exposure_ns is None:
+        return found
+    begins = streams.frame_ns - streams.mid_exposure_ns
+    if timing.frames == "hardware trigger":
+        coded = begins[streams.frame_sync > 0]
+        _try(found, "frames", lambda: pulses.fit("frames", coded, camera, timing.frames))
+    elif timing.frames == "exposure line":
+        _try(found, "frames", lambda: _by_exposures(begins, streams, timing))
+    elif timing.frames == "device time stamps":
+        _try(found, "frames", lambda: _frames_by_reads(streams, timing))
+    else:
+        _try(found, "frames", lambda: _frames_by_arrival(streams, timing))
+    return found
+
+
+def _try(found: TrialSync, name: str, fit: Callable[[], DeviceSync]) -> None:
+    try:
+        found.devices[name] = fit()
+    except (ClockRefused, BoundsContradictError) as error:
+        found.refused[name] = str(error)
+
+
+@dataclass(frozen=True)
+class _Pulses:
+    """Devices that see the box's pulses."""
+
+    reference: I64
+    timing: Timing
+    rate_hz: float
+    found: TrialSync
+
+    def fit(self, name: str, stamps: I64, clock: DeviceClock, grade: str) -> DeviceSync:
+        stretches = split_at_restarts(stamps, RESTART_NS)
+        if len(stretches) > 1:
+            self.found.pieces[name] = [
+                self._piece(stamps[part], clock, grade) for part in stretches
+            ]
+            raise ClockRefused(
+                "residuals",
+                f"its clock fell back by more than {RESTART_NS / 1e6:g} ms, {len(stretches) - 1} "
+                f"times during the trial: the device restarted, or its clock was set; "
+                f"{UNDISTURBED}",
+            )
+        return self._fit(stamps, clock, grade)
+
+    def _piece(self, stamps: I64, clock: DeviceClock, grade: str) -> DeviceSync | str:
+        try:
+            return self._fit(stamps, clock, grade)
+        except ClockRefused as refusal:
+            return str(refusal)
+
+    def _fit(self, stamps: I64, clock: DeviceClock, grade: str) -> DeviceSync:
+        fit = fit_clock(
+            stamps,
+            self.reference,
+            **_limits(clock, self.timing),
+            in_order=True,
+            start_marker_ns=self.timing.start_marker_ns(self.rate_hz),
+        )
+        return DeviceSync(grade, fit.map, fit.uncertainty_ns, fit)
+
+
+def _limits(clock: DeviceClock, timing: Timing) -> dict[str, Any]:
+    """What a fit is told of a device's clock."""
+    return {
+        "jitter_ns": clock.jitter_us * 1e3,
+        "max_drift_ppm": clock.drift_ppm + timing.sync_box.drift_ppm,
+        "resolution_ns": clock.resolution_us * 1e3,
+        "rounding": clock.rounding,
+    }
+
+
+def _by_exposures(begins: I64, streams: SyncStreams, timing: Timing) -> DeviceSync:
+    """The camera runs by itself; the box stamped every exposure."""
+    fit = fit_numbered(
+        begins, streams.frame_number, streams.exposures,
+        **_limits(timing.frame_camera, timing),
+        reference_resolution_ns=timing.sync_box.resolution_us * 1e3,
+    )  # fmt: skip
+    return DeviceSync(timing.frames, fit.map, fit.uncertainty_ns, fit)
+
+
+def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
+    """A pose was sent before it arrived, and not longer before than its way takes."""
+    delay = timing.pose_delay
+    # bounds of some thousand poses say as much as those of all
+    some = slice(None, None, max(1, streams.pose_ns.size // 4000))
+    arrived = streams.pose_host_ns[some]
+    bounded = _bounded(
+        ClockReadings(
+            streams.pose_ns[some],
+            arrived - round(delay.longest_us * 1000),
+            arrived - round(delay.shortest_us * 1000),
+        ),
+        timing.arm_controller.drift_ppm + HOST_PPM,
+        "poses",
+    )
+    return _through_host(bounded, streams, timing, timing.arm)
+
+
+def _frames_by_reads(streams: SyncStreams, timing: Timing) -> DeviceSync:
+    """The host read the camera's clock now and then."""
+    drift = timing.frame_camera.drift_ppm + HOST_PPM
+    bounded = _bounded(streams.frame_camera_reads, drift, "readings of the frame camera's clock")
+    return _through_host(bounded, streams, timing, timing.frames)
+
+
+def _frames_by_arrival(streams: SyncStreams, timing: Timing) -> DeviceSync:
+    """A frame's time is its arrival; the middle of its exposure was some known time before."""
+    delay, box = timing.frame_delay, _box(streams, timing)
+    earlier = round(500 * (delay.shortest_us + delay.longest_us)) + (streams.mid_exposure_ns or 0)
+    to_box = ClockMap.line(earlier, 0).then(box.map.inverse)
+    spread = 500 * (delay.longest_us - delay.shortest_us)
+    return DeviceSync(timing.frames, to_box, spread + box.uncertainty_ns, None, box)
+
+
+def _through_host(
+    bounded: BoundedClock, streams: SyncStreams, timing: Timing, grade: str
+) -> DeviceSync:
+    box = _box(streams, timing)
+    to_box = bounded.map.then(box.map.inverse)
+    return DeviceSync(grade, to_box, bounded.uncertainty_ns + box.uncertainty_ns, None, bounded)
+
+
+def _box(streams: SyncStreams, timing: Timing) -> BoundedClock:
+    """The box's clock on the host's."""
+    drift = timing.sync_box.drift_ppm + HOST_PPM
+    return _bounded(streams.box_reads, drift, "readings of the sync box's clock")
+
+
+def _bounded(reads: ClockReadings, drift_ppm: float, name: str) -> BoundedClock:
+    if reads.device_ns.size < MIN_PAIRS:
+        raise BoundsContradictError(
+            f"{reads.device_ns.size} {name}; at least {MIN_PAIRS} are needed: record for longer, "
+            "and check that the device answers"
+        )
+    try:
+        return fit_bounds(reads.device_ns, reads.before_ns, reads.after_ns, drift_ppm)
+    except BoundsContradictError as error:
+        raise BoundsContradictError(f"{name}: {error}") from None

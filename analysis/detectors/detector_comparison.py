@@ -1,0 +1,267 @@
+"""All detectors at equal rates of false early detections: the report's comparison.
+
+They learn from training trials, their levels are set on validation trials, to the same number of
+false early detections, and they are judged on test trials. Nothing is ever chosen by a test trial.
+The numbers are small, a percent of 130 trials is one of them, so each rate stands with its exact
+interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sliplab.analysis.detectors.detectors import (
+    Detector,
+    Evidence,
+    Labelled,
+    Learned,
+    Levels,
+    Predictions,
+    Smoothing,
+    decide,
+    first_above,
+    learn,
+)
+from sliplab.analysis.detectors.latency import (
+    TrialLatency,
+    TrueSlip,
+    score_trial,
+    summarise_latency,
+    summarise_lead,
+)
+from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.protocols.settings import Comparison, Detection, Windows
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A trial's evidence with its true onsets."""
+
+    evidence: Evidence
+    slip: TrueSlip
+
+
+def judge(detector: Detector, trials: Sequence[Labelled]) -> list[Judged]:
+    """Evidence of a detector on labelled trials."""
+    return [Judged(detector.evidence(t.predictions), t.slip) for t in trials]
+
+
+def allowed_early(rate: float, trials: int) -> int:
+    """Number of trials that may be false early: the whole number not above their share."""
+    return int(np.floor(rate * trials + 1e-9))
+
+
+def set_levels(trials: Sequence[Judged], allowed: int, false_early_ns: int) -> Levels:
+    """The lowest levels at which at most `allowed` trials are false early, for either onset.
+
+    A level is the evidence that the trial after the allowed ones had before its onset; so it is
+    found exactly, and a lower one would let that trial through. The gross level is found with the
+    incipient one in force.
+
+    Raises:
+        ValueError: not more trials than are allowed to be false: nothing would bound a level.
+    """
+    if not 0 <= allowed < len(trials):
+        raise ValueError(f"{allowed} of {len(trials)} trials may be false early: no bound")
+
+    def level(highest: list[float]) -> float:
+        return sorted(highest, reverse=True)[allowed]
+
+    incipient = level(
+        [
+            _highest(t.evidence.incipient, t.evidence, 0, t.slip.incipient_ns - false_early_ns)
+            for t in trials
+        ]
+    )
+    highest = []
+    for t in trials:
+        first = first_above(t.evidence.incipient, incipient)
+        if first is None:
+            highest.append(-np.inf)
+            continue
+        gross = t.evidence.gross_after(first)
+        highest.append(_highest(gross, t.evidence, first + 1, t.slip.gross_ns - false_early_ns))
+    return Levels(incipient, level(highest))
+
+
+def _highest(values: Any, evidence: Evidence, start: int, before_ns: int) -> float:
+    """The highest value of windows from `start` on that end before a moment; -inf without any."""
+    stop = int(np.searchsorted(evidence.end_ns, before_ns, side="left"))
+    return float(values[start:stop].max(initial=-np.inf))
+
+
+def outcomes(trials: Sequence[Judged], levels: Levels, false_early_ns: int) -> list[TrialLatency]:
+    """Each trial's detections against its true onsets."""
+    return [score_trial(decide(t.evidence, levels), t.slip, false_early_ns) for t in trials]
+
+
+def merit(scored: Sequence[TrialLatency]) -> tuple[float, float]:
+    """Median and 95th percentile incipient latency, ms; a missed or late one counts as infinite.
+
+    So a detector cannot better its median by missing what is hard. False early trials are left
+    out: they are bounded apart.
+    """
+    late = [
+        np.inf if t.latency_incipient_ms is None else t.latency_incipient_ms
+        for t in scored
+        if not t.false_early_incipient
+    ]
+    if not late:
+        return np.inf, np.inf
+    ordered = np.sort(np.asarray(late, np.float64))
+    # between two values a percentile of infinite ones would be no number
+    return float(np.median(ordered)), float(np.percentile(ordered, 95, method="inverted_cdf"))
+
+
+CURVE_RATE = 0.06
+"""The curves end at this share of false early validation trials."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Trials with both onsets: training ones in consecutive windows, the others at the finer
+    stride."""
+
+    train: Sequence[Labelled]
+    validation: Sequence[Labelled]
+    test: Sequence[Labelled]
+
+
+def compare(
+    parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
+) -> dict[str, Any] | None:
+    """Every detector at every stride and rate, as plain data for JSON.
+
+    Args:
+        windows: their length.
+        settings: smoothing of the paper's rule, the grid of smoothings, what is false early, and
+            the rates that are compared.
+        fine_ms: the finer stride; divides the window's length.
+        most: spikes that a class can give in a window.
+
+    Returns:
+        None where nothing is to be compared, or training, validation or test trials are missing.
+        ``trials``: how many of each.
+        ``detectors``: one entry for each detector and stride, with ``name``, ``stride_ms``,
+        ``rates`` (one entry for each of the rates) and ``curve`` (false early validation
+        trials, and what the test trials then give).
+    """
+    asked = settings.compare
+    if asked is None or not (parts.train and parts.validation and parts.test):
+        return None
+    learned = learn(parts.train, windows.length_ms * 1_000_000, most)
+    found = []
+    for stride in sorted({windows.length_ms, fine_ms}, reverse=True):
+        every = stride // fine_ms
+        validation = [thinned(trial, every) for trial in parts.validation]
+        test = [thinned(trial, every) for trial in parts.test]
+        for name, choices in _detectors(learned, windows, settings, stride).items():
+            judged = {
+                key: (judge(detector, validation), judge(detector, test))
+                for key, detector in choices.items()
+            }
+            found.append({"name": name, "stride_ms": stride, **_scores(judged, settings, asked)})
+    return {
+        "trials": {name: len(getattr(parts, name)) for name in ("train", "validation", "test")},
+        "strides_ms": sorted({windows.length_ms, fine_ms}),
+        "detectors": found,
+    }
+
+
+def thinned(trial: Labelled, every: int) -> Labelled:
+    """A trial with each `every`-th of its windows, the first one among them."""
+    predictions = trial.predictions
+    kept = Predictions(
+        predictions.counts[::every], predictions.events[::every], predictions.end_ns[::every]
+    )
+    return Labelled(kept, trial.slip)
+
+
+def _detectors(
+    learned: Learned, windows: Windows, settings: Detection, stride_ms: int
+) -> dict[str, dict[int, Detector]]:
+    """Detectors by name; where there are several, the validation trials choose, by the number."""
+    ours = learned.detectors(stride_ms / windows.length_ms)
+    return {
+        "smoothing": {settings.smoothing: Smoothing(settings.smoothing)},
+        "smoothing chosen": {width: Smoothing(width) for width in settings.smoothing_grid},
+        **{name: {0: detector} for name, detector in ours.items()},
+    }
+
+
+def _scores(
+    judged: Mapping[int, tuple[list[Judged], list[Judged]]],
+    settings: Detection,
+    asked: Comparison,
+) -> dict[str, Any]:
+    tolerance = round(settings.false_early_ms * 1e6)
+    trials = len(next(iter(judged.values()))[0])
+    known: dict[int, dict[str, Any]] = {}
+
+    def at(allowed: int) -> dict[str, Any]:
+        if allowed not in known:
+            known[allowed] = _best(judged, allowed, tolerance)
+        return known[allowed]
+
+    rates = [
+        {"asked": rate, "allowed": allowed_early(rate, trials), **at(allowed_early(rate, trials))}
+        for rate in asked.rates
+    ]
+    last = min(allowed_early(CURVE_RATE, trials), trials - 1)
+    curve = [
+        {
+            "allowed": allowed,
+            "rate": allowed / trials,
+            "median_ms": at(allowed)["test"]["median_with_missed_ms"],
+        }
+        for allowed in range(last + 1)
+    ]
+    return {"rates": rates, "curve": curve}
+
+
+def _best(
+    judged: Mapping[int, tuple[list[Judged], list[Judged]]], allowed: int, tolerance: int
+) -> dict[str, Any]:
+    """One detector at one rate; of several the one that validation trials find quickest."""
+    ranked = []
+    for key, (validation, _) in judged.items():
+        levels = set_levels(validation, allowed, tolerance)
+        scored = outcomes(validation, levels, tolerance)
+        ranked.append((*merit(scored), key, levels))
+    # keys differ, so levels are never compared
+    _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
+    return {
+        "choice": key,
+        "levels": {name: _plain(value) for name, value in vars(levels).items()},
+        **{
+            name: _summary(trials, outcomes(trials, levels, tolerance), levels)
+            for name, trials in zip(("validation", "test"), judged[key], strict=True)
+        },
+    }
+
+
+def _summary(
+    trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
+) -> dict[str, Any]:
+    early = sum(trial.false_early_incipient for trial in scored)
+    low, high = exact_interval(early, len(scored))
+    before = []
+    for trial, score in zip(trials, scored, strict=True):
+        found = decide(trial.evidence, levels).incipient_ns
+        if score.false_early_incipient and found is not None:
+            before.append((trial.slip.incipient_ns - found) / 1e6)
+    return {
+        "false_early_before_ms": sorted(before),
+        "false_early_rate": {"value": early / len(scored), "low": low, "high": high},
+        "median_with_missed_ms": _plain(merit(scored)[0]),
+        "latency_ms": summarise_latency(scored),
+        "lead_ms": summarise_lead(scored),
+    }
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,537 @@
+"""Causal detectors side by side: each turns a trial's windows into evidence, window by window.
+
+A detector says how strongly everything up to a window speaks for slip having begun; a threshold
+on that makes it a detection. So detectors of any kind can be set to the same rate of false alarms
+(`detectors.detector_comparison`) and then compared by how late they are. No other comparison
+is fair: each can be made as quick as one likes by letting it cry slip more often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.optimize import minimize
+from scipy.special import log_softmax
+
+from sliplab.analysis.detectors.detection import Found, lead_of
+from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Array = npt.NDArray[np.integer] | FloatArray
+
+ADDED = 0.5
+"""Windows added to each bin of a histogram (Krichevsky and Trofimov, 1981): no bin stays empty."""
+
+RIDGE = 1e-3
+"""L2 penalty of the regression on standardised weights, per mean log likelihood."""
+
+
+# --------------------------------------------------------------------------------------------------
+# A slip goes one way: the forward filter of a left-to-right hidden Markov model.
+#
+# A trial is at rest, then slips at its rim, then slips as a whole, and never goes back. That is
+# all this model knows besides what a window looks like in each state, and it is why it can detect
+# a weak change earlier than an average can: evidence adds up over windows instead of being
+# forgotten. The recursion is the forward one of Rabiner (1989), equation 19, normalised at every
+# step and kept in logarithms, so that neither thousands of windows nor an impossible one
+# underflow.
+
+
+@dataclass(frozen=True)
+class Chain:
+    """States in their only order; the last is never left.
+
+    Attributes:
+        leave: float64 (states - 1,), probability of going from each state to the next at a
+            window's end, inside 0..1.
+    """
+
+    leave: FloatArray
+
+    def __post_init__(self) -> None:
+        """Probabilities that are none are refused."""
+        if self.leave.ndim != 1 or not ((self.leave > 0) & (self.leave < 1)).all():
+            raise ValueError(f"leave = {self.leave}: must be probabilities inside 0..1")
+
+    @property
+    def states(self) -> int:
+        """How many states there are."""
+        return len(self.leave) + 1
+
+
+def fit_chain(labels: Sequence[npt.NDArray[np.integer]], states: int) -> Chain:
+    """The chain of labelled trials: how often each state was left, by the windows spent in it.
+
+    The share of the windows after which a state was left is the likeliest value; one departure in
+    two windows is added, so that a state nobody saw, or nobody left, still has one.
+
+    Args:
+        labels: states of each trial's windows in the order of time, integer (n,); a trial may
+            have none, and may end in any state.
+
+    Raises:
+        ValueError: a label that is no state, or labels that go back.
+    """
+    left, spent = np.zeros(states - 1), np.zeros(states - 1)
+    for trial in labels:
+        trial = np.asarray(trial, np.int64)
+        if not len(trial):
+            continue
+        if trial.min() < 0 or trial.max() >= states or (np.diff(trial) < 0).any():
+            raise ValueError(f"labels must ascend within 0..{states - 1}")
+        spent += np.bincount(trial, minlength=states)[:-1]
+        # a state between two windows was passed through without a window of its own
+        left[trial[0] : trial[-1]] += 1
+    return Chain((left + 1) / (np.maximum(spent, left) + 2))
+
+
+def forward(chain: Chain, log_likelihood: FloatArray) -> FloatArray:
+    """The states' log probabilities given all windows up to each one.
+
+    The chain is in its first state before the first window. Within one window it moves on by one
+    state at most, so the last of three needs two windows.
+
+    Args:
+        log_likelihood: float64 (n, states), of each window in each state, up to a constant of the
+            window; finite.
+
+    Returns:
+        float64 (n, states), each row's exponentials add up to 1; -inf where a state cannot have
+        been reached.
+
+    Raises:
+        ValueError: another shape, or a value that is not finite.
+    """
+    if log_likelihood.ndim != 2 or log_likelihood.shape[1] != chain.states:
+        raise ValueError(f"likelihoods {log_likelihood.shape}; expected (n, {chain.states})")
+    if not np.isfinite(log_likelihood).all():
+        raise ValueError("a log likelihood is not finite")
+    out = np.empty(log_likelihood.shape)
+    stay = np.append(np.log1p(-chain.leave), 0.0)
+    _forward(stay, np.log(chain.leave), np.ascontiguousarray(log_likelihood, np.float64), out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _add(a: Any, b: Any) -> Any:
+    """log(exp(a) + exp(b)), either of which may be -inf."""
+    high, low = max(a, b), min(a, b)
+    return high if low == -np.inf else high + np.log1p(np.exp(low - high))
+
+
+@njit(cache=True, nogil=True)
+def _forward(stay: Any, go: Any, seen: Any, out: Any) -> None:
+    windows, states = seen.shape
+    belief = np.full(states, -np.inf)
+    belief[0] = 0.0
+    for n in range(windows):
+        total = -np.inf
+        # from the last state down: each needs what its predecessor was before this window
+        for s in range(states - 1, -1, -1):
+            moved = belief[s] + stay[s]
+            if s > 0:
+                moved = _add(moved, belief[s - 1] + go[s - 1])
+            belief[s] = moved + seen[n, s]
+            total = _add(total, belief[s])
+        for s in range(states):
+            belief[s] -= total
+            out[n, s] = belief[s]
+
+
+def log_odds(log_probability: FloatArray, state: int) -> FloatArray:
+    """Log odds of having come to `state` or beyond, float64 (n,), from `forward`; may be -inf.
+
+    From logarithms, so that a belief next to certainty is still told from one nearer to it.
+    """
+    before = np.logaddexp.reduce(log_probability[:, :state], axis=1)
+    after: FloatArray = np.logaddexp.reduce(log_probability[:, state:], axis=1) - before
+    return after
+
+
+# --------------------------------------------------------------------------------------------------
+# A sequential test for a change: Page's CUSUM on log likelihood ratios.
+#
+# Of all tests with a given mean time to a false alarm CUSUM has the shortest worst mean delay, if
+# the windows before and after the change are independent and their distributions known (Lorden
+# 1971, Moustakides 1986). It is Wald's sequential probability ratio test begun again whenever it
+# decides for "no change", so that test is left out.
+
+
+def cusum(log_ratio: FloatArray) -> FloatArray:
+    """Page's statistic after each window, float64 (n,), never negative.
+
+    ``g(t) = max(0, g(t-1) + l(t))`` with ``g = 0`` before the first window.
+
+    Args:
+        log_ratio: float64 (n,), log likelihood after the change less before it, finite.
+
+    Raises:
+        ValueError: another shape, or a value that is not finite.
+    """
+    if log_ratio.ndim != 1 or not np.isfinite(log_ratio).all():
+        raise ValueError(f"log ratios {log_ratio.shape}: must be finite and one a window")
+    out = np.empty(len(log_ratio))
+    level = 0.0
+    for n, value in enumerate(log_ratio.tolist()):
+        level = max(0.0, level + value)
+        out[n] = level
+    return out
+
+
+# --------------------------------------------------------------------------------------------------
+# How likely what a window shows is without slip, in incipient and in gross slip.
+#
+# Two models, both fitted on training trials alone. Histograms take the three spike counts for
+# independent given the state, which they are not; they say what counting alone reaches. The other
+# is a multinomial logistic regression on any features, turned into likelihoods by weighing the
+# classes equally: p(seen | state) is p(state | seen) times p(seen) where all states are equally
+# common, and p(seen) is the same for every state, so detectors never need it.
+
+
+class Likelihood(Protocol):
+    """What a window says about the state."""
+
+    def log(self, features: Array) -> FloatArray:
+        """Log likelihoods float64 (n, classes) of features (n, k), up to a constant a window."""
+
+
+@dataclass(frozen=True)
+class Histograms:
+    """Independent histograms of small whole numbers.
+
+    Attributes:
+        table: float64 (k, classes, bins), log shares; a value beyond the last bin is of the last.
+    """
+
+    table: FloatArray
+
+    def log(self, features: Array) -> FloatArray:
+        """As `Likelihood.log`; features are whole numbers from 0."""
+        bins = np.clip(np.asarray(features, np.int64), 0, self.table.shape[2] - 1)
+        out = np.zeros((len(bins), self.table.shape[1]))
+        for column, table in zip(bins.T, self.table, strict=True):
+            out += table[:, column].T
+        return out
+
+
+def fit_histograms(
+    features: Array, labels: npt.NDArray[np.integer], classes: int, bins: int
+) -> Histograms:
+    """Shares of each value by class, with `ADDED` windows in each bin.
+
+    Args:
+        features: whole numbers (n, k), 0 to ``bins - 1``; larger ones go into the last bin.
+        labels: integer (n,), 0 to ``classes - 1``; a class without windows is taken as even.
+
+    Raises:
+        ValueError: lengths differ, or a label that is no class.
+    """
+    labels = _check(features, labels, classes)
+    values = np.clip(np.asarray(features, np.int64), 0, bins - 1)
+    table = np.empty((values.shape[1], classes, bins))
+    for k, column in enumerate(values.T):
+        counted = np.bincount(labels * bins + column, minlength=classes * bins)
+        filled = counted.reshape(classes, bins) + ADDED
+        table[k] = np.log(filled / filled.sum(axis=1, keepdims=True))
+    return Histograms(table)
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """Multinomial logistic regression with all classes weighing the same.
+
+    Attributes:
+        weights: float64 (1 + k, classes), the first row the offsets.
+        mean, scale: float64 (k,), of the features over the training windows.
+    """
+
+    weights: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+
+    def log(self, features: Array) -> FloatArray:
+        """As `Likelihood.log`."""
+        scaled = (np.asarray(features, np.float64) - self.mean) / self.scale
+        # not a matrix product, whose rounding depends on how many windows there are: a detector
+        # must say the same of a window whatever comes after it
+        linear = np.broadcast_to(self.weights[0], (len(scaled), len(self.weights[0]))).copy()
+        for column, weights in zip(scaled.T, self.weights[1:], strict=True):
+            linear += column[:, None] * weights
+        return np.asarray(log_softmax(linear, axis=1))
+
+
+def fit_logistic(features: Array, labels: npt.NDArray[np.integer], classes: int) -> Logistic:
+    """The regression, by L-BFGS from zero: convex, so the result repeats.
+
+    Minimises the cross-entropy, averaged within each class that has windows and then over these,
+    + `RIDGE` / 2 times the squared weights (not the offsets). It is blind to the classes' order.
+
+    Args:
+        features: (n, k), finite; a constant one gets no weight.
+        labels: integer (n,), 0 to ``classes - 1``.
+
+    Raises:
+        ValueError: lengths differ, or a label that is no class.
+    """
+    labels = _check(features, labels, classes)
+    raw = np.asarray(features, np.float64)
+    if not len(raw):
+        empty = np.zeros(raw.shape[1])
+        return Logistic(np.zeros((1 + raw.shape[1], classes)), empty, empty + 1)
+    mean, spread = raw.mean(axis=0), raw.std(axis=0)
+    scale = np.where(spread > 0, spread, 1.0)
+    x = np.concatenate([np.ones((len(raw), 1)), (raw - mean) / scale], axis=1)
+    each = np.bincount(labels, minlength=classes)
+    share = 1.0 / (each[labels] * (each > 0).sum())
+    target = np.eye(classes)[labels] * share[:, None]
+    shape = (x.shape[1], classes)
+    penalty = np.full(shape, RIDGE)
+    penalty[0] = 0.0
+
+    def objective(flat: FloatArray) -> tuple[float, FloatArray]:
+        w = flat.reshape(shape)
+        log_p = log_softmax(x @ w, axis=1)
+        loss = -(target * log_p).sum() + 0.5 * (penalty * w * w).sum()
+        gradient = x.T @ (np.exp(log_p) * share[:, None] - target) + penalty * w
+        return float(loss), gradient.ravel()
+
+    found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
+    return Logistic(np.asarray(found.x).reshape(shape), mean, scale)
+
+
+def _check(features: Array, labels: npt.NDArray[np.integer], classes: int) -> npt.NDArray[np.int64]:
+    found = np.asarray(labels).astype(np.int64)
+    if features.ndim != 2 or found.shape != features.shape[:1]:
+        raise ValueError(f"features {features.shape} for {found.shape} labels")
+    if len(found) and (found.min() < 0 or found.max() >= classes):
+        raise ValueError(f"labels range over {found.min()}..{found.max()}; of {classes} classes")
+    return found
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions of one trial: the input of every detector.
+
+    Attributes:
+        counts: int64 (n, 3), the network's output spikes in each window.
+        events: int64 (n,), events in each window.
+        end_ns: int64 (n,), end of each window on the trial's time line, ascending.
+    """
+
+    counts: IntArray
+    events: IntArray
+    end_ns: IntArray
+
+    def __post_init__(self) -> None:
+        """Columns that do not fit each other are refused."""
+        n = len(self.end_ns)
+        if self.counts.shape != (n, len(CLASSES)) or self.events.shape != (n,):
+            raise ValueError(
+                f"counts {self.counts.shape} and events {self.events.shape} of {n} windows"
+            )
+        if (np.diff(self.end_ns) <= 0).any():
+            raise ValueError("window ends do not increase")
+
+    def __len__(self) -> int:
+        return len(self.end_ns)
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A trial with its true slip, on the time line of its windows."""
+
+    predictions: Predictions
+    slip: TrueSlip
+
+    def states(self, length_ns: int) -> IntArray:
+        """The class that each window of this length holds most of, by its middle; int64 (n,)."""
+        middle = self.predictions.end_ns - length_ns // 2
+        return (middle >= self.slip.incipient_ns).astype(np.int64) + (middle >= self.slip.gross_ns)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a detector makes of one trial; no value depends on a later window.
+
+    Attributes:
+        end_ns: int64 (n,), end of each window.
+        incipient: float64 (n,), how strongly everything up to each window speaks for slip.
+        gross_after: the same for gross slip, given the window in which incipient slip was
+            detected; only values after that window mean anything.
+    """
+
+    end_ns: IntArray
+    incipient: FloatArray
+    gross_after: Callable[[int], FloatArray]
+
+
+class Detector(Protocol):
+    """Evidence that slip has begun."""
+
+    def evidence(self, predictions: Predictions) -> Evidence:
+        """The evidence of one trial."""
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """The paper's rule: mean counts of the last `width` windows, and by how much a class leads.
+
+    The evidence is the lead in spikes.
+    """
+
+    width: int
+
+    def evidence(self, predictions: Predictions) -> Evidence:
+        """See `Detector`."""
+        gross = lead_of(predictions.counts, self.width, GROSS)
+        return Evidence(
+            predictions.end_ns,
+            lead_of(predictions.counts, self.width, INCIPIENT),
+            lambda first: gross,
+        )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a window's likelihoods are read from.
+
+    Attributes:
+        likelihood: fitted on training trials.
+        events: whether the number of events is among the features; see `features`.
+        weight: factor on log likelihoods. Windows that overlap hold each event several times:
+            stride over length counts it once again.
+    """
+
+    likelihood: Likelihood
+    events: bool
+    weight: float
+
+    def log(self, predictions: Predictions) -> FloatArray:
+        """Log likelihoods float64 (n, 3)."""
+        return self.weight * self.likelihood.log(features(predictions, self.events))
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The hidden Markov filter; the evidence is log odds."""
+
+    chain: Chain
+    reading: Reading
+
+    def evidence(self, predictions: Predictions) -> Evidence:
+        """See `Detector`."""
+        belief = forward(self.chain, self.reading.log(predictions))
+        gross = log_odds(belief, GROSS)
+        return Evidence(predictions.end_ns, log_odds(belief, INCIPIENT), lambda first: gross)
+
+
+@dataclass(frozen=True)
+class Cusum:
+    """Page's test of no slip against incipient slip; after that, of incipient against gross."""
+
+    reading: Reading
+
+    def evidence(self, predictions: Predictions) -> Evidence:
+        """See `Detector`."""
+        log = self.reading.log(predictions)
+        ratio = log[:, GROSS] - log[:, INCIPIENT]
+
+        def gross_after(first: int) -> FloatArray:
+            out = np.zeros(len(ratio))
+            out[first + 1 :] = cusum(ratio[first + 1 :])
+            return out
+
+        return Evidence(predictions.end_ns, cusum(log[:, INCIPIENT] - log[:, NO_SLIP]), gross_after)
+
+
+@dataclass(frozen=True)
+class Levels:
+    """What the evidence must EXCEED."""
+
+    incipient: float
+    gross: float
+
+
+def decide(evidence: Evidence, levels: Levels) -> Found:
+    """First incipient, then gross slip; each dated by the end of the window that told."""
+    first = first_above(evidence.incipient, levels.incipient)
+    if first is None:
+        return Found(None, None)
+    second = first_above(evidence.gross_after(first), levels.gross, first + 1)
+    end = evidence.end_ns
+    return Found(int(end[first]), None if second is None else int(end[second]))
+
+
+def first_above(evidence: FloatArray, level: float, start: int = 0) -> int | None:
+    """The first window from `start` on whose evidence exceeds the level."""
+    found = np.flatnonzero(evidence[start:] > level)
+    return start + int(found[0]) if len(found) else None
+
+
+def features(predictions: Predictions, events: bool) -> FloatArray:
+    """The counts; if wanted, the logarithm of one plus the events, and all products of two.
+
+    float64 (n, 3), or (n, 14) with events; the counts come first.
+    """
+    counts = predictions.counts.astype(np.float64)
+    if not events:
+        return counts
+    each = [*counts.T, np.log1p(predictions.events)]
+    products = [one * other for k, one in enumerate(each) for other in each[k:]]
+    return np.stack([*each, *products], axis=1)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What training trials taught, for windows of any stride.
+
+    Attributes:
+        chain: how often states are left, by consecutive windows.
+        readings: by name, likelihoods of windows of full weight.
+    """
+
+    chain: Chain
+    readings: dict[str, Reading]
+
+    def detectors(self, stride_share: float) -> dict[str, Detector]:
+        """A filter and a test for each reading, by name.
+
+        Args:
+            stride_share: stride over length of the windows that they will read.
+        """
+        # a state is left as often per second whatever the stride
+        chain = Chain(-np.expm1(stride_share * np.log1p(-self.chain.leave)))
+        weighed = {n: replace(r, weight=stride_share) for n, r in self.readings.items()}
+        return {
+            **{f"hmm {name}": Filter(chain, reading) for name, reading in weighed.items()},
+            **{f"cusum {name}": Cusum(reading) for name, reading in weighed.items()},
+        }
+
+
+def learn(trials: Sequence[Labelled], length_ns: int, most: int) -> Learned:
+    """Learn from labelled training trials in consecutive windows.
+
+    Args:
+        length_ns: a window's length.
+        most: spikes that a class can give in a window.
+    """
+    labels = [trial.states(length_ns) for trial in trials]
+    flat = np.concatenate([np.empty(0, np.int64), *labels])
+    both = np.concatenate([np.empty((0, 14)), *(features(t.predictions, True) for t in trials)])
+    counts = both[:, :3]
+    classes = len(CLASSES)
+    return Learned(
+        fit_chain(labels, classes),
+        {
+            "histograms": Reading(fit_histograms(counts, flat, classes, most + 1), False, 1.0),
+            "counts": Reading(fit_logistic(counts, flat, classes), False, 1.0),
+            "counts and events": Reading(fit_logistic(both, flat, classes), True, 1.0),
+        },
+    )

@@ -1,0 +1,231 @@
+"""Latency and lead of a detector against a trial's true slip, without rewarding false alarms.
+
+A detector that cries slip at once would have the best latency and the longest lead. So each
+detection is first judged: missed, false early, late, or counted; only the counted ones have times,
+and the four numbers always add up to the trials. Incipient slip ends where gross slip begins, and
+gross slip ends where the sensor and the plate stop moving on each other: a detection after that
+warns of nothing, however long the recording goes on, and without this bound a detector that says
+gross slip for as long as the plate lies still would miss nothing. Each evaluation, choice and
+search judges by `is_false_early` and `is_late`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sliplab.analysis.detectors.detection import Found
+
+Summary = dict[str, float | int | None]
+
+NEVER = int(np.iinfo(np.int64).max)
+"""The time of what was not detected, where times are held in an array."""
+
+
+@dataclass(frozen=True)
+class TrueSlip:
+    """True onsets and end of a trial's slip, nanoseconds on the time line of its windows.
+
+    Attributes:
+        incipient_ns, gross_ns: the onsets.
+        end_ns: where gross slip ended.
+
+    Raises:
+        ValueError: not in this order.
+    """
+
+    incipient_ns: int
+    gross_ns: int
+    end_ns: int
+
+    def __post_init__(self) -> None:
+        """The three are in order, or refused."""
+        if self.gross_ns < self.incipient_ns:
+            raise ValueError(
+                f"gross onset {self.gross_ns} ns is before incipient onset {self.incipient_ns} ns"
+            )
+        if self.end_ns < self.gross_ns:
+            raise ValueError(f"end {self.end_ns} ns is before gross onset {self.gross_ns} ns")
+
+
+def true_slip(label: Mapping[str, Any]) -> TrueSlip | None:
+    """The slip that a label tells of; None where it lacks an onset.
+
+    Args:
+        label: with ``incipient_ns``, ``gross_ns`` and ``end_ns``. A person may have set the gross
+            onset after the end: the slip then ends as it begins.
+    """
+    incipient, gross = label["incipient_ns"], label["gross_ns"]
+    if incipient is None or gross is None:
+        return None
+    return TrueSlip(incipient, gross, max(label["end_ns"], gross))
+
+
+def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:
+    """Check if a detection comes before the onset by MORE than the tolerance.
+
+    Args:
+        found_ns: an integer or an array of them, `NEVER` where nothing was detected; likewise:
+        onset_ns: true onset.
+        tolerance_ns: of a detection before it.
+    """
+    return found_ns < onset_ns - tolerance_ns
+
+
+def is_late(found_ns: Any, end_ns: Any) -> Any:
+    """Check if a detection comes at the end of its event or after it.
+
+    Args:
+        found_ns: an integer or an array of them, `NEVER` where nothing was detected (not late).
+        end_ns: likewise: gross onset for incipient slip, the slip's end for gross slip.
+    """
+    return (found_ns >= end_ns) & (found_ns != NEVER)
+
+
+@dataclass(frozen=True)
+class TrialLatency:
+    """One trial's detections against its true onsets.
+
+    Attributes:
+        latency_incipient_ms: detection minus true onset; negative down to the tolerance where it
+            came early; None where missed, false early or late.
+        latency_gross_ms: the same for gross slip.
+        lead_ms: true gross onset minus incipient detection, above zero; None where the incipient
+            detection is not counted.
+        late_incipient_ms, late_gross_ms: a late detection minus the event's end, zero or more;
+            None where it is not late.
+        missed_incipient, missed_gross: there was no detection.
+        false_early_incipient, false_early_gross: it came before the true onset by more than the
+            tolerance.
+    """
+
+    latency_incipient_ms: float | None
+    latency_gross_ms: float | None
+    lead_ms: float | None
+    late_incipient_ms: float | None
+    late_gross_ms: float | None
+    missed_incipient: bool
+    missed_gross: bool
+    false_early_incipient: bool
+    false_early_gross: bool
+
+    @property
+    def uncounted(self) -> tuple[int, int, int, int]:
+        """Numbers, 0 or 1, against a choice's bounds: false early, then missed or late, by onset.
+
+        Incipient slip stands before gross slip.
+        """
+        return (
+            int(self.false_early_incipient),
+            int(self.false_early_gross),
+            int(self.missed_incipient or self.late_incipient_ms is not None),
+            int(self.missed_gross or self.late_gross_ms is not None),
+        )
+
+
+def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
+    """Judge one trial; see the module.
+
+    Args:
+        detections: what the detector said.
+        slip: what is true, on the same time line.
+        false_early_ns: a detection earlier than the true onset by MORE than this is false.
+
+    Raises:
+        ValueError: a negative tolerance.
+    """
+    if false_early_ns < 0:
+        raise ValueError(f"false_early_ns = {false_early_ns}: must not be negative")
+    found, gross_found = detections.incipient_ns, detections.gross_ns
+    early, late, counted = _judge(found, slip.incipient_ns, slip.gross_ns, false_early_ns)
+    early_gross, late_gross, gross = _judge(gross_found, slip.gross_ns, slip.end_ns, false_early_ns)
+    lead = None if counted is None or found is None else _ms(slip.gross_ns - found)
+    return TrialLatency(
+        latency_incipient_ms=counted,
+        latency_gross_ms=gross,
+        lead_ms=lead,
+        late_incipient_ms=late,
+        late_gross_ms=late_gross,
+        missed_incipient=found is None,
+        missed_gross=gross_found is None,
+        false_early_incipient=early,
+        false_early_gross=early_gross,
+    )
+
+
+def summarise_latency(trials: Sequence[TrialLatency]) -> dict[str, Summary]:
+    """Latency over trials: ``{"incipient": {...}, "gross": {...}}``.
+
+    Each holds mean, std, median, p95, min, max (milliseconds) over the n counted detections, and
+    missed, late and false_early; the four numbers add up to the trials.
+    """
+    return {
+        "incipient": {
+            **_describe([t.latency_incipient_ms for t in trials]),
+            **_not_counted(trials, "incipient"),
+        },
+        "gross": {
+            **_describe([t.latency_gross_ms for t in trials]),
+            **_not_counted(trials, "gross"),
+        },
+    }
+
+
+def summarise_lead(trials: Sequence[TrialLatency]) -> Summary:
+    """Lead over trials: min, mean, std, median, p95, max (milliseconds) over n counted leads.
+
+    ``detected_first`` is n under the name that readers look for; missed, late and false_early are
+    those of the incipient detection.
+    """
+    found = _describe([t.lead_ms for t in trials])
+    return {**found, "detected_first": found["n"], **_not_counted(trials, "incipient")}
+
+
+def _not_counted(trials: Sequence[TrialLatency], kind: str) -> dict[str, int]:
+    return {
+        "missed": sum(getattr(t, f"missed_{kind}") for t in trials),
+        "late": sum(getattr(t, f"late_{kind}_ms") is not None for t in trials),
+        "false_early": sum(getattr(t, f"false_early_{kind}") for t in trials),
+    }
+
+
+def _judge(
+    found: int | None, onset: int, end: int, tolerance: int
+) -> tuple[bool, float | None, float | None]:
+    """Tell false early, by how much it was late, and its latency if it counts, in ms."""
+    if found is None:
+        return False, None, None
+    if is_false_early(found, onset, tolerance):
+        return True, None, None
+    if is_late(found, end):
+        return False, _ms(found - end), None
+    return False, None, _ms(found - onset)
+
+
+def _ms(difference_ns: int) -> float:
+    return int(difference_ns) / 1e6
+
+
+def _describe(values: Sequence[float | None]) -> dict[str, Any]:
+    """Statistics of the values that are there; None where one cannot be computed.
+
+    ``std`` is the sample standard deviation (divisor n - 1), so it needs two values; percentiles
+    interpolate linearly between order statistics.
+    """
+    there = np.array([v for v in values if v is not None], np.float64)
+    n = len(there)
+    if n == 0:
+        names = ("mean", "std", "median", "p95", "min", "max")
+        return {**dict.fromkeys(names), "n": 0}
+    return {
+        "mean": float(there.mean()),
+        "std": float(there.std(ddof=1)) if n > 1 else None,
+        "median": float(np.median(there)),
+        "p95": float(np.percentile(there, 95)),
+        "min": float(there.min()),
+        "max": float(there.max()),
+        "n": n,
+    }

@@ -1,0 +1,429 @@
+"""The detector on a running stream: events in as they come, one decision out for each window.
+
+Events are counted into the windows that are open when they arrive, so nothing of the past is kept
+or binned again, and a window is judged by the very functions that judge a stored trial: the same
+events give the same windows, counts and decisions. What a stream does that a file does not
+(silence, events out of order, events too late, a clock that leaps) has one outcome each:
+
+- A window ends when an event at or after its end has come, or when `advance` says that the
+  camera's clock is past it; so a quiet scene is judged too.
+- Events out of order count where they belong while their window is open.
+- An event of a window that is judged already is left out and counted as late; nothing is revised.
+- Time that leaps ahead by more than `gap_us` is a gap: the open windows are given up, the sliding
+  window begins anew, and the gap is counted.
+- Time that falls back by more than `back_us` is another clock: `ClockFellBack`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, winners
+from sliplab.analysis.networks.training import Fitted, engine
+from sliplab.analysis.windows.windows import bin_events
+from sliplab.protocols.settings import Detection, Windows
+from sliplab.storage.streams import EventChunk
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Decision on one window. Times on the camera's clock, microseconds.
+
+    Attributes:
+        number: of the window, from 0; gaps leave numbers out.
+        counts: output spikes in the order of `analysis.metrics.classification.CLASSES`.
+        smoothed, valid_class, onset: as `Step`.
+        events: events of the window, all over the sensor and of both polarities.
+        last_event_us: the latest of them; None in a window without events.
+        by_event: an event ended the window, and not the clock alone.
+        decided_ns: monotonic clock when the decision was there.
+    """
+
+    number: int
+    start_us: int
+    end_us: int
+    counts: tuple[int, int, int]
+    smoothed: tuple[float, float, float]
+    valid_class: int
+    onset: str | None
+    events: int
+    last_event_us: int | None
+    by_event: bool
+    decided_ns: int = field(compare=False)
+
+
+@dataclass
+class Losses:
+    """Faults of a stream that a stored trial has not."""
+
+    late: int = 0
+    """Events left out: their window had been judged."""
+    disordered: int = 0
+    """Events that came after a younger one, the late ones among them."""
+    gaps: int = 0
+    longest_gap_us: int = 0
+
+
+@dataclass(frozen=True)
+class Step:
+    """Answer of the rule after one more window.
+
+    Attributes:
+        smoothed: trailing mean counts in the order of `metrics.classification.CLASSES`, over the
+            windows there are.
+        valid_class: the detected class; -1 where none is valid.
+        onset: ``incipient`` or ``gross`` where this window is the first such detection.
+    """
+
+    smoothed: tuple[float, float, float]
+    valid_class: int
+    onset: str | None
+
+
+class StepRule:
+    """The rule of `analysis.detectors.detection.detect`, window by window, to the bit.
+
+    `detect` sees a whole trial at once; this holds the last `smoothing` rows and no more.
+    """
+
+    def __init__(self, settings: Detection) -> None:
+        self._width = settings.smoothing
+        self._lead = settings.margin * settings.smoothing
+        self._held: deque[npt.NDArray[np.int64]] = deque()
+        self._sum = np.zeros(len(CLASSES), np.int64)
+        self._incipient = self._gross = False
+
+    def step(self, counts: npt.NDArray[np.integer[Any]]) -> Step:
+        """Take the counts, integer (3,), of the window after the last one.
+
+        Raises:
+            ValueError: another shape or type.
+        """
+        row = np.asarray(counts)
+        if row.shape != (len(CLASSES),) or not np.issubdtype(row.dtype, np.integer):
+            raise ValueError(f"counts are {row.dtype} {row.shape}; expected integers (3,)")
+        row = row.astype(np.int64)
+        self._held.append(row)
+        self._sum = self._sum + row
+        if len(self._held) > self._width:
+            self._sum = self._sum - self._held.popleft()
+        valid = -1
+        if len(self._held) == self._width:
+            valid = int(winners(self._sum[None], self._lead)[0])
+        a, b, c = (self._sum / len(self._held)).tolist()
+        return Step((a, b, c), valid, self._onset(valid))
+
+    def interrupt(self) -> None:
+        """Forget the windows so far: the next one does not follow them. Onsets found stay found."""
+        self._held.clear()
+        self._sum = np.zeros(len(CLASSES), np.int64)
+
+    def _onset(self, valid: int) -> str | None:
+        if not self._incipient:
+            self._incipient = valid == INCIPIENT
+            return CLASSES[INCIPIENT] if self._incipient else None
+        if not self._gross and valid == GROSS:
+            self._gross = True
+            return CLASSES[GROSS]
+        return None
+
+
+Counting = Callable[[npt.NDArray[np.uint8]], npt.NDArray[np.int64]]
+"""Output spikes int64 (1, 3) of one window, uint8 (1, steps, channels, cells, cells)."""
+
+GAP_US = 10_000_000
+BACK_US = 1_000_000
+
+
+class ClockFellBack(ValueError):
+    """The camera's clock is another one than before."""
+
+
+@dataclass
+class _Open:
+    """A window that is not over."""
+
+    start_us: int
+    x: npt.NDArray[np.uint8]
+    events: int = 0
+    last_us: int | None = None
+
+
+def counting_of(fitted: Fitted) -> Counting:
+    """The network's spike counts by the event-driven kernels, in the calling thread alone."""
+    fast = engine(fitted)
+    return lambda x: fast.counts(x, 1)
+
+
+class LiveDetector:
+    """Windows, counts and decisions of one stream.
+
+    Args:
+        counts: the network.
+        windows: shape of a sample.
+        detection: sliding window and margin.
+        width, height: the sensor's pixels.
+        centre_px: middle of the crop, as for `analysis.windows.windows.bin_events`.
+        stride_us: from one window's start to the next one's; the window's length by default.
+        starts: start of each window by its number, strictly increasing, instead of an even grid
+            that begins with the first event or time.
+        gap_us, back_us: see the module.
+
+    Raises:
+        ValueError: a crop larger than the sensor, or a stride, gap or step back that is not
+            positive.
+    """
+
+    def __init__(
+        self,
+        counts: Counting,
+        windows: Windows,
+        detection: Detection,
+        *,
+        width: int = 640,
+        height: int = 480,
+        centre_px: tuple[float, float] | None = None,
+        stride_us: int | None = None,
+        starts: Callable[[int], int] | None = None,
+        gap_us: int = GAP_US,
+        back_us: int = BACK_US,
+    ) -> None:
+        self._counts, self._windows = counts, windows
+        self._rule = StepRule(detection)
+        self._geometry = (width, height, centre_px)
+        self._length_us = windows.length_ms * 1000
+        self._stride_us = self._length_us if stride_us is None else stride_us
+        if min(self._stride_us, gap_us, back_us) <= 0:
+            raise ValueError("stride_us, gap_us and back_us must be positive")
+        self._starts = starts
+        self._gap_us, self._back_us = gap_us, back_us
+        self._open: dict[int, _Open] = {}
+        self._next = 0
+        self._now_us: int | None = None
+        self._judged_us: int | None = None
+        self.losses = Losses()
+        self._bin(_NO_EVENTS, 0)  # raises where the crop does not fit
+
+    def warm_up(self) -> None:
+        """Load and compile what the first window would have to wait for."""
+        self._counts(self._empty())
+
+    @property
+    def now_us(self) -> int | None:
+        """The latest time of the camera's clock that is known; None before the first."""
+        return self._now_us
+
+    @property
+    def origin_us(self) -> int | None:
+        """Start of the first window; None before the first event or time."""
+        return None if self._starts is None else self._starts(0)
+
+    @property
+    def open_windows(self) -> int:
+        """How many windows are open: what the detector keeps does not grow with time."""
+        return len(self._open)
+
+    def push(self, chunk: EventChunk) -> list[Decision]:
+        """Take events; give the decisions of the windows that they end, in order.
+
+        Raises:
+            ClockFellBack: see the module.
+            ValueError: an event outside the sensor.
+        """
+        if not len(chunk):
+            return []
+        chunk = self._ordered(chunk)
+        edges = np.flatnonzero(np.diff(chunk.t_us) > self._gap_us) + 1
+        made = []
+        for part in np.split(np.arange(len(chunk)), edges) if len(edges) else [slice(None)]:
+            made += self._push(
+                EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+            )
+        return made
+
+    def advance(self, to_us: int) -> list[Decision]:
+        """The camera's clock has come to `to_us`, and all events before it are here.
+
+        A time before the latest known one tells nothing.
+        """
+        if self._now_us is not None and to_us <= self._now_us:
+            return []
+        self._come_to(to_us)
+        self._now_us = to_us
+        made = []
+        while self._start(self._next) + self._length_us <= to_us:
+            made.append(self._judge(self._next, by_event=False))
+        return made
+
+    # -- events ------------------------------------------------------------------------------
+
+    def _ordered(self, chunk: EventChunk) -> EventChunk:
+        """The chunk in the order of time; what came out of order is counted."""
+        t_us = chunk.t_us
+        newest = int(t_us[0]) if self._now_us is None else self._now_us
+        if int(t_us.min()) < newest - self._back_us:
+            raise ClockFellBack(
+                f"an event at {int(t_us.min())} us after the clock had come to {newest} us: "
+                "the camera's clock fell back"
+            )
+        before = np.maximum.accumulate(np.concatenate([t_us[:1], t_us[:-1]]))
+        disordered = int(np.count_nonzero(t_us < before))
+        if disordered:
+            order = np.argsort(t_us, kind="stable")
+            chunk = EventChunk(chunk.x[order], chunk.y[order], chunk.p[order], t_us[order])
+        self.losses.disordered += disordered
+        if self._judged_us is not None:
+            self.losses.late += int(np.searchsorted(chunk.t_us, self._judged_us))
+        return chunk
+
+    def _push(self, chunk: EventChunk) -> list[Decision]:
+        """Events in order and without a gap among them."""
+        self._come_to(int(chunk.t_us[0]))
+        last_us = int(chunk.t_us[-1])
+        self._now_us = last_us if self._now_us is None else max(self._now_us, last_us)
+        made = []
+        number = self._next
+        while (start_us := self._start(number)) <= last_us:
+            self._fill(number, start_us, chunk)
+            if start_us + self._length_us <= last_us:
+                made.append(self._judge(number, by_event=True))
+            number += 1
+        return made
+
+    def _fill(self, number: int, start_us: int, chunk: EventChunk) -> None:
+        """Count the events of one window, which is opened for them."""
+        bounds = np.searchsorted(chunk.t_us, [start_us, start_us + self._length_us])
+        begin, end = bounds.tolist()
+        window = self._opened(number, start_us)
+        if begin == end:
+            return
+        part = slice(begin, end)
+        inside = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+        more = self._bin(inside, start_us)
+        # 255 stays 255, as if all had been counted at once
+        window.x += np.minimum(more, 255 - window.x)
+        window.events += end - begin
+        last_us = int(chunk.t_us[end - 1])
+        window.last_us = last_us if window.last_us is None else max(window.last_us, last_us)
+
+    def _bin(self, chunk: EventChunk, start_us: int) -> npt.NDArray[np.uint8]:
+        starts = np.array([start_us], np.int64)
+        return bin_events(chunk, starts, self._windows, *self._geometry)
+
+    # -- windows -----------------------------------------------------------------------------
+
+    def _start(self, number: int) -> int:
+        assert self._starts is not None
+        return self._starts(number)
+
+    def _opened(self, number: int, start_us: int) -> _Open:
+        if number not in self._open:
+            self._open[number] = _Open(start_us, self._empty())
+        return self._open[number]
+
+    def _empty(self) -> npt.NDArray[np.uint8]:
+        w = self._windows
+        return np.zeros((1, w.steps, w.channels, w.cells, w.cells), np.uint8)
+
+    def _judge(self, number: int, *, by_event: bool) -> Decision:
+        """Close the first window that is not judged, `number`, and say what it is."""
+        start_us = self._start(number)
+        window = self._opened(number, start_us)
+        del self._open[number]
+        counts = self._counts(window.x)[0]
+        said = self._rule.step(counts)
+        self._next = number + 1
+        self._judged_us = start_us + self._length_us
+        a, b, c = counts.tolist()
+        return Decision(
+            number=number,
+            start_us=start_us,
+            end_us=self._judged_us,
+            counts=(a, b, c),
+            smoothed=said.smoothed,
+            valid_class=said.valid_class,
+            onset=said.onset,
+            events=window.events,
+            last_event_us=window.last_us,
+            by_event=by_event,
+            decided_ns=time.monotonic_ns(),
+        )
+
+    def _come_to(self, t_us: int) -> None:
+        """Time goes on to `t_us`: the grid begins with the first, and a gap is dealt with."""
+        if self._starts is None:
+            stride_us = self._stride_us
+            self._starts = lambda number: t_us + number * stride_us
+        if self._now_us is None or t_us - self._now_us <= self._gap_us:
+            return
+        self.losses.gaps += 1
+        self.losses.longest_gap_us = max(self.losses.longest_gap_us, t_us - self._now_us)
+        self._open.clear()
+        self._rule.interrupt()
+        self._next = self._first_from(t_us)
+        self._judged_us = self._start(self._next)
+
+    def _first_from(self, t_us: int) -> int:
+        """Number of the first window, not judged yet, that begins at `t_us` or later."""
+        low, step = self._next, 1
+        while self._start(low + step) < t_us:
+            step *= 2
+        high = low + step
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (low, middle) if self._start(middle) >= t_us else (middle + 1, high)
+        return low
+
+
+_NO_EVENTS = EventChunk(
+    np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.uint8), np.empty(0, np.int64)
+)
+
+
+SPAN_NS = 5_000_000_000
+"""How long an arrival counts at least; twice that at most. 100 ppm of drift are 1 ms then."""
+
+
+class FreshestArrival:
+    """Camera time against the host's monotonic clock, by the freshest thing that has arrived.
+
+    Nothing is fitted while a stream runs. What arrives with the least delay bounds the camera's
+    clock from below, so the freshest arrival of the last seconds counts as having taken no time;
+    the part of the delay that no arrival is without cannot be seen from here.
+    """
+
+    def __init__(self) -> None:
+        self._began_ns: int | None = None
+        self._before: int | None = None
+        self._here: int | None = None
+
+    def observe(self, camera_us: int, host_ns: int) -> None:
+        """Something that happened at `camera_us` was here at `host_ns`."""
+        ahead_ns = camera_us * 1000 - host_ns
+        if self._began_ns is None or host_ns - self._began_ns >= SPAN_NS:
+            self._began_ns, self._before, self._here = host_ns, self._here, ahead_ns
+        elif self._here is None or ahead_ns > self._here:
+            self._here = ahead_ns
+
+    def camera_us(self, host_ns: int) -> int | None:
+        """What the camera's clock has come to, at the least; None before the first arrival."""
+        ahead_ns = self._ahead_ns
+        return None if ahead_ns is None else (host_ns + ahead_ns) // 1000
+
+    def host_ns(self, camera_us: int) -> int | None:
+        """When a thing of that time could have been here at the earliest."""
+        ahead_ns = self._ahead_ns
+        return None if ahead_ns is None else camera_us * 1000 - ahead_ns
+
+    @property
+    def _ahead_ns(self) -> int | None:
+        if self._here is None:
+            return None
+        return self._here if self._before is None else max(self._before, self._here)

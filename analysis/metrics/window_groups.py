@@ -1,0 +1,155 @@
+"""Accuracy of groups of windows, with intervals that know that windows of a trial go together.
+
+Fifty windows of a trial see the same papillae slip: they are right together and wrong together. An
+interval that counts them as fifty independent ones is several times too narrow. So intervals are
+over trials (`analysis.metrics.intervals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.metrics.classification import (
+    CLASSES,
+    Counts,
+    IntArray,
+    Labels,
+    check,
+    winners,
+)
+from sliplab.analysis.metrics.intervals import mean_interval, share_interval
+
+FloatArray = npt.NDArray[np.float64]
+
+TENTHS = 10
+"""Parts of a phase."""
+
+
+def credit(scores: Counts, labels: Labels) -> FloatArray:
+    """What each window counts for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
+    scores, labels = check(scores, labels)
+    top = scores == scores.max(axis=1, keepdims=True) if len(scores) else np.zeros((0, 3), bool)
+    return np.asarray(top[np.arange(len(labels)), labels] / np.maximum(top.sum(axis=1), 1))
+
+
+def strict_hits(counts: Counts, labels: Labels) -> FloatArray:
+    """1 where the unique winner is right, else 0; (n,)."""
+    counts, labels = check(counts, labels)
+    return (winners(counts) == labels).astype(np.float64)
+
+
+def share(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+    """Share that `values` come to, its interval over trials, windows and trials.
+
+    Args:
+        values: (n,), what a window counts, 0..1.
+        trial: integer (n,), the trial of each window.
+
+    Returns:
+        ``share``, ``low``, ``high`` (None where there is none), ``n`` windows and ``trials``.
+    """
+    return _summary(values, trial, share_interval)
+
+
+def mean(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+    """The same of values of any sign, such as differences, with Student's interval."""
+    return _summary(values, trial, mean_interval)
+
+
+def _summary(
+    values: FloatArray,
+    trial: IntArray,
+    measure: Callable[[FloatArray, FloatArray], tuple[float, float] | None],
+) -> dict[str, Any]:
+    which, place = np.unique(trial, return_inverse=True)
+    sums, sizes = (
+        np.bincount(place, weights, minlength=len(which)).astype(np.float64)
+        for weights in (values, None)
+    )
+    span = measure(sums, sizes)
+    return {
+        "share": float(values.mean()) if len(values) else None,
+        "low": None if span is None else span[0],
+        "high": None if span is None else span[1],
+        "n": len(values),
+        "trials": len(which),
+    }
+
+
+def by_factor(
+    hits: FloatArray, trial: IntArray, levels: Mapping[int, Mapping[str, str]]
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Share of hits by each factor's levels.
+
+    Args:
+        hits: (n,), 0..1.
+        trial: integer (n,).
+        levels: of each trial, its level of each factor in words; levels come out in the order in
+            which they are first seen here.
+    """
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for factor in dict.fromkeys(name for of in levels.values() for name in of):
+        found[factor] = {}
+        for text in dict.fromkeys(of[factor] for of in levels.values() if factor in of):
+            ours = [number for number, of in levels.items() if of.get(factor) == text]
+            there = np.isin(trial, ours)
+            if there.any():
+                found[factor][text] = share(hits[there], trial[there])
+    return found
+
+
+def by_tenth(
+    hits: FloatArray, labels: Labels, trial: IntArray, fraction: FloatArray
+) -> dict[str, list[dict[str, Any]]]:
+    """Recall of each class by tenths of its phase, ten rows a class.
+
+    Args:
+        hits: (n,), 1 where a window was called rightly.
+        fraction: (n,), where in its class's phase the middle of the window lies, 0..1; windows
+            outside, or NaN, are left out.
+    """
+    result = {}
+    inside = (fraction >= 0) & (fraction <= 1)
+    tenth = np.zeros(len(labels), np.int64)
+    tenth[inside] = np.minimum((fraction[inside] * TENTHS).astype(np.int64), TENTHS - 1)
+    for k, name in enumerate(CLASSES):
+        rows = []
+        for part in range(TENTHS):
+            there = inside & (labels == k) & (tenth == part)
+            rows.append({"tenth": part + 1, **share(hits[there], trial[there])})
+        result[name] = rows
+    return result
+
+
+def by_trial(
+    counts: Counts, labels: Labels, trial: IntArray, name: Callable[[int], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """One row a trial, the worst first: windows, errors, and what was taken for what.
+
+    Args:
+        name: gives what identifies a trial, put first into its row.
+    """
+    counts, labels = check(counts, labels)
+    said = winners(counts)
+    rows = []
+    for number in np.unique(trial).tolist():
+        there = trial == number
+        true, called = labels[there], said[there]
+        wrong = called != true
+        taken = {
+            f"{CLASSES[k]} as {'undecided' if j < 0 else CLASSES[j]}": int(
+                ((true == k) & (called == j)).sum()
+            )
+            for k in range(len(CLASSES))
+            for j in (*range(len(CLASSES)), -1)
+            if j != k and ((true == k) & (called == j)).any()
+        }
+        rows.append(
+            {**name(number), "n": int(there.sum()), "errors": int(wrong.sum()),
+             "strict": float(1 - wrong.mean()), "taken": taken}
+        )  # fmt: skip
+    return sorted(rows, key=lambda row: row["strict"])

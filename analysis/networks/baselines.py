@@ -1,0 +1,227 @@
+"""What little effort reaches on the same samples, so that the network's accuracy means something.
+
+Event rate alone tells much about slip. The report prints three beside the network: the commonest
+class, two thresholds on the number of events, and a logistic regression on it. They take a second
+and are always there. Where the events are tells more: a logistic regression on the events of each
+cell, and what stands in `networks.baseline_trees` and `networks.baseline_nets`, take
+minutes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.special import log_softmax
+from threadpoolctl import threadpool_limits
+
+from sliplab.analysis.metrics.classification import CLASSES, Labels, accuracy, check_labels
+from sliplab.analysis.windows.sparse import SparseWindows
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+RIDGE = 1e-3
+"""L2 penalty of a logistic regression on standardised weights, per mean log-likelihood."""
+
+
+@dataclass(frozen=True)
+class BaselineScore:
+    """One baseline on the test samples.
+
+    Attributes:
+        name: ``majority``, ``rate_threshold`` or ``logistic``.
+        argmax: accuracy in 0..1 by `metrics.classification.accuracy` (ties are shared); None where
+            there are no test samples.
+        parameters: what was fitted, as plain data.
+        votes: (n, 3) for each test sample, the highest is its class.
+    """
+
+    name: str
+    argmax: float | None
+    parameters: dict[str, Any]
+    votes: npt.NDArray[Any]
+
+
+def evaluate_baselines(
+    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows, test_y: Labels
+) -> dict[str, BaselineScore]:
+    """Fit the cheap baselines on the training samples and score them on the test samples.
+
+    Args:
+        train_x, test_x: event counts.
+        train_y, test_y: classes, integer (n,), 0..2.
+
+    Raises:
+        ValueError: no training samples, lengths that differ, a label that is no class.
+    """
+    train_y, test_y = check_labels(train_y), check_labels(test_y)
+    if len(train_x) != len(train_y) or len(test_x) != len(test_y):
+        raise ValueError("samples and labels differ in number")
+    if not len(train_y):
+        raise ValueError("no training samples")
+    train_total, test_total = (x.totals.astype(np.float64) for x in (train_x, test_x))
+    each = np.bincount(train_y, minlength=len(CLASSES))
+    low, high, table = fit_rate_thresholds(train_total, train_y)
+    rate = fit_logistic(_of_total(train_total), train_y)
+
+    decisions: dict[str, tuple[npt.NDArray[Any], dict[str, Any]]] = {
+        "majority": (
+            np.tile(each, (len(test_y), 1)),
+            {"training_samples": dict(zip(CLASSES, each.tolist(), strict=True))},
+        ),
+        "rate_threshold": (
+            table[np.searchsorted([low, high], test_total)],
+            {"thresholds_events": [low, high], "training_samples": table.tolist()},
+        ),
+        "logistic": (
+            rate.scores(_of_total(test_total)),
+            {
+                "weights": rate.weights.tolist(),
+                "mean": rate.mean.tolist(),
+                "scale": rate.scale.tolist(),
+            },
+        ),
+    }
+    return {
+        name: BaselineScore(name, accuracy(votes, test_y).argmax, parameters, votes)
+        for name, (votes, parameters) in decisions.items()
+    }
+
+
+def logistic_cells(
+    train_x: SparseWindows, train_y: Labels, test_x: SparseWindows
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Logistic regression on the log of 1 + each cell's events: where they are, not when.
+
+    Returns:
+        votes (n, 3) for the test samples, and what was fitted, without the weights.
+    """
+    fitted = fit_logistic(np.log1p(cell_sums(train_x)), check_labels(train_y))
+    features = len(fitted.mean)
+    said = {
+        "ridge": RIDGE,
+        "weights": fitted.weights.size,
+        "multiply_adds": features * len(CLASSES),
+        "iterations": fitted.iterations,
+    }
+    return fitted.scores(np.log1p(cell_sums(test_x))), said
+
+
+def cell_sums(x: SparseWindows) -> IntArray:
+    """Events of each cell over all steps of a sample, int64 (n, channels * rows * columns)."""
+    places = math.prod(x.shape[1:])
+    sample = np.repeat(np.arange(len(x)), np.diff(x.offsets[:: x.shape[0]]))
+    flat = np.bincount(sample * places + x.cell, x.count, minlength=len(x) * places)
+    return flat.astype(np.int64).reshape(len(x), places)
+
+
+def step_sums(x: SparseWindows) -> IntArray:
+    """Events of each step over all cells of a sample, int64 (n, steps)."""
+    running = np.concatenate([[0], x.count.cumsum(dtype=np.int64)])
+    return np.diff(running[x.offsets]).reshape(len(x), x.shape[0])
+
+
+def fit_rate_thresholds(totals: FloatArray, labels: IntArray) -> tuple[float, float, IntArray]:
+    """Two thresholds on the total that get most training samples right, found exactly.
+
+    They cut the totals into three intervals and each is called by its commonest class. With P_c
+    the running number of samples of class c over the sorted distinct totals, and a, b, c the
+    classes of the intervals, the best sum
+    ``max over i <= j of (P_a - P_b)(i) + (P_b - P_c)(j) + P_c(end)`` is a running maximum in i:
+    O(n log n) for the sort and linear after it. Among equals the smallest upper, then the
+    smallest lower threshold is taken, which names no class.
+
+    Args:
+        totals: (n,), n at least 1.
+        labels: integer (n,), 0..2.
+
+    Returns:
+        lower and upper threshold (half-way between neighbouring totals; half an event outside
+        them at the ends), and int64 (3, 3): training samples by interval (row) and class; the
+        largest of a row is its vote, equal ones share it.
+    """
+    values, where = np.unique(totals, return_inverse=True)
+    classes = len(CLASSES)
+    table = np.zeros((len(values) + 1, classes), np.int64)
+    np.add.at(table, (where + 1, labels), 1)
+    running = table.cumsum(axis=0)  # [i, c]: samples of class c among the i smallest values
+    end = running[-1]
+
+    # two[j]: most samples right with one threshold somewhere below cut j
+    first = running[:, :, None] - running[:, None, :]
+    two = (np.maximum.accumulate(first, axis=0) + running[:, None, :]).max(axis=(1, 2))
+    j = int(np.argmax(two + (end - running).max(axis=1)))
+    i = int(np.argmax(running[: j + 1].max(axis=1) + (running[j] - running[: j + 1]).max(axis=1)))
+
+    edges = np.concatenate([[values[0] - 0.5], (values[1:] + values[:-1]) / 2, [values[-1] + 0.5]])
+    parts = np.stack([running[i], running[j] - running[i], end - running[j]])
+    # the lower intervals may be empty (the upper never is, at the smallest best cut): a total
+    # below all those seen then votes with its neighbour
+    for k in (1, 0):
+        if not parts[k].any():
+            parts[k] = parts[k + 1]
+    return float(edges[i]), float(edges[j]), parts
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A fitted multinomial logistic regression.
+
+    Attributes:
+        weights: (features + 1, 3), the first row is the offset.
+        mean, scale: (features,), by which features are standardised.
+        iterations: that it took.
+    """
+
+    weights: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+    iterations: int
+
+    def scores(self, features: FloatArray) -> FloatArray:
+        """Log-odds (n, 3) up to a constant a row."""
+        return np.asarray(_standard(features, self.mean, self.scale) @ self.weights)
+
+
+def fit_logistic(features: FloatArray, labels: IntArray) -> Logistic:
+    """Multinomial logistic regression on standardised features, by L-BFGS from zero.
+
+    Minimises mean cross-entropy + `RIDGE` / 2 times the squared weights (not the offsets); the
+    problem is convex and the start fixed, so the result repeats.
+
+    Args:
+        features: (n, features).
+        labels: integer (n,), 0..2.
+    """
+    mean, spread = features.mean(axis=0), features.std(axis=0)
+    scale = np.where(spread > 0, spread, 1.0)
+    x = _standard(features, mean, scale)
+    target = np.eye(len(CLASSES))[labels]
+    shape = (x.shape[1], len(CLASSES))
+    penalty = np.full(shape, RIDGE)
+    penalty[0] = 0.0
+
+    def objective(flat: FloatArray) -> tuple[float, FloatArray]:
+        w = flat.reshape(shape)
+        log_p = log_softmax(x @ w, axis=1)
+        loss = -(target * log_p).sum() / len(x) + 0.5 * (penalty * w * w).sum()
+        gradient = x.T @ (np.exp(log_p) - target) / len(x) + penalty * w
+        return float(loss), gradient.ravel()
+
+    # sums over threads come out otherwise on another number of them, and waiting costs the most
+    with threadpool_limits(1):
+        found = minimize(objective, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B")
+    return Logistic(np.asarray(found.x).reshape(shape), mean, scale, int(found.nit))
+
+
+def _of_total(totals: FloatArray) -> FloatArray:
+    return np.stack([totals, np.log1p(totals)], axis=1)
+
+
+def _standard(features: FloatArray, mean: FloatArray, scale: FloatArray) -> FloatArray:
+    return np.concatenate([np.ones((len(features), 1)), (features - mean) / scale], axis=1)

@@ -1,0 +1,190 @@
+"""What a model is, was made of and is worth, on one page: for whoever meets the file without us."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.metrics.classification import CLASSES, class_balance, score
+from sliplab.analysis.networks.activity import Activity
+from sliplab.analysis.networks.training import Fitted
+
+FORMAT = "sliplab-model-card-1"
+FEW_TRIALS = 10
+"""Test trials below which a figure is little more than an anecdote."""
+
+
+@dataclass(frozen=True)
+class SplitResult:
+    """The network's spike counts, int64 (n, 3), and the labels (n,), of one split's samples."""
+
+    counts: npt.NDArray[np.int64]
+    labels: npt.NDArray[np.int64]
+    trials: int
+
+
+def model_card(
+    fitted: Fitted,
+    file: Mapping[str, Any],
+    data: Mapping[str, Any],
+    splits: Mapping[str, SplitResult],
+    spikes: Activity,
+    detection: Mapping[str, Any],
+    versions: Mapping[str, str],
+    margin: float,
+) -> dict[str, Any]:
+    """The card as JSON data.
+
+    Args:
+        file: name and checksum of the model file.
+        data: where the samples are from: ``simulated``, ``made_from_these_data``, ``campaigns``.
+        splits: results by split.
+        spikes: over the windows of the test split.
+        detection: latency by experiment, over whole test trials.
+        margin: of the margin accuracy, mean spikes.
+    """
+    record = fitted.chosen
+    figures = {
+        name: {
+            "trials": part.trials,
+            "samples": len(part.labels),
+            "balance": class_balance(part.labels),
+            **score(part.counts, part.labels, margin).as_dict(),
+        }
+        for name, part in splits.items()
+    }
+    return {
+        "format": FORMAT,
+        "simulated": data["simulated"],
+        "model": {
+            **file,
+            "seed": fitted.seed,
+            "parameters": int(sum(w.numel() for w in fitted.state_dict.values())),
+            "network": fitted.network.model_dump(mode="json"),
+            "windows": fitted.windows.model_dump(mode="json"),
+            "training": fitted.training.model_dump(mode="json"),
+            "epochs": len(fitted.history),
+            "chosen_epoch": fitted.chosen_epoch,
+            "rates_in_training": dict(record.rates),
+        },
+        "data": dict(data),
+        "figures": figures,
+        "margin": margin,
+        "activity": spikes.as_json(),
+        "detection": dict(detection),
+        "versions": dict(versions),
+        "warnings": _warnings(fitted, data, splits),
+    }
+
+
+def _warnings(
+    fitted: Fitted, data: Mapping[str, Any], splits: Mapping[str, SplitResult]
+) -> list[str]:
+    found = list(fitted.warnings)
+    if data["simulated"]:
+        found.append("the data are simulated: the figures say nothing about a real sensor")
+    if not data["made_from_these_data"]:
+        found.append(
+            "the store's data and settings are not those that the model was trained on: "
+            "its figures for 'train' and 'validation' may be those of unseen data, and its figures "
+            "for 'test' those of data it was trained on"
+        )
+    test = splits.get("test")
+    if test is None or test.trials < FEW_TRIALS:
+        trials = 0 if test is None else test.trials
+        found.append(f"only {trials} test trials of the training campaigns")
+    return found
+
+
+def card_markdown(card: Mapping[str, Any]) -> str:
+    """The card for people."""
+    model, data, simulated = card["model"], card["data"], card["simulated"]
+    said = " (simulated)" if simulated else ""
+    text = [f"# {model['file']}{said}", ""]
+    text.append(
+        f"Spiking network, {model['parameters']:,} weights, seed {model['seed']}, epoch "
+        f"{model['chosen_epoch']} of {model['epochs']}. SHA-256 `{model['sha256']}`."
+    )
+    if card["warnings"]:
+        text += ["", "## Warnings", "", *(f"- {warning}" for warning in card["warnings"])]
+    text += ["", f"## Data{said}", ""]
+    text += table(
+        ["campaign", "experiment", "collection", "analysis", "rig", "train", "validation", "test"],
+        [
+            [
+                item["name"], item["experiment"], f"`{item['collection_hash'][:12]}`",
+                f"`{item['analysis_hash'][:12]}`", item["rig"],
+                *(item["trials"].get(split, 0) for split in ("train", "validation", "test")),
+            ]
+            for item in data["campaigns"]
+        ],
+    )  # fmt: skip
+    text += ["", f"## Accuracy over windows{said}", ""]
+    names = [name.replace("_", " ") for name in CLASSES]
+    text += table(
+        ["split", "trials", "windows", "strict", f"margin {card['margin']:g}", "argmax"]
+        + [f"recall {name}" for name in names],
+        [
+            [split, part["trials"], part["samples"]]
+            + [percent(part["accuracy"][kind]) for kind in ("strict", "margin", "argmax")]
+            + [percent(part["recall"][name]) for name in CLASSES]
+            for split, part in card["figures"].items()
+        ],
+    )
+    text += ["", "Strict: only a unique winner counts. Argmax shares ties."]
+    text += ["", f"## Detection over whole test trials{said}", ""]
+    text += latency_table(card["detection"])
+    spikes = card["activity"]
+    text += ["", f"## Spikes and operations a window{said}", ""]
+    text += table(
+        ["layer", "spikes per neuron and step", "synaptic operations", "multiply-adds if dense"],
+        [
+            [f"{weighted} + {spiking}", f"{rate:.4f}", f"{operations:,.0f}", f"{dense:,}"]
+            for (spiking, rate), (weighted, operations), dense in zip(
+                spikes["rates"].items(),
+                list(spikes["synaptic_operations"].items())[:-1],
+                list(spikes["dense_multiply_adds"].values())[:-1],
+                strict=True,
+            )
+        ],
+    )
+    text += [
+        "",
+        f"All: {spikes['synaptic_operations']['all']:,.0f} synaptic operations, "
+        f"{percent(spikes['share_of_dense'])} of the dense ones; "
+        f"{spikes['events_a_window']:.0f} events a window.",
+    ]
+    text += ["", "## Versions", "", ", ".join(f"{k} {v}" for k, v in card["versions"].items())]
+    return "\n".join(text) + "\n"
+
+
+def latency_table(detection: Mapping[str, Any]) -> list[str]:
+    """Latency by experiment and onset."""
+    rows: list[list[object]] = []
+    for experiment, found in detection.items():
+        for onset, values in found["latency_ms"].items():
+            times = [ms(values[name]) for name in ("mean", "median", "max")]
+            lost = [values[name] for name in ("missed", "late", "false_early")]
+            rows.append([experiment, onset, found["trials"], *times, *lost])
+    columns = ["experiment", "onset", "trials", "mean ms", "median ms", "most ms"]
+    return table([*columns, "missed", "late", "false early"], rows)
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Lines of a Markdown table."""
+    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
+    return lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
+
+
+def percent(share: float | None) -> str:
+    """``94.3 %``; a dash where there is none."""
+    return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def ms(value: float | None) -> str:
+    """Milliseconds; a dash where there are none."""
+    return "-" if value is None else f"{value:.0f}"

@@ -1,0 +1,222 @@
+"""Whether the network fits a Speck (DynapCNN) chip, layer by layer, without the chip.
+
+The vendor's compiler lives in a package that this program never imports (docs/decisions/0009), so
+the rules stand here as a table with their sources:
+
+- cores and their memories: Sinabs 3.1.3, "Available Network Architecture" (its documentation,
+  speck/faqs/available_network_arch) and the table in its `validate_memory_speck.py`;
+- what a layer may be (kernel, stride, padding, features, sizes, bits, destinations): the vendor's
+  page of the Speck 2e (samna's documentation, models/speckSeries/speck2e), and of the 2b before.
+
+A fully connected layer is mapped as a convolution whose kernel covers its whole input.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.protocols.settings import Network, Windows
+
+KI = 1024
+
+
+@dataclass(frozen=True)
+class Core:
+    """One core of the chip; memories in words."""
+
+    number: int
+    kernel_words: int
+    neuron_words: int
+
+
+CORES = tuple(
+    Core(number, kernel * KI, neuron * KI)
+    for numbers, kernel, neuron in (
+        ((0, 1, 2), 16, 64),
+        ((3, 4), 32, 32),
+        ((5, 6), 64, 16),
+        ((7, 8), 16, 16),
+    )
+    for number in numbers
+)
+MOST_KERNEL = 16
+MOST_FEATURES = 1024
+MOST_INPUT = 128
+MOST_OUTPUT = 64
+STRIDES = (1, 2, 4, 8)
+MOST_PADDING = 7
+DESTINATIONS = 2
+"""Cores that one core may send to."""
+WEIGHT_BITS, STATE_BITS = 8, 16
+
+
+@dataclass(frozen=True)
+class SpeckLayer:
+    """One layer of weights and the neurons behind it, as the chip sees it.
+
+    Attributes:
+        weights: that there are; the memory rounds up to powers of two.
+        kernel_words, neuron_words: memory that the layer takes.
+        fan_in: synapses of one neuron.
+        fan_out: neurons that one input spike reaches at most.
+    """
+
+    name: str
+    in_channels: int
+    in_side: int
+    out_channels: int
+    out_side: int
+    kernel: int
+    stride: int
+    padding: int
+    weights: int
+    neurons: int
+    kernel_words: int
+    neuron_words: int
+    fan_in: int
+    fan_out: int
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What no core of the chip can do."""
+        found = []
+        for what, value, most in (
+            ("kernel", self.kernel, MOST_KERNEL),
+            ("input features", self.in_channels, MOST_FEATURES),
+            ("output features", self.out_channels, MOST_FEATURES),
+            ("input side", self.in_side, MOST_INPUT),
+            ("output side", self.out_side, MOST_OUTPUT),
+            ("padding", self.padding, MOST_PADDING),
+        ):
+            if value > most:
+                found.append(f"{self.name}: {what} is {value}, at most {most}")
+        if self.stride not in STRIDES:
+            found.append(f"{self.name}: stride is {self.stride}, one of {STRIDES}")
+        if not any(self.fits(core) for core in CORES):
+            found.append(
+                f"{self.name}: needs {self.kernel_words / KI:g} Ki of kernel memory and "
+                f"{self.neuron_words / KI:g} Ki of neuron memory; no core has both"
+            )
+        return tuple(found)
+
+    def fits(self, core: Core) -> bool:
+        """Whether its memories are enough."""
+        return self.kernel_words <= core.kernel_words and self.neuron_words <= core.neuron_words
+
+
+@dataclass(frozen=True)
+class SpeckFit:
+    """The layers, and the core of each.
+
+    Attributes:
+        cores: layer to number of its core; empty where they do not all fit.
+        problems: why not.
+    """
+
+    layers: tuple[SpeckLayer, ...]
+    cores: dict[str, int]
+    problems: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the whole network goes onto one chip."""
+        return not self.problems
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data: limits, layers with their cores, problems."""
+        by_number = {core.number: core for core in CORES}
+        layers = []
+        for place, layer in enumerate(self.layers):
+            number = self.cores.get(layer.name)
+            following = self.layers[place + 1 : place + 2]
+            layers.append(
+                {
+                    **asdict(layer),
+                    "core": number,
+                    "core_kernel_words": None if number is None else by_number[number].kernel_words,
+                    "core_neuron_words": None if number is None else by_number[number].neuron_words,
+                    "destinations": [self.cores[next_.name] for next_ in following if self.cores],
+                }
+            )
+        return {
+            "fits": self.fits,
+            "problems": list(self.problems),
+            "layers": layers,
+            "limits": {
+                "cores": [asdict(core) for core in CORES],
+                "kernel": MOST_KERNEL,
+                "features": MOST_FEATURES,
+                "input_side": MOST_INPUT,
+                "output_side": MOST_OUTPUT,
+                "padding": MOST_PADDING,
+                "strides": list(STRIDES),
+                "destinations_of_a_core": DESTINATIONS,
+                "weight_bits": WEIGHT_BITS,
+                "state_bits": STATE_BITS,
+            },
+        }
+
+
+def speck_fit(network: Network, windows: Windows) -> SpeckFit:
+    """Lay a network out on the chip."""
+    side = -(-windows.cells // 2)
+    layers = (
+        _layer(
+            "conv1", windows.channels, windows.cells, network.conv1_channels,
+            network.conv1_kernel, 1, network.conv1_kernel // 2,
+        ),
+        _layer(
+            "conv2", network.conv1_channels, windows.cells, network.conv2_channels,
+            network.conv2_kernel, 2, network.conv2_kernel // 2,
+        ),
+        _layer("fc1", network.conv2_channels, side, network.hidden, side, 1, 0),
+        _layer("fc2", network.hidden, 1, len(CLASSES) * network.outputs_per_class, 1, 1, 0),
+    )  # fmt: skip
+    problems = [problem for layer in layers for problem in layer.problems]
+    cores = _assign(layers)
+    if not problems and len(cores) < len(layers):
+        problems.append("each layer fits a core, but there are not enough of the cores needed")
+    return SpeckFit(layers, {} if problems else cores, tuple(problems))
+
+
+def _layer(
+    name: str, in_channels: int, in_side: int, out_channels: int, kernel: int, stride: int,
+    padding: int,
+) -> SpeckLayer:  # fmt: skip
+    out_side = (in_side - kernel + 2 * padding) // stride + 1
+    reach = min(-(-kernel // stride), out_side)
+    return SpeckLayer(
+        name, in_channels, in_side, out_channels, out_side, kernel, stride, padding,
+        weights=in_channels * kernel**2 * out_channels,
+        neurons=out_channels * out_side**2,
+        kernel_words=in_channels << _bits(kernel**2) + _bits(out_channels),
+        neuron_words=out_channels << 2 * _bits(out_side),
+        fan_in=in_channels * kernel**2,
+        fan_out=out_channels * reach**2,
+    )  # fmt: skip
+
+
+def _bits(count: int) -> int:
+    """Address bits for so many things: the memory is addressed by whole bits."""
+    return (count - 1).bit_length()
+
+
+def _assign(layers: tuple[SpeckLayer, ...]) -> dict[str, int]:
+    """A core of its own for each layer, as many as there can be (augmenting paths)."""
+    taken: dict[int, SpeckLayer] = {}
+
+    def place(layer: SpeckLayer, seen: set[int]) -> bool:
+        for core in CORES:
+            if core.number in seen or not layer.fits(core):
+                continue
+            seen.add(core.number)
+            if core.number not in taken or place(taken[core.number], seen):
+                taken[core.number] = layer
+                return True
+        return False
+
+    for layer in layers:
+        place(layer, set())
+    return {layer.name: number for number, layer in taken.items()}

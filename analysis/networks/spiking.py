@@ -1,0 +1,313 @@
+"""The same network, many times faster than step by step: spike counts equal to Sinabs' own.
+
+`networks.network` says what the network is; here its weights are packed for the event-driven
+kernels. Equality is not luck: trained weights lie on a grid (`networks.network.on_grid`), so
+every current is exact in float32 in whatever order it is summed, and a neuron's potential is summed
+in the one order that there is, that of time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from sinabs.activation import MembraneReset, SingleExponential, SingleSpike
+from torch import nn
+
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks import spiking_gradients, spiking_kernels
+from sliplab.analysis.networks.network import SPIKING, matrices
+from sliplab.analysis.networks.spiking_layout import Layout
+from sliplab.analysis.windows.sparse import SparseWindows
+
+F32 = npt.NDArray[np.float32]
+I64 = npt.NDArray[np.int64]
+Samples = SparseWindows | npt.NDArray[np.uint8]
+
+CHUNK = 64
+"""Windows that a thread counts at a time."""
+
+
+class Engine:
+    """Spike counts of one network, with the weights that it has now.
+
+    Args:
+        net: from `analysis.networks.network.build`; neither used nor changed afterwards.
+        cells: along a sample's side.
+
+    Raises:
+        TypeError: it holds a neuron that the kernels do not compute.
+    """
+
+    def __init__(self, net: nn.Sequential, cells: int) -> None:
+        self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
+        self.threshold, _, _ = neuron(net)
+        weights = matrices(net)
+        self._layout = Layout(tuple(w.shape for w in weights), cells)
+        self._layers = self._layout.layers(weights)
+        self.shape = (self.steps, weights[0].shape[1], cells, cells)
+        self._idle: list[tuple[Any, Any]] = []
+
+    def counts(self, x: Samples, threads: int | None = None) -> I64:
+        """Output spikes int64 (n, 3) of samples, each from rest; see `spikes`."""
+        return self.spikes(x, threads)[0]
+
+    def spikes(self, x: Samples, threads: int | None = None) -> tuple[I64, I64]:
+        """Output spikes of samples, each from rest, and how often each layer fired.
+
+        Args:
+            x: (n, steps, channels, cells, cells), dense uint8 or sparse.
+            threads: those of torch by default; the result does not depend on it.
+
+        Returns:
+            int64 (n, 3) in the order of `metrics.classification.CLASSES`, and int64 (n, 4).
+
+        Raises:
+            ValueError: samples of another shape, or not uint8.
+        """
+        x = self.sparse(x)
+        out = np.zeros((len(x), len(CLASSES)), np.int64)
+        fired = np.zeros((len(x), len(SPIKING)), np.int64)
+
+        def some(begin: int) -> None:
+            state, scratch = self._borrow()
+            spiking_kernels.windows(
+                x.cell, x.count, x.offsets, begin, min(begin + CHUNK, len(x)), self.steps,
+                self._layers, self.threshold, self._layout.rest, state, scratch, out, fired,
+            )  # fmt: skip
+            self._idle.append((state, scratch))
+
+        side_by_side(some, range(0, len(x), CHUNK), threads)
+        return out, fired
+
+    def stream(self) -> Stream:
+        """The network step by step, from rest."""
+        return Stream(self)
+
+    def sparse(self, x: Samples) -> SparseWindows:
+        """The samples as the kernels read them.
+
+        Raises:
+            ValueError: another shape, or not uint8.
+        """
+        if not isinstance(x, SparseWindows):
+            if x.shape[1:] != self.shape:
+                expected = ", ".join(map(str, self.shape))
+                raise ValueError(f"samples have the shape {x.shape}; expected (n, {expected})")
+            x = SparseWindows.of(x)
+        if x.shape != self.shape:
+            raise ValueError(f"samples have the shape {x.shape}; expected {self.shape}")
+        return x
+
+    def _borrow(self) -> tuple[Any, Any]:
+        """Memory for one thread, to be put back into `_idle`."""
+        try:
+            return self._idle.pop()
+        except IndexError:
+            return self._layout.state(), self._layout.scratch()
+
+
+class Stream:
+    """A network that is given one step after the other, and keeps its potentials."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._state = engine._layout.state()
+        self._scratch = engine._layout.scratch()
+        self._fired = np.zeros(len(SPIKING), np.int64)
+
+    def push(self, plane: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The next step's counts (channels, cells, cells): output spikes by class, uint8 (3,).
+
+        Raises:
+            ValueError: another shape, or not uint8.
+        """
+        engine = self._engine
+        if plane.shape != engine.shape[1:] or plane.dtype != np.uint8:
+            raise ValueError(f"a step is {plane.dtype} {plane.shape}; uint8 {engine.shape[1:]}")
+        cell = np.flatnonzero(plane).astype(np.uint32)
+        n = spiking_kernels.step(
+            cell, plane.ravel()[cell], 0, len(cell), engine._layers, engine.threshold,
+            self._state, self._scratch, self._fired,
+        )  # fmt: skip
+        classes = self._scratch[1][-1][:n] % np.uint64(len(CLASSES))
+        return np.bincount(classes.astype(np.int64), minlength=len(CLASSES)).astype(np.uint8)
+
+    def reset(self) -> None:
+        """Back to rest."""
+        for state, rest in zip(self._state, self._engine._layout.rest, strict=True):
+            state[:] = rest
+
+
+class WindowLoss(torch.autograd.Function):
+    """The loss of a few windows as a function of the weights, for training with torch.
+
+    The sum of the cross-entropies of their output spike counts times the job's gain. The gradient
+    is computed with it.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, job: Job, *weights: torch.Tensor) -> torch.Tensor:
+        """Float64 (); `weights` are the trainer's `leaves`."""
+        ctx.job = job
+        return torch.tensor(job.run(), dtype=torch.float64)
+
+    @staticmethod
+    def backward(ctx: Any, by_loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Surrogate gradients by the weights."""
+        factor = float(by_loss)
+        grads = map(torch.from_numpy, ctx.job.grads)
+        return None, *(grads if factor == 1.0 else (grad * factor for grad in grads))
+
+
+class Job:
+    """A few windows through a network and back.
+
+    Args:
+        trainer: the network.
+        windows: samples; `rows` of them are meant.
+        rows: int64 (n,).
+        labels: classes int64 (n,) of these rows.
+        gain: what a spike counts in the cross-entropy.
+
+    Attributes:
+        counts: output spikes int64 (n, 3), when it was run.
+        grads: float32, gradients by the packed weights.
+    """
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        windows: SparseWindows,
+        rows: I64,
+        labels: I64,
+        gain: float = 1.0,
+    ) -> None:
+        self._gain = gain
+        self._trainer, self._windows, self._rows, self._labels = trainer, windows, rows, labels
+        self._fired = np.zeros(len(SPIKING), np.int64)
+        self.counts = np.zeros((len(rows), len(CLASSES)), np.int64)
+        self.grads = tuple(np.zeros_like(w) for w in trainer.layers[1])
+
+    def run(self) -> float:
+        """The summed loss; once."""
+        trainer, x = self._trainer, self._windows
+        memory = trainer.borrow()
+        loss = spiking_gradients.windows_loss(
+            x.cell, x.count, x.offsets, self._rows, self._labels, self._gain, trainer.steps,
+            trainer.layers, trainer.layout.spans, trainer.back, trainer.constants,
+            trainer.layout.rest, memory[:4], trainer.layout.neurons[-1], memory[4], self.counts,
+            self._fired, self.grads,
+        )  # fmt: skip
+        trainer.give_back(memory)
+        return float(loss)
+
+    def rates(self) -> dict[str, float]:
+        """Mean spikes per neuron and step of each spiking layer, by name, when it was run."""
+        steps = self._trainer.steps * len(self._rows)
+        return {
+            name: int(self._fired[k]) / (steps * self._trainer.layout.neurons[k])
+            for k, name in enumerate(SPIKING)
+        }
+
+
+class Trainer:
+    """A network's packed weights and memory, for `Job`s in several threads."""
+
+    def __init__(self, net: nn.Sequential, cells: int) -> None:
+        self.steps = int(_layer(net, SPIKING[0]).num_timesteps)
+        self.constants = neuron(net)
+        self.layout = Layout(tuple(w.shape for w in matrices(net)), cells)
+        self._idle: list[Any] = []
+        self.take(matrices(net))
+
+    def take(self, weights: list[F32]) -> None:
+        """Use these weights from now on."""
+        self.layers = self.layout.layers(weights)
+        self.back = self.layout.back(weights)
+        self.leaves = tuple(torch.from_numpy(w).requires_grad_() for w in self.layers[1])
+        """The packed weights, by which `WindowLoss` is differentiated."""
+
+    def borrow(self) -> tuple[Any, Any, Any, Any, F32]:
+        """State, scratch, kept, planes and a padded row for one thread.
+
+        Kept are, of each layer and for one window: potentials float32 (steps, neurons), spikes
+        uint64 and where each step's end, uint64 (steps + 1,).
+        """
+        try:
+            return self._idle.pop()
+        except IndexError:
+            layout = self.layout
+            sizes = [len(rest) for rest in layout.rest]
+            one, two = (table.target for table in layout.tables[:2])
+            above = [table.target.places for table in layout.tables[1:]]
+            kernel = layout.shapes[1][2]
+            kept = (
+                tuple(np.empty((self.steps, size), np.float32) for size in sizes),
+                tuple(np.empty(self.steps * size, np.uint64) for size in sizes),
+                tuple(np.empty(self.steps + 1, np.uint64) for size in sizes),
+            )
+            planes = (
+                tuple(np.zeros((self.steps, places), np.float32) for places in above),
+                np.zeros(max(sizes), np.float32),
+                np.zeros(sizes[0], np.float32),
+                np.zeros((two.full**2, one.depth * kernel * kernel), np.float32),
+            )
+            row = np.zeros(above[-1], np.float32)
+            return layout.state(), layout.scratch(), kept, planes, row
+
+    def give_back(self, memory: tuple[Any, Any, Any, Any, F32]) -> None:
+        """For the next to borrow."""
+        self._idle.append(memory)
+
+
+def side_by_side(
+    work: Callable[[int], None], items: Iterable[int], threads: int | None = None
+) -> None:
+    """Do all of the work, in as many threads as torch may use or as are given."""
+    items = list(items)
+    count = min(threads or torch.get_num_threads(), len(items))
+    if count <= 1:
+        for item in items:
+            work(item)
+        return
+    with ThreadPoolExecutor(count) as pool:
+        for _ in pool.map(work, items):
+            pass
+
+
+def neuron(net: nn.Sequential) -> tuple[np.float32, np.float32, np.float32]:
+    """Threshold, width and scale of a network's neurons.
+
+    Raises:
+        TypeError: they are not the paper's, or not all alike.
+    """
+    found = {_constants(name, _layer(net, name)) for name in SPIKING}
+    if len(found) > 1:
+        raise TypeError(f"neurons differ: (threshold, width, scale) are {sorted(found)}")
+    threshold, width, scale = found.pop()
+    return np.float32(threshold), np.float32(width), np.float32(scale)
+
+
+def _layer(net: nn.Sequential, name: str) -> Any:
+    return getattr(net, name)
+
+
+def _constants(name: str, layer: Any) -> tuple[float, float, float]:
+    surrogate = layer.surrogate_grad_fn
+    if not (
+        layer.spike_fn is SingleSpike
+        and layer.reset_fn == MembraneReset(0.0)
+        and type(surrogate) is SingleExponential
+        and layer.min_v_mem is None
+        and layer.tau_syn is None
+    ):
+        raise TypeError(f"{name}: the kernels compute only single spikes with reset to zero")
+    threshold = float(layer.spike_threshold.detach())
+    if not threshold > 0:
+        raise TypeError(f"{name}: threshold {threshold}; the kernels need a positive one")
+    return threshold, threshold * surrogate.grad_width, surrogate.grad_scale

@@ -1,0 +1,134 @@
+"""The detector's trade-off at a glance: every detector as a point, and each factor as a line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, NullLocator
+
+from sliplab.analysis.report.figure_style import BLUE, GREY, ORANGE, STYLE, svg_text
+
+
+@dataclass(frozen=True)
+class Point:
+    """A detector.
+
+    Attributes:
+        values: its figures by name; None where it has none.
+        front: whether it is on the front; paper: whether it is the paper's.
+    """
+
+    values: Mapping[str, float | None]
+    front: bool
+    paper: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Two figures against each other, by name, and what their axes are called."""
+
+    x: str
+    y: str
+    x_name: str
+    y_name: str
+    log_x: bool = False
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A value of a factor: mean, lowest and highest over seeds of each figure by name."""
+
+    value: str
+    paper: bool
+    spread: Mapping[str, tuple[float, float, float] | None]
+
+
+def front_panels(points: Sequence[Point], panels: Sequence[Panel], *, simulated: bool) -> str:
+    """A scatter for each panel, two a row: the front above all others, the paper's point marked.
+
+    A point without one of the two figures is not drawn.
+    """
+    with plt.rc_context(STYLE):
+        rows = -(-len(panels) // 2)
+        figure, grid = plt.subplots(rows, 2, figsize=(8.4, 2.9 * rows + 0.4), squeeze=False)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes, panel in zip(grid.flat, panels, strict=False):
+            _points(axes, points, panel)
+            axes.set(xlabel=panel.x_name, ylabel=panel.y_name)
+            if panel.log_x:
+                axes.set_xscale("log")
+                axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.xaxis.set_major_formatter("{x:g}")
+                axes.xaxis.set_minor_locator(NullLocator())
+            axes.margins(0.06)
+        handles, names = grid.flat[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def _points(axes: Any, points: Sequence[Point], panel: Panel) -> None:
+    kinds = (
+        ("another is nowhere worse and somewhere better", False, GREY, "o", 3, 1, 0.5),
+        ("on the front", True, BLUE, "o", 4.5, 2, 0.85),
+    )
+    drawn = [
+        (point, point.values[panel.x], point.values[panel.y])
+        for point in points
+        if point.values[panel.x] is not None and point.values[panel.y] is not None
+    ]
+    for name, front, colour, mark, size, above, alpha in kinds:
+        ours = [(x, y) for point, x, y in drawn if point.front == front]
+        axes.plot(
+            [x for x, _ in ours], [y for _, y in ours], mark, ms=size, mew=0,
+            color=colour, alpha=alpha, zorder=above, label=name,
+        )  # fmt: skip
+    ours = [(x, y) for point, x, y in drawn if point.paper]
+    axes.plot(
+        [x for x, _ in ours], [y for _, y in ours], "*", ms=13, mec="black", mew=0.7,
+        color=ORANGE, zorder=3, label="the paper's",
+    )  # fmt: skip
+
+
+def factor_lines(
+    factors: Mapping[str, Sequence[Bar]], figures: Mapping[str, str], *, simulated: bool
+) -> str:
+    """A column for each factor, a row for each figure: mean over seeds, lowest to highest.
+
+    Args:
+        factors: title to values in order.
+        figures: name in `Bar.spread` to the name of the axis.
+    """
+    with plt.rc_context(STYLE):
+        widths = [max(2, len(bars)) for bars in factors.values()]
+        figure, grid = plt.subplots(
+            len(figures), len(factors), figsize=(9.6, 1.9 * len(figures) + 0.5), sharey="row",
+            squeeze=False, width_ratios=widths,
+        )  # fmt: skip
+        for row, (key, name) in zip(grid, figures.items(), strict=True):
+            row[0].set_ylabel(name)
+            for axes, bars in zip(row, factors.values(), strict=True):
+                _line(axes, bars, key)
+        for axes, title in zip(grid[-1], factors, strict=True):
+            axes.set_xlabel(title, fontsize=8)
+        return svg_text(figure, simulated)
+
+
+def _line(axes: Any, bars: Sequence[Bar], key: str) -> None:
+    there = [(k, bar, bar.spread[key]) for k, bar in enumerate(bars)]
+    known = [(k, bar, spread) for k, bar, spread in there if spread is not None]
+    axes.plot([k for k, _, _ in known], [s[0] for _, _, s in known], lw=0.8, color=BLUE, alpha=0.5)
+    for k, bar, (mean, low, high) in known:
+        axes.plot([k, k], [low, high], lw=1.6, color=BLUE)
+        colour, mark, size = (ORANGE, "*", 11) if bar.paper else (BLUE, "o", 4)
+        edge = "black" if bar.paper else BLUE
+        axes.plot([k], [mean], mark, ms=size, color=colour, mec=edge, mew=0.6)
+    turned = 40 if any(len(bar.value) > 3 for bar in bars) else 0
+    axes.set_xticks(
+        range(len(bars)), [bar.value for bar in bars], fontsize=7, rotation=turned,
+        ha="right" if turned else "center",
+    )  # fmt: skip
+    axes.set_xlim(-0.6, len(bars) - 0.4)

@@ -1,0 +1,1 @@
+"""Speed against error over a grid of settings."""

@@ -1,0 +1,1 @@
+"""Windows of events: how they are cut, stored and chosen."""

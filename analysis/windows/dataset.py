@@ -1,0 +1,173 @@
+"""From labelled recordings to samples: windows chosen by the 50/50/50 rule and binned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.analysis.windows.samples import choose_windows, consecutive_windows
+from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.analysis.windows.windows import list_events
+from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.array_file import Arrays, map_arrays, write_arrays
+from sliplab.storage.recording import Recording
+
+VERSION = 1
+
+
+class TrialId(NamedTuple):
+    """A trial of a store; campaigns may have trials of the same id."""
+
+    campaign: str
+    trial: str
+
+
+@dataclass(frozen=True)
+class SampleSet:
+    """Samples of some trials.
+
+    Attributes:
+        windows: event counts (n, steps, channels, cells, cells), sparse.
+        y: int64 (n,), classes 0 no slip, 1 incipient, 2 gross.
+        trial: int64 (n,), each sample's trial by its index in `trials`.
+        start_ns: int64 (n,), start of each window on its trial's time line.
+        trials: the trials, each once; one may have no samples.
+    """
+
+    windows: SparseWindows
+    y: npt.NDArray[np.int64]
+    trial: npt.NDArray[np.int64]
+    start_ns: npt.NDArray[np.int64]
+    trials: tuple[TrialId, ...]
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    @property
+    def x(self) -> npt.NDArray[np.uint8]:
+        """The counts, dense: 12 kB a sample of the paper's, made anew at each call."""
+        return self.windows.dense()
+
+    @staticmethod
+    def join(parts: list[SampleSet], windows: Windows) -> SampleSet:
+        """The samples of all parts in order; works for none."""
+        shape = (windows.steps, windows.channels, windows.cells, windows.cells)
+        none = np.empty(0, np.int64)
+        index: dict[TrialId, int] = {}
+        trial = [none]
+        for part in parts:
+            there = [index.setdefault(name, len(index)) for name in part.trials]
+            trial.append(np.array(there, np.int64)[part.trial])
+        return SampleSet(
+            SparseWindows.join([part.windows for part in parts], shape),
+            np.concatenate([none, *(part.y for part in parts)]),
+            np.concatenate(trial),
+            np.concatenate([none, *(part.start_ns for part in parts)]),
+            tuple(index),
+        )
+
+    def save(self, path: Path) -> None:
+        """Into one file, whole or not at all; `load` maps it into memory."""
+        windows = self.windows
+        arrays: Arrays = {
+            "shape": np.array(windows.shape, np.int64),
+            "offsets": windows.offsets,
+            "cell": windows.cell,
+            "count": windows.count,
+            "y": self.y,
+            "trial": self.trial,
+            "start_ns": self.start_ns,
+            "trials": np.array(self.trials, np.str_).reshape(-1, 2),
+        }
+        write_arrays(path, arrays)
+
+    @staticmethod
+    def load(path: Path) -> SampleSet:
+        """What `save` wrote; pages are read when they are used.
+
+        Raises:
+            OSError: there is none, or it cannot be read.
+            ValueError: it is no such file, or cut short.
+        """
+        arrays = map_arrays(path)
+        try:
+            shape = tuple(arrays["shape"].tolist())
+            windows = SparseWindows(shape, arrays["offsets"], arrays["cell"], arrays["count"])
+            trials = tuple(TrialId(*names) for names in arrays["trials"].tolist())
+            return SampleSet(windows, arrays["y"], arrays["trial"], arrays["start_ns"], trials)
+        except KeyError as error:
+            raise ValueError(f"{path}: holds no samples: {error} is missing") from error
+
+
+def cut_windows(
+    recording: Recording, starts_ns: npt.NDArray[np.int64], windows: Windows
+) -> SparseWindows:
+    """Windows that begin at times of the trial's time line.
+
+    The starts are mapped to the camera's microseconds; the events stay as they were recorded.
+    """
+    events = recording.events()
+    starts_us = np.asarray(recording.clock("events").to_device(starts_ns)) // 1000
+    width, height = recording.event_px
+    return list_events(events, starts_us, windows, width, height, crop_centre_px(recording))
+
+
+def crop_centre_px(recording: Recording) -> tuple[float, float] | None:
+    """Where the event camera saw the skin's centre, column and row; None where nobody looked."""
+    return recording.record.geometry.event_centre_px
+
+
+def recorded_span(recording: Recording) -> tuple[int, int]:
+    """Start and end of the recording on its time line, ns."""
+    recorded = [step for step in recording.record.steps if step.recorded]
+    clock = recording.clock("arm")
+    return clock.to_reference(recorded[0].start_ns), clock.to_reference(recorded[-1].end_ns)
+
+
+def trial_samples(
+    recording: Recording,
+    label: dict[str, Any],
+    trial: TrialId,
+    windows: Windows,
+    samples: Samples,
+    seed: int,
+) -> SampleSet:
+    """The samples of one trial by the paper's rule.
+
+    Args:
+        label: the trial's label (`incipient_ns`, `gross_ns`).
+        trial: what the samples carry.
+        seed: of the random windows within incipient slip.
+    """
+    start, end = recorded_span(recording)
+    chosen = choose_windows(
+        start,
+        end,
+        label["incipient_ns"],
+        label["gross_ns"],
+        windows.length_ms * 1_000_000,
+        samples.per_class,
+        seed,
+    )
+    starts = np.concatenate([chosen[key] for key in sorted(chosen)])
+    classes = np.concatenate([np.full(len(chosen[key]), key, np.int64) for key in sorted(chosen)])
+    return SampleSet(
+        cut_windows(recording, starts, windows),
+        classes,
+        np.zeros(len(starts), np.int64),
+        starts,
+        (trial,),
+    )
+
+
+def trial_windows(
+    recording: Recording, windows: Windows
+) -> tuple[SparseWindows, npt.NDArray[np.int64]]:
+    """All consecutive windows of a recording: samples, and the end of each on the time line, ns."""
+    length_ns = windows.length_ms * 1_000_000
+    starts = consecutive_windows(*recorded_span(recording), length_ns)
+    return cut_windows(recording, starts, windows), starts + length_ns

@@ -1,0 +1,126 @@
+"""The comparison on trials whose onsets are plain: fair, complete, and blind to test trials."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.detectors.detector_comparison import Parts, compare, thinned
+from sliplab.analysis.detectors.detectors import Labelled, Predictions
+from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.protocols.settings import Comparison, Detection, Windows
+
+MS = 1_000_000
+WINDOWS = Windows()
+SETTINGS = Detection(smoothing_grid=(1, 4), compare=Comparison(rates=(0.0, 0.2), train_trials=9))
+
+
+def trial(seed: int, stride: int) -> Labelled:
+    """Each millisecond's spikes and events from the state it is in; windows sum 30 of them."""
+    rng = np.random.default_rng(seed)
+    onset, gross, end = 600 + int(rng.integers(0, 90)), 1300, 2000
+    rates = np.zeros((end, 3))
+    rates[:onset], rates[onset:gross], rates[gross:] = (
+        (0.3, 0.1, 0.1),
+        (0.1, 0.3, 0.1),
+        (0.1, 0.1, 0.3),
+    )
+    fired = rng.random((end, 3)) < rates
+    sums = np.concatenate([np.zeros((1, 3), int), fired.cumsum(axis=0)])
+    ends = np.arange(30, end + 1, stride)
+    counts = sums[ends] - sums[ends - 30]
+    slip = TrueSlip(onset * MS, gross * MS, int(ends[-1] + 1) * MS)
+    return Labelled(Predictions(counts, counts.sum(axis=1), ends * MS), slip)
+
+
+def parts(validation: int = 10, test: int = 10) -> Parts:
+    return Parts(
+        [trial(k, 30) for k in range(9)],
+        [trial(100 + k, 10) for k in range(validation)],
+        [trial(200 + k, 10) for k in range(test)],
+    )
+
+
+@pytest.fixture(scope="module")
+def compared() -> dict[str, object]:
+    found = compare(parts(), WINDOWS, SETTINGS, 10, WINDOWS.steps)
+    assert found is not None
+    return found
+
+
+def test_every_detector_at_every_stride_and_rate(compared: dict) -> None:
+    assert compared["trials"] == {"train": 9, "validation": 10, "test": 10}
+    assert compared["strides_ms"] == [10, 30]
+    names = [(entry["name"], entry["stride_ms"]) for entry in compared["detectors"]]
+    assert len(names) == len(set(names)) == 16
+    assert names[0] == ("smoothing", 30)
+    for entry in compared["detectors"]:
+        assert [rate["allowed"] for rate in entry["rates"]] == [0, 2]
+        for rate in entry["rates"]:
+            early = rate["validation"]["latency_ms"]["incipient"]["false_early"]
+            assert early <= rate["allowed"]
+            for split in ("validation", "test"):
+                values = rate[split]["latency_ms"]["incipient"]
+                assert values["n"] + values["missed"] + values["false_early"] == 10
+                assert len(rate[split]["false_early_before_ms"]) == values["false_early"]
+                assert all(before > 30 for before in rate[split]["false_early_before_ms"])
+                share = rate[split]["false_early_rate"]
+                assert share["low"] <= share["value"] == values["false_early"] / 10 <= share["high"]
+    json.dumps(compared, allow_nan=False)
+
+
+def test_what_adds_up_evidence_beats_the_average_here(compared: dict) -> None:
+    late = {
+        (entry["name"], entry["stride_ms"]): entry["rates"][0]["test"]["median_with_missed_ms"]
+        for entry in compared["detectors"]
+    }
+    # independent windows of known distribution: what CUSUM and the filter are the best for
+    assert late["hmm counts", 10] < late["smoothing", 30]
+    assert late["cusum counts", 10] < late["smoothing", 30]
+
+
+def test_no_level_and_no_choice_knows_the_test_trials(compared: dict) -> None:
+    other = compare(
+        Parts(parts().train, parts().validation, [trial(900, 10)]),
+        WINDOWS,
+        SETTINGS,
+        10,
+        WINDOWS.steps,
+    )
+    assert other is not None
+    for mine, theirs in zip(compared["detectors"], other["detectors"], strict=True):
+        for a, b in zip(mine["rates"], theirs["rates"], strict=True):
+            assert (a["levels"], a["choice"], a["validation"]) == (
+                b["levels"], b["choice"], b["validation"]
+            )  # fmt: skip
+
+
+def test_one_stride_is_compared_once() -> None:
+    few = Parts(
+        parts().train,
+        *([thinned(t, 3) for t in p] for p in (parts(3, 3).validation, parts(3, 3).test)),
+    )
+    found = compare(few, WINDOWS, SETTINGS, 30, WINDOWS.steps)
+    assert found is not None
+    assert found["strides_ms"] == [30]
+    assert len(found["detectors"]) == 8
+
+
+def test_thinned_windows_are_the_consecutive_ones() -> None:
+    fine, coarse = trial(5, 10), trial(5, 30)
+    kept = thinned(fine, 3).predictions
+    assert kept.end_ns.tolist() == coarse.predictions.end_ns.tolist()
+    assert (kept.counts == coarse.predictions.counts).all()
+
+
+@pytest.mark.parametrize("missing", ["train", "validation", "test", "compare"])
+def test_nothing_to_compare(missing: str) -> None:
+    there = copy.copy(vars(parts(2, 2)))
+    if missing == "compare":
+        assert compare(Parts(**there), WINDOWS, Detection(compare=None), 10, WINDOWS.steps) is None
+        return
+    there[missing] = []
+    assert compare(Parts(**there), WINDOWS, SETTINGS, 10, WINDOWS.steps) is None

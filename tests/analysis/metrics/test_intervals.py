@@ -1,0 +1,240 @@
+"""Intervals over trials: against SciPy's, and by how often they hold what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sliplab.analysis.metrics.intervals import (
+    STATISTICS,
+    between_seeds,
+    difference,
+    drawn,
+    exact_interval,
+    interval,
+    mean_interval,
+    share_difference,
+    share_interval,
+)
+
+RNG = np.random.default_rng(7)
+LATE = RNG.gamma(4.0, 25.0, 180)
+"""As latencies are: positive and skewed."""
+SIZES = (3, 6, 12, 132)
+NOISE = 2.6 / np.sqrt(1500) * np.sqrt(0.05 * 0.95)
+"""By which a share of 95 % in 1,500 draws is off in one case of a hundred."""
+
+
+def coverage(
+    measure: Callable[[np.random.Generator], Any], truth: float, seed: int, tried: int = 1500
+) -> float:
+    """In which share of sets of trials the interval holds the truth."""
+    rng = np.random.default_rng(seed)
+    spans = [measure(rng) for _ in range(tried)]
+    return float(np.mean([low <= truth <= high for low, high in spans]))
+
+
+def as_said(found: float) -> bool:
+    """Whether a measured coverage can be one of 93 to 97 %."""
+    return 0.93 - NOISE <= found <= 0.97 + NOISE
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+def test_a_mean_is_held_as_often_as_said(kind: str, n: int) -> None:
+    def measure(rng: np.random.Generator) -> Any:
+        return interval(rng.normal(80, 20, n) if kind == "normal" else rng.gamma(4, 20, n))
+
+    assert as_said(coverage(measure, 80.0, n))
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize(("a", "b"), [(18, 2), (9, 1)])
+def test_a_share_of_windows_is_held_as_often_as_said(a: int, b: int, n: int) -> None:
+    """Trials of 100 to 200 windows, each with a share of its own."""
+
+    def measure(rng: np.random.Generator) -> Any:
+        windows = rng.integers(100, 200, n)
+        return share_interval(rng.binomial(windows, rng.beta(a, b, n)), windows)
+
+    assert as_said(coverage(measure, a / (a + b), n))
+
+
+@pytest.mark.parametrize(("statistic", "n"), [("median", 6), ("median", 12), ("median", 132),
+                                              ("p95", 72), ("p95", 132)])  # fmt: skip
+def test_a_quantile_is_held_as_often_as_said(statistic: str, n: int) -> None:
+    truth = stats.gamma.ppf({"median": 0.5, "p95": 0.95}[statistic], 4, scale=25)
+    found = coverage(lambda rng: interval(rng.gamma(4, 25, n), statistic), truth, n)
+    assert as_said(found)
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_difference_of_means_is_held_as_often_as_said(paired: bool, n: int) -> None:
+    """Every sixth trial or so has no value in one of the two sets."""
+
+    def measure(rng: np.random.Generator) -> Any:
+        shared = rng.normal(80, 20, n) * paired
+        a, b = (shared + rng.normal(0, 20, n) for _ in range(2))
+        if n > 3:
+            a[rng.random(n) < 1 / 6] = np.nan
+        found = difference(a + 10, b, paired=paired)
+        return (-np.inf, np.inf) if found is None else found
+
+    assert as_said(coverage(measure, 10.0, n))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_a_difference_of_shares_is_held_as_often_as_said(n: int) -> None:
+    def measure(rng: np.random.Generator) -> Any:
+        windows = rng.integers(100, 200, n)
+        each = rng.beta(18, 2, n)
+        a, b = rng.binomial(windows, each), rng.binomial(windows, 0.9 * each)
+        return share_difference((a, windows), (b, windows))
+
+    assert as_said(coverage(measure, 0.09, n))
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_difference_of_medians_is_held_at_least_as_often_as_said(paired: bool) -> None:
+    def measure(rng: np.random.Generator) -> Any:
+        shared = rng.gamma(3, 25, 12) * paired
+        return difference(
+            shared + rng.gamma(2, 25, 12), shared + rng.gamma(2, 25, 12), "median", paired=paired
+        )
+
+    assert coverage(measure, 0.0, 5, 250) >= 0.92
+
+
+def test_a_mean_of_few_is_students() -> None:
+    # six trials of which the audit said: 85.5 to 97.2, not 87.3 to 95.3
+    for n in SIZES:
+        values = RNG.gamma(4.0, 25.0, n)
+        known = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
+        assert interval(values) == pytest.approx(known)
+        weighed = mean_interval(values * 50, np.full(n, 50.0))
+        assert weighed == pytest.approx(known)
+
+
+def test_a_median_of_few_lies_between_the_ranks_of_scipy() -> None:
+    for n in (6, 12, 132):
+        values = np.sort(RNG.gamma(4.0, 25.0, n))
+        exact = stats.quantile_test(values, p=0.5).confidence_interval(0.95)
+        found = interval(values, "median")
+        assert found is not None
+        # no wider than whole ranks, and at most one rank narrower on either side
+        a, b = (int(np.flatnonzero(values == edge)[0]) for edge in (exact.low, exact.high))
+        assert values[a] <= found[0] <= values[a + 1]
+        assert values[b - 1] <= found[1] <= values[b]
+
+
+def test_counts_have_the_exact_interval() -> None:
+    for count, n in ((0, 8), (1, 130), (65, 130), (130, 130), (2, 3)):
+        known = stats.binomtest(count, n).proportion_ci(method="exact")
+        assert exact_interval(count, n) == pytest.approx((known.low, known.high), abs=1e-12)
+    assert exact_interval(0, 0) == (0.0, 1.0)
+
+
+def test_a_share_that_all_trials_have_alike_is_known_by_their_number() -> None:
+    windows = np.full(6, 150)
+    assert share_interval(windows, windows) == exact_interval(6, 6)
+    assert share_interval(0 * windows, windows) == exact_interval(0, 6)
+    assert share_interval(windows / 2, windows) is None
+
+
+def test_log_odds_of_many_trials_are_students() -> None:
+    windows = np.full(400, 150.0)
+    hits = RNG.binomial(150, RNG.beta(18, 2, 400))
+    found, plain = share_interval(hits, windows), mean_interval(hits, windows)
+    assert found is not None
+    assert plain is not None
+    assert found == pytest.approx(plain, abs=0.03 * (plain[1] - plain[0]))
+
+
+def test_two_sets_differ_as_welch_says() -> None:
+    for n, m in ((200, 150), (3, 5)):
+        a, b = RNG.normal(90.0, 20.0, n), RNG.normal(80.0, 30.0, m)
+        welch = stats.ttest_ind(a, b, equal_var=False).confidence_interval()
+        assert difference(a, b) == pytest.approx((welch.low, welch.high))
+
+
+def test_pairs_know_what_they_have_in_common() -> None:
+    assert difference(LATE + 30.0, LATE, paired=True) == (pytest.approx(30.0), pytest.approx(30.0))
+    other = LATE + RNG.normal(3.0, 5.0, len(LATE))
+    known = stats.ttest_rel(other, LATE).confidence_interval()
+    assert difference(other, LATE, paired=True) == pytest.approx((known.low, known.high))
+    loose = difference(other, LATE)
+    assert loose is not None
+    assert loose[0] < 0 < known.low
+    with pytest.raises(ValueError, match="no pairs"):
+        difference([1.0, 2.0], [1.0, 2.0, 3.0], paired=True)
+
+
+def test_trials_without_a_value_are_left_out_of_a_difference() -> None:
+    gaps = LATE.copy()
+    gaps[::3] = np.nan
+    found = difference(gaps, LATE, "median", paired=True)
+    assert found is not None
+    assert found[0] < np.nanmedian(gaps) - np.median(LATE) < found[1]
+    assert difference([np.nan, np.nan, 1.0], [1.0, 2.0, 3.0], paired=True) is None
+
+
+def test_too_few_trials_have_no_interval() -> None:
+    assert interval([]) is None
+    assert interval([3.0]) is None
+    assert interval([3.0, 3.0, 3.0]) is None
+    assert interval(LATE[:5], "median") is None
+    assert interval(LATE[:71], "p95") is None
+    assert difference(LATE[:11], LATE, "median") is None
+    assert difference(LATE[:71], LATE, "p95") is None
+    assert share_difference(([1.0], [2.0]), ([1.0], [2.0])) is None
+    assert share_interval([1.0], [2.0]) is None
+    assert share_interval([], []) is None
+    for bad in ([1.0, np.inf], [1.0, np.nan]):
+        with pytest.raises(ValueError, match="finite"):
+            interval(bad)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=90), st.sampled_from(["median", "p95"]))
+def test_a_quantile_s_interval_lies_within_the_values(values: list[float], statistic: str) -> None:
+    found = interval(values, statistic)
+    if found is None:
+        assert statistic == "p95"
+        assert len(values) < 72
+        return
+    middle = STATISTICS[statistic](np.array(values), axis=0)
+    slack = 1e-9 * max(1.0, *map(abs, values))
+    assert min(values) - slack <= found[0] <= middle + slack
+    assert middle - slack <= found[1] <= max(values) + slack
+
+
+def test_draws_are_the_same_at_every_call() -> None:
+    assert (drawn(9) == drawn(9)).all()
+    a, b = RNG.normal(9.0, 2.0, 20), RNG.normal(8.0, 3.0, 30)
+    assert difference(a, b, "median") == difference(a, b, "median")
+
+
+def test_shares_must_be_of_the_same_trials() -> None:
+    windows = RNG.integers(20, 150, 40).astype(float)
+    with pytest.raises(ValueError, match="same trials"):
+        share_difference((windows, windows), (windows[1:], windows[1:]))
+
+
+def test_seeds_differ_as_student_says() -> None:
+    a, b = [0.90, 0.92, 0.91], [0.93, 0.95, 0.94, 0.92]
+    known = stats.ttest_ind(a, b).confidence_interval()
+    noise = between_seeds(a, b)
+    assert noise == pytest.approx((known.high - known.low) / 2)
+    # one seed borrows the other set's spread: a prediction interval
+    one = between_seeds(a, [0.93])
+    spread = float(np.std(a, ddof=1))
+    assert one == pytest.approx(stats.t.ppf(0.975, 2) * spread * np.sqrt(1 + 1 / 3))
+    assert between_seeds([0.9], [0.8]) is None
+    assert between_seeds([], a) is None

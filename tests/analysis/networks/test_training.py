@@ -1,0 +1,364 @@
+"""Training learns, repeats to the bit, says what is wrong, and its files survive."""
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks.model_file import FORMAT, load, save
+from sliplab.analysis.networks.network import (
+    GRID,
+    WEIGHTED,
+    build,
+    exact,
+    matrices,
+    spike_counts,
+    weights,
+)
+from sliplab.analysis.networks.training import (
+    EpochRecord,
+    Fitted,
+    fit,
+    predict_counts,
+    restore,
+)
+from sliplab.protocols.settings import Network, Training, Windows
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+NETWORK = Network(conv1_channels=4, conv2_channels=4, hidden=12)
+WINDOWS = Windows(length_ms=12, crop_px=160)  # (12, 1, 8, 8)
+TRAINING = Training(
+    epochs=6, batch=16, learning_rate=1e-2, patience=6, schedule="constant", gain=1.0, mirror=False
+)
+
+
+def windows_like(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Three regimes in the manner of the real ones: noise, moving edges of discs, local bursts.
+
+    Edges and bursts have as many events, so the rate alone cannot tell them apart.
+    """
+    rng = np.random.default_rng(seed)
+    x = rng.poisson(0.02, (n, 12, 1, 8, 8)).astype(np.uint8)
+    y = np.arange(n) % 3
+    for sample, label in zip(x[:, :, 0], y, strict=True):
+        if label == metrics.INCIPIENT:  # all the while, at the right-hand edges of four discs
+            rows, columns = rng.integers(0, 8, 40), rng.choice([3, 7], 40)
+            np.add.at(sample, (rng.integers(0, 12, 40), rows, columns), 1)
+        elif label == metrics.GROSS:  # one place, a few milliseconds
+            corner = rng.integers(0, 6, 2)
+            steps = rng.integers(0, 9) + rng.integers(0, 4, 40)
+            rows, columns = (corner[:, None] + rng.integers(0, 3, (2, 40))).tolist()
+            np.add.at(sample, (steps, rows, columns), 1)
+    return x, y
+
+
+TRAIN, VAL, TEST = windows_like(150, 0), windows_like(60, 1), windows_like(90, 2)
+
+
+def run(seed: int = 0, **changes: object) -> Fitted:
+    settings = TRAINING.model_copy(update=changes)
+    return fit(*TRAIN, *VAL, NETWORK, WINDOWS, settings, seed)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fitted:
+    return run()
+
+
+def test_a_network_without_biases_learns_and_has_none(tmp_path: Path) -> None:
+    network = NETWORK.model_copy(update={"biases": False, "outputs_per_class": 1})
+    found = fit(*windows_like(600, 3), *VAL, network, WINDOWS, TRAINING, 0)
+    assert list(found.state_dict) == [f"{name}.weight" for name in WEIGHTED]
+    counts = predict_counts(found, TEST[0])
+    np.testing.assert_array_equal(counts, spike_counts(restore(found), TEST[0]))
+    score = metrics.accuracy(counts, TEST[1])
+    assert score.strict is not None
+    assert score.strict > 0.8
+    # the margin in the record is the network's: two spikes for one output neuron
+    record, val = found.chosen, predict_counts(found, VAL[0])
+    assert record.val_margin == metrics.accuracy(val, VAL[1], 2.0).margin
+    save(tmp_path / "a.pt", found)
+    assert load(tmp_path / "a.pt").network == network
+
+
+def test_every_seed_learns() -> None:
+    settings = TRAINING.model_copy(update={"epochs": 10, "patience": 10})
+    train = windows_like(600, 3)
+    for seed in range(3):
+        found = fit(*train, *VAL, NETWORK, WINDOWS, settings, seed)
+        assert not found.warnings
+        score = metrics.accuracy(predict_counts(found, TEST[0]), TEST[1])
+        assert score.strict is not None
+        assert score.strict > 0.9, (seed, [r.val_strict for r in found.history])
+
+
+def test_the_same_seed_gives_the_same_bits(fitted: Fitted) -> None:
+    again = run()
+    assert again.history == fitted.history
+    for name, value in fitted.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+    other = run(seed=1, epochs=1)
+    assert not torch.equal(other.state_dict["fc2.weight"], fitted.state_dict["fc2.weight"])
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_the_number_of_threads_changes_no_bit(fitted: Fitted, threads: int) -> None:
+    torch.set_num_threads(threads)
+    again = run()
+    assert torch.get_num_threads() == threads
+    torch.set_num_threads(1)
+    assert again.history == fitted.history
+    for name, value in fitted.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+
+
+def test_torchs_global_randomness_is_neither_used_nor_moved(fitted: Fitted) -> None:
+    torch.manual_seed(123)
+    expected = torch.rand(1)
+    torch.manual_seed(123)
+    again = run()
+    assert torch.equal(torch.rand(1), expected)
+    assert again.history == fitted.history
+
+
+def test_predictions_are_those_of_the_sinabs_network(fitted: Fitted) -> None:
+    counts = predict_counts(fitted, TEST[0])
+    assert counts.dtype == np.int64
+    np.testing.assert_array_equal(counts, spike_counts(restore(fitted), TEST[0]))
+
+
+def test_the_chosen_epoch_is_the_one_in_the_weights(fitted: Fitted) -> None:
+    found = metrics.accuracy(predict_counts(fitted, VAL[0]), VAL[1], fitted.network.margin)
+    chosen = fitted.chosen
+    assert (found.argmax, found.strict, found.margin) == (
+        chosen.val_argmax,
+        chosen.val_strict,
+        chosen.val_margin,
+    )
+    assert chosen.val_strict == max(r.val_strict for r in fitted.history)
+    assert [r.epoch for r in fitted.history] == list(range(1, len(fitted.history) + 1))
+    assert len(fitted.epoch_seconds) == len(fitted.history)
+
+
+def test_an_epoch_is_chosen_by_strict_accuracy_then_argmax_then_loss() -> None:
+    def record(strict: float, argmax: float, loss: float) -> EpochRecord:
+        return EpochRecord(1, 0.0, 0.0, loss, argmax, strict, 0.0, {})
+
+    silent = record(0.0, 1 / 3, 1.0986)
+    worse = [silent, record(0.8, 0.9, 0.1), record(0.9, 0.91, 0.1), record(0.9, 0.92, 0.3)]
+    best = record(0.9, 0.92, 0.2)
+    assert all(best.merit > other.merit for other in worse)
+
+
+def test_patience_ends_it_and_the_callback_sees_every_epoch() -> None:
+    seen: list[EpochRecord] = []
+    # so small a step changes no weight enough to change any count
+    settings = Training(epochs=50, batch=64, learning_rate=1e-12, patience=2)
+    found = fit(*TRAIN, *VAL, NETWORK, WINDOWS, settings, 0, on_epoch=seen.append)
+    assert len(found.history) == 3
+    assert found.chosen_epoch == 1
+    assert seen == list(found.history)
+
+
+def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
+    one_step = {"epochs": 1, "batch": 150}
+    parts = run(**one_step)
+    monkeypatch.setattr("sliplab.analysis.networks.training_work.MICRO_BATCH", 150)
+    whole = run(**one_step)
+    assert parts.history[0].loss == pytest.approx(whole.history[0].loss, rel=1e-6)
+    start = weights(build(NETWORK, WINDOWS, 0))
+    for name, first in start.items():
+        moved = whole.state_dict[name] - first
+        assert moved.abs().max() > 0
+        # Adam's first step is the sign of the gradient: only where that is nothing may they differ
+        differs = (parts.state_dict[name] - whole.state_dict[name]).abs() > 1e-5
+        assert differs.float().mean() < 0.01
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_a_training_goes_on_to_the_same_bits(stop: int, schedule: str) -> None:
+    """Killed after any epoch, it ends with the weights and records of an undisturbed one."""
+    states: list[bytes] = []
+    settings = TRAINING.model_copy(update={"epochs": 4, "schedule": schedule})
+    rest = (*TRAIN, *VAL, NETWORK, WINDOWS, settings, 0)
+    whole = fit(*rest, on_state=states.append)
+    told: list[EpochRecord] = []
+    again = fit(*rest, on_epoch=told.append, state=states[stop - 1])
+    assert again.history == whole.history == tuple(told)
+    assert again.chosen_epoch == whole.chosen_epoch
+    for name, value in whole.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+    assert fit(*rest, state=states[-1]).history == whole.history  # nothing was left to do
+
+
+@pytest.mark.parametrize("spoilt", [b"", b"nonsense", None])
+def test_a_damaged_state_is_refused(spoilt: bytes | None) -> None:
+    if spoilt is None:  # whole, but of another network
+        states: list[bytes] = []
+        other = Network(conv1_channels=3, conv2_channels=4, hidden=12)
+        few = TRAINING.model_copy(update={"epochs": 1})
+        fit(*TRAIN, *VAL, other, WINDOWS, few, 0, on_state=states.append)
+        spoilt = states[0]
+    with pytest.raises(ValueError, match=r"state of this training|expected"):
+        fit(*TRAIN, *VAL, NETWORK, WINDOWS, TRAINING, 0, state=spoilt)
+
+
+def test_mirrored_training_knows_slides_that_it_was_not_shown(fitted: Fitted) -> None:
+    """Edges stand on the right of every training window; here they stand on the left."""
+    x, y = TEST[0][..., ::-1], TEST[1]
+    mirrored = run(mirror=True, epochs=10, patience=10)
+    plain, both = (
+        metrics.accuracy(predict_counts(net, np.ascontiguousarray(x)), y).strict
+        for net in (fitted, mirrored)
+    )
+    assert plain is not None
+    assert both is not None
+    assert both > plain + 0.1
+    again = run(mirror=True, epochs=10, patience=10)
+    assert again.history == mirrored.history
+
+
+def test_trained_weights_lie_on_the_grid(fitted: Fitted) -> None:
+    values = matrices(restore(fitted))
+    for value, step in zip(values, GRID, strict=True):
+        assert not np.any(np.mod(value.astype(np.float64), step))
+    assert exact(values)
+
+
+def test_silent_layers_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = NETWORK.model_copy(update={"weight_scale": (1e-3, 1.0, 1.0, 1.0)})
+    settings = Training(epochs=1, batch=64, learning_rate=1e-9)
+    monkeypatch.setattr("sliplab.analysis.networks.network.FIRST_BIAS", (0.0, 0.0))
+    monkeypatch.setattr("sliplab.analysis.networks.network.FIRST_DRIVE", 0.0)
+    found = fit(*TRAIN, *VAL, network, WINDOWS, settings, 0)
+    assert [w.split()[1] for w in found.warnings] == ["iaf1", "iaf2", "iaf3", "iaf4"]
+    assert "silent" in found.warnings[0]
+    assert found.chosen.val_strict == 0.0
+    assert found.chosen.val_argmax == pytest.approx(1 / 3)
+    assert found.chosen.val_loss == pytest.approx(np.log(3))
+
+
+def test_a_saved_model_is_the_same_model(fitted: Fitted, tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    save(path, fitted)
+    again = load(path)
+    for name, value in fitted.state_dict.items():
+        assert torch.equal(again.state_dict[name], value)
+    assert (again.network, again.windows, again.training) == (NETWORK, WINDOWS, TRAINING)
+    assert (again.seed, again.history, again.chosen_epoch, again.warnings) == (
+        fitted.seed,
+        fitted.history,
+        fitted.chosen_epoch,
+        fitted.warnings,
+    )
+    np.testing.assert_array_equal(predict_counts(again, TEST[0]), predict_counts(fitted, TEST[0]))
+
+
+def test_the_same_model_gives_the_same_file(fitted: Fitted, tmp_path: Path) -> None:
+    save(tmp_path / "a.pt", fitted)
+    save(tmp_path / "b.pt", run())  # its times differ and are not in the file
+    assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "b.pt").read_bytes()
+
+
+def test_a_failed_save_leaves_the_old_file_and_no_litter(
+    fitted: Fitted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "model.pt"
+    path.write_bytes(b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("sliplab.storage.files.os.replace", fail)
+    with pytest.raises(OSError, match="no space"):
+        save(path, fitted)
+    assert [p.name for p in tmp_path.iterdir()] == ["model.pt"]
+    assert path.read_bytes() == b"old"
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return (eval, ("1/0",))
+
+
+def damaged(path: Path, kind: str, good: bytes) -> None:
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "half":
+        path.write_bytes(good[: len(good) // 2])
+    elif kind == "one bit":
+        middle = len(good) // 2
+        path.write_bytes(good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :])
+    elif kind == "not torch":
+        path.write_bytes(b"hello" * 100)
+    elif kind == "other zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("a.txt", "a")
+    elif kind == "code":
+        torch.save({"format": FORMAT, "state_dict": Bomb()}, path)
+    elif kind == "pickle":
+        path.write_bytes(pickle.dumps(Bomb()))
+    elif kind == "other format":
+        torch.save({"format": "something"}, path)
+    elif kind == "other content":
+        torch.save([1, 2], path)
+    elif kind == "key missing":
+        content = torch.load(path, weights_only=True)
+        torch.save({k: v for k, v in content.items() if k != "seed"}, path)
+    elif kind == "wrong shape":
+        content = torch.load(path, weights_only=True)
+        content["network"]["hidden"] = 13
+        torch.save(content, path)
+    else:
+        content = torch.load(path, weights_only=True)
+        content["network"]["hidden"] = -1
+        torch.save(content, path)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "empty", "half", "one bit", "not torch", "other zip", "code", "pickle", "other format",
+        "other content", "key missing", "wrong shape", "wrong setting",
+    ],
+)  # fmt: skip
+def test_a_damaged_or_foreign_file_is_refused_by_name(
+    kind: str, fitted: Fitted, tmp_path: Path
+) -> None:
+    path = tmp_path / "model.pt"
+    save(path, fitted)
+    damaged(path, kind, path.read_bytes())
+    with pytest.raises(ValueError, match=r"model\.pt: not a model file"):
+        load(path)
+
+
+def test_a_missing_file_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none.pt")
+
+
+def test_wrong_samples_are_named() -> None:
+    (x, y), rest = TRAIN, (NETWORK, WINDOWS, TRAINING, 0)
+    with pytest.raises(ValueError, match=r"training samples are float64 .*; expected uint8"):
+        fit(x.astype(float), y, *VAL, *rest)
+    with pytest.raises(ValueError, match="0 validation samples"):
+        fit(x, y, x[:0], y[:0], *rest)
+    with pytest.raises(ValueError, match="150 training samples and 149 labels"):
+        fit(x, y[1:], *VAL, *rest)
+    with pytest.raises(ValueError, match=r"expected 0\.\.2"):
+        fit(x, y + 1, *VAL, *rest)
+    with pytest.raises(ValueError, match=r"expected \(n, 12, 1, \d+, \d+\)"):
+        fit(x[:, 1:], y, *VAL, *rest)
+
+
+def test_samples_may_be_read_only() -> None:
+    x = TRAIN[0].copy()
+    x.flags.writeable = False
+    assert fit(x, TRAIN[1], *VAL, NETWORK, WINDOWS, Training(epochs=1), 0).chosen_epoch == 1
