@@ -41,7 +41,7 @@ def run_step(
 
     store = Store.open(folder)
     prepare_store(folder)
-    from sliplab.flows.running.campaigns import collected
+    from sliplab.analysis.campaigns import collected
     from sliplab.flows.running.cluster import connected
 
     campaigns = collected(store, names)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling import label_check
 from sliplab.flows.labelling.label import label
@@ -19,7 +20,6 @@ from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import report
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching.holdout import STEP, measure_holdout
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.study_searches import Search, training_windows

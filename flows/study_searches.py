@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.flows.learning.window_baselines import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import FILES
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.searching.detector_tradeoff import detector_tradeoff
 from sliplab.flows.searching.detector_tradeoff_data import Ask
 from sliplab.flows.searching.detector_tradeoff_grid import Axes

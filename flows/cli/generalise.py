@@ -42,7 +42,7 @@ def generalise(
 
     store = Store.open(folder)
     prepare_store(folder)
-    from sliplab.flows.running.campaigns import collected
+    from sliplab.analysis.campaigns import collected
     from sliplab.flows.searching.generalisation import COLUMNS, measure_generalisation, row_cells
 
     result = measure_generalisation(

@@ -28,7 +28,7 @@ def guesses(
 
     store = Store.open(folder)
     prepare_store(folder)
-    from sliplab.flows.running.campaigns import collected
+    from sliplab.analysis.campaigns import collected
     from sliplab.flows.searching.guess_changes import FIGURES, UNITS
     from sliplab.flows.searching.guesses import GUESSES, measure_guesses
 

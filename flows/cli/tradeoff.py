@@ -169,7 +169,7 @@ def _detector(
     folder = located(place)
     store = Store.open(folder)
     prepare_store(folder)
-    from sliplab.flows.running.campaigns import collected
+    from sliplab.analysis.campaigns import collected
     from sliplab.flows.searching import detector_tradeoff as steps
     from sliplab.flows.searching.detector_tradeoff_data import Ask
     from sliplab.flows.searching.detector_tradeoff_grid import Axes

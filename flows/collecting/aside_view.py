@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.planning.run_request import set_aside
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import InputError
 from sliplab.storage.store import IMPORTED, Store, StoreError
 

@@ -7,11 +7,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.collecting.halting import halt, holder_of
 from sliplab.flows.collecting.run_session import owned
 from sliplab.flows.collecting.trial_gate import carry_out
 from sliplab.flows.running import console, stopping
-from sliplab.flows.running.campaigns import collected
 from sliplab.protocols import InputError
 from sliplab.storage import control, process
 from sliplab.storage.control import Kind, Request

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels import labelling
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.derived import make_key

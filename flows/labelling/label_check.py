@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.labels import labelling
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.label_errors import CHECK, rules_compared
 from sliplab.flows.planning.run_request import RunRequest, make_request
-from sliplab.flows.running.campaigns import collected
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.derived import Derived, make_key

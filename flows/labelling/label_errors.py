@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP as LABELS
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.store import Store
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.recording import Recording
 from sliplab.storage.review import Decision, last

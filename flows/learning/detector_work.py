@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.rule_sweep import Choice, Counted, choose_smoothing
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store, StoreError

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.rule_sweep import settled
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.label_errors import label_errors, rules_compared
@@ -23,7 +24,6 @@ from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import Model, rules_of, training_settings, wanted_models
 from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import key_inputs, score_windows
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.settings import Detection

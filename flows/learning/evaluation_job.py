@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_work import DetectorWork
 from sliplab.flows.learning.train import Model
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 from sliplab.storage.recording import Recording

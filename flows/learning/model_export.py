@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.activity import activity
@@ -42,7 +43,6 @@ from sliplab.flows.learning.train import (
     wanted_models,
 )
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
 from sliplab.storage.store import Store, StoreError

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
 from sliplab.analysis.networks import training
@@ -13,7 +14,6 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.train import rules_of
-from sliplab.flows.running.campaigns import Collected
 
 Latency = dict[str, Any]
 """By experiment: ``trials`` with both onsets, and ``latency_ms`` as `summarise_latency` has it."""

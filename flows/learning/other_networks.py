@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from prefect import flow
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
@@ -32,7 +33,6 @@ from sliplab.flows.learning.train import comparison_models, rules_of, training_s
 from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import intervals_of
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials

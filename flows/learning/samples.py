@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.flows.labelling.reviewed import Labels
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.trial_work import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.networks import model_file, training, training_device
 from sliplab.analysis.networks.epoch_record import EpochRecord
 from sliplab.analysis.report.figures import training_curves
@@ -21,7 +22,6 @@ from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.errors import InputError

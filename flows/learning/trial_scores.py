@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import (
     TrialLatency,
@@ -16,7 +17,6 @@ from sliplab.analysis.detectors.latency import (
     summarise_lead,
     true_slip,
 )
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
 

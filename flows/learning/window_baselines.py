@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
 from sliplab.analysis.networks.baseline_trees import ROUNDS, boosted
@@ -21,7 +22,6 @@ from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.samples import STEP as SAMPLES
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.running.timing import timed
 from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.store import Store

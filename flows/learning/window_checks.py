@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.window_checks import (
@@ -21,7 +22,6 @@ from sliplab.flows.learning.evaluate import choose_model
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.store import Store, StoreError
 
 EPOCHS = 3

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
@@ -28,7 +29,6 @@ from sliplab.flows.learning.samples import (
     split_trials,
 )
 from sliplab.flows.learning.train import Model, training_settings
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json
 from sliplab.storage.store import Store

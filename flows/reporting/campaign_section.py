@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import theilslopes
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import figures, figures_campaign
 from sliplab.analysis.report.report import Figure, Section, Table, number
 from sliplab.flows.collecting.reference_watch import hold_rate
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols import Trial
 from sliplab.protocols.factors import Level
 from sliplab.storage.derived import Derived

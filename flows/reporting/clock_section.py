@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import figures_campaign
 from sliplab.analysis.report.report import Figure, Link, Section, number
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_page import PAGE
 from sliplab.storage.schema.trial import DEVICES
 from sliplab.storage.store import Store

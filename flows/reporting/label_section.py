@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures_campaign import label_uncertainty
 from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label_errors import KINDS, distances
 from sliplab.flows.reporting.results import source_text
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.store import Store
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
 from sliplab.analysis.report.figure_style import BLUE, GREEN, ORANGE, RED
 from sliplab.analysis.report.figures_conditions import Panel, by_condition
@@ -13,7 +14,6 @@ from sliplab.analysis.report.report import Figure, Section, Table, number, perce
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note
 from sliplab.flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values
-from sliplab.flows.running.campaigns import Collected
 
 Json = dict[str, Any]
 

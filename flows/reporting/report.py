@@ -12,6 +12,7 @@ from typing import Any
 
 from prefect import flow
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.report import report as page
 from sliplab.flows.labelling import label_errors
@@ -24,7 +25,6 @@ from sliplab.flows.reporting.report_against import compare, load_other
 from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.reporting.summary import make_summary
 from sliplab.flows.running import timing
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
 from sliplab.storage.derived import Derived, make_key

@@ -13,8 +13,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import interval
-from sliplab.flows.running.campaigns import Collected
 
 Json = dict[str, Any]
 

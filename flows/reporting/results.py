@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.report import figures
 from sliplab.analysis.report.report import Figure, Section, Table, number
@@ -11,7 +12,6 @@ from sliplab.analysis.windows import dataset
 from sliplab.flows.learning.evaluate import trial_counts
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols.settings import Detection
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report.report import Number, Section, number, percent
 from sliplab.flows.reporting import (
@@ -23,7 +24,6 @@ from sliplab.flows.reporting import (
     trial_section,
 )
 from sliplab.flows.reporting.window_section import window_sections
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.store import Store
 
 Json = dict[str, Any]

@@ -6,6 +6,7 @@ from collections import Counter
 from importlib.metadata import version
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.flows.labelling.label_errors import holds_compared, read_check
 from sliplab.flows.learning import other_networks
 from sliplab.flows.learning.train import training_settings
@@ -16,7 +17,6 @@ from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.campaign_section import reference_rows, wear
 from sliplab.flows.reporting.report_trials import accounted, intervals, trial_summary
 from sliplab.flows.running import timing
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
 from sliplab.rigs.rig_file import load_rig_file

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import figures
 from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.report.report import Figure, Section
@@ -15,7 +16,6 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording
 from sliplab.storage.store import Store

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.labelling.reviewed import State, state_of
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols.errors import InputError
 from sliplab.storage import review
 from sliplab.storage.derived import Derived

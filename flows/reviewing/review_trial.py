@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import STEP
 from sliplab.flows.reviewing.review_list import Row
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording
 from sliplab.storage.review import Onsets

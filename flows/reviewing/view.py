@@ -18,9 +18,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.reviewing.view_streams import Subject
 from sliplab.flows.running import stopping
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.store import Store

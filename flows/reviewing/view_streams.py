@@ -21,13 +21,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of
 from sliplab.flows.reviewing.review_trial import event_rate
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage import review
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording

@@ -16,9 +16,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.searching.detector_tradeoff_compare import comparisons
 from sliplab.flows.searching.detector_tradeoff_data import Ask, Data
 from sliplab.flows.searching.detector_tradeoff_estimate import estimate

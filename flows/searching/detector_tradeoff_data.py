@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.latency import true_slip
 from sliplab.analysis.detectors.rule_sweep import Trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.flows.searching.detector_tradeoff_grid import Setting
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
@@ -36,7 +37,6 @@ from sliplab.flows.learning.samples import (
 )
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.flows.searching.other_rig import other_request
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_integer

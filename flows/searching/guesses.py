@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
@@ -31,7 +32,6 @@ from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.flows.searching.guess_changes import AS_IT_IS, NAMES, figures
 from sliplab.flows.searching.other_rig import judge, other_request
 from sliplab.flows.searching.scene_runs import sample_trials

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
@@ -27,7 +28,6 @@ from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected, collected, training_campaigns
 from sliplab.flows.searching.other_rig import judge, other_request
 from sliplab.flows.searching.scene_runs import sample_trials
 from sliplab.protocols.settings import Detection

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
@@ -17,7 +18,6 @@ from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.trial_scores import score_row
 from sliplab.flows.planning.run_request import RunRequest, make_request
-from sliplab.flows.running.campaigns import Collected, training_campaigns
 from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import rig_yaml

@@ -158,7 +158,7 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
 
 
 def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> str:
-    from sliplab.flows.running.campaigns import collected
+    from sliplab.analysis.campaigns import collected
 
     store = Store.open(here.folder)
     step = getattr(import_module(STEPS[name]), name)

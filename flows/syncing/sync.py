@@ -11,9 +11,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows.running import console
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.flows.syncing.sync_numbers import campaign_numbers

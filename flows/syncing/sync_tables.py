@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.report import Table, number
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
 from sliplab.flows.syncing.sync_series import All
 from sliplab.flows.syncing.sync_trials import TrialClocks

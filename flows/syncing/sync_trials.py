@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.running.campaigns import Collected
+from sliplab.analysis.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import Clocks, Gate, SyncResult

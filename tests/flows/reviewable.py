@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
-from sliplab.flows.running.campaigns import Collected
 from sliplab.storage.derived import Derived
 from sliplab.storage.files import sha256
 from sliplab.storage.schema.trial import Provenance, TrialRecord

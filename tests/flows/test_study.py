@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import collected, training_campaigns
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
@@ -27,7 +28,6 @@ from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.running import trial_work
-from sliplab.flows.running.campaigns import collected, training_campaigns
 from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
 from sliplab.protocols.errors import InputError

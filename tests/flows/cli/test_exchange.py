@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.__main__ import _run
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.running.campaigns import collected
 from sliplab.protocols import InputError
 from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.store import Store, StoreError

@@ -12,6 +12,7 @@ import pytest
 import torch
 import yaml
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import spike_counts
@@ -24,7 +25,6 @@ from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import read_summary, report
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.study import Outcome
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows

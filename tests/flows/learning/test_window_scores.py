@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.windows.dataset import TrialId
 from sliplab.flows.collecting.collect import collect
@@ -17,7 +18,6 @@ from sliplab.flows.learning.samples import load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_scores import kept_counts
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.running.campaigns import collected
 from sliplab.storage.review import Onsets, decide
 from sliplab.storage.store import Store
 from tests.flows.conftest import tiny, write

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collecting.collect import collect
@@ -29,7 +30,6 @@ from sliplab.flows.reporting.report_trials import (
     intervals,
     trial_summary,
 )
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching.tradeoff_page import ERRORS
 from sliplab.flows.study import Outcome
 from sliplab.storage.derived import Derived

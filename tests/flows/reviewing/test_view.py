@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.flows.reviewing import view, view_streams
-from sliplab.flows.running.campaigns import Collected
 from sliplab.protocols.errors import InputError
 from sliplab.storage import review
 from sliplab.storage.derived import Derived

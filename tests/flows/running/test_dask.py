@@ -18,12 +18,12 @@ from pathlib import Path
 import distributed
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.running import cluster as clusters
 from sliplab.flows.running import stopping, trial_work
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.searching.tradeoff_runs import everywhere
 from sliplab.protocols.errors import InputError

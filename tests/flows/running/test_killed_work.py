@@ -16,9 +16,9 @@ from random import Random
 
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.labelling.label import label
 from sliplab.flows.running import trial_work
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.running.spread import WorkerKilled
 from sliplab.storage.files import read_json
 from sliplab.storage.store import Store

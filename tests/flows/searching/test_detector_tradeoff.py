@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import stopping
-from sliplab.flows.running.campaigns import Collected, collected
 from sliplab.flows.searching.detector_tradeoff import (
     NUMBERS,
     PAGE,

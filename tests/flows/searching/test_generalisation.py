@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import extras
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching import generalisation
 from sliplab.flows.searching.generalisation import (
     Generalisation,

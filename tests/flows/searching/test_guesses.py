@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import guesses_section
 from sliplab.flows.reporting.report import report
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching import guesses
 from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
 from sliplab.flows.searching.guesses import Guesses, Setting, measure_guesses

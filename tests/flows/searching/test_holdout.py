@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.analysis.campaigns import collected
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.report import read_summary, report
-from sliplab.flows.running.campaigns import collected
 from sliplab.flows.searching import generalisation, holdout
 from sliplab.flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.study import Outcome

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.reporting.summary import _sync as sync_summary
-from sliplab.flows.running.campaigns import Collected, collected
 from sliplab.flows.syncing.sync import sync
 from sliplab.flows.syncing.sync_fit import fit_again, same_clocks
 from sliplab.storage.catalogue import catalogue

@@ -10,9 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.sync_figures import pooled
 from sliplab.flows.reporting import clock_words
-from sliplab.flows.running.campaigns import Collected
 from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 from sliplab.storage.derived import Derived

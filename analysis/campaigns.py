@@ -1,4 +1,4 @@
-"""Campaigns as the analysis steps see them: recordings, plan and settings read from the store."""
+"""Collected campaigns of a store: recordings, plan and settings, read from the store alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sliplab.storage.store import IMPORTED, Campaign, Store, StoreError
 
 @dataclass(frozen=True)
 class Collected:
-    """One campaign with its plan, as the store's own copy of the protocol says it."""
+    """A campaign with its plan, which is read from the store's own copy of the protocol."""
 
     campaign: Campaign
 
@@ -25,7 +25,7 @@ class Collected:
 
     @cached_property
     def info(self) -> dict[str, object]:
-        """What the campaign says of itself."""
+        """The campaign's own document, `campaign.json`."""
         return self.campaign.info
 
     @cached_property
