@@ -8,8 +8,8 @@ from functools import cached_property
 
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.settings import AnalysisSettings
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)

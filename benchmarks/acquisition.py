@@ -40,10 +40,10 @@ from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.wire.basler import LossyDevice, emulate, show, write_frames
 from sliplab.rigs.wire.dvxplorer import DvxplorerServer, Packet
 from sliplab.storage.files import sync_file
-from sliplab.storage.hdf5 import StreamReader
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
-from sliplab.storage.video import count_frames
-from sliplab.storage.writer import DATA, FRAMES, SPOOL, TrialWriter
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.video import count_frames
+from sliplab.storage.trials.writer import DATA, FRAMES, SPOOL, TrialWriter
 
 RATE_HZ = 100
 EMULATED_HZ = 102

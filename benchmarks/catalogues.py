@@ -13,11 +13,11 @@ import time
 from pathlib import Path
 
 from benchmarks.measure import Figures, alternate, spread
-from sliplab.storage.catalogue import catalogue, query
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.files import sha256
-from sliplab.storage.store import Store
-from sliplab.storage.writer import CHECKSUMS, DATA, FRAMES, RECORD
+from sliplab.storage.trials.catalogue import catalogue, query
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.writer import CHECKSUMS, DATA, FRAMES, RECORD
 
 _LINKS = 30_000
 """Names that a file system lets one file have, and then some."""

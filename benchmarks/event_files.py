@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sliplab.storage.columns import EVENT_CHUNK
 from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.columns import EVENT_CHUNK
 
 WIDTH, HEIGHT = 640, 480
 Lists = list[list[list[int]]]

@@ -26,7 +26,7 @@ from sliplab.rigs.mock.settings import FrameCamera, MockSettings
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.storage.streams import F64, U8
-from sliplab.storage.video import VideoWriter, read_frames
+from sliplab.storage.trials.video import VideoWriter, read_frames
 
 _CV2: Any = cv2  # its stubs lack the blob detector
 RATE_HZ = 100

@@ -25,11 +25,11 @@ from sliplab.analysis.networks.network import build, weights
 from sliplab.analysis.windows import dataset
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.protocols import load_plan
-from sliplab.storage.manifest import of_trial
-from sliplab.storage.push import PushOptions, push
-from sliplab.storage.recording import Recording
-from sliplab.storage.remote import Remote
-from sliplab.storage.store import Store
+from sliplab.storage.objects import Remote
+from sliplab.storage.remote.manifest import of_trial
+from sliplab.storage.remote.push import PushOptions, push
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 ROOT = Path(__file__).parent.parent
 
@@ -93,7 +93,7 @@ def _pushing(store: Store, runs: int, s3: bool) -> Figures:
     if s3:
         import boto3
 
-        from tests.storage.remotes import s3_server
+        from tests.storage.remote.remotes import s3_server
 
         with s3_server() as endpoint:
             boto3.client("s3", endpoint_url=endpoint).create_bucket(Bucket="lab")

@@ -18,10 +18,10 @@ from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, r
 from benchmarks.slides import many_events
 from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.rigs.scene.randomness import generator
-from sliplab.storage.exchange.aedat4 import Aedat4File
-from sliplab.storage.hdf5 import StreamFile, StreamReader
+from sliplab.storage.formats.aedat4 import Aedat4File
 from sliplab.storage.streams import U8, EventChunk
-from sliplab.storage.video import VideoWriter, read_frames
+from sliplab.storage.trials.hdf5 import StreamFile, StreamReader
+from sliplab.storage.trials.video import VideoWriter, read_frames
 
 CHUNK = 20_000
 WINDOW_US = 30_000

@@ -21,7 +21,7 @@ from sliplab.flows.collecting.session import Session
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 ROOT = Path(__file__).parent.parent
 

@@ -1,7 +1,7 @@
 """What `import sliplab` offers: stores, trials as arrays, and every step of the work as a call.
 
 A trial's arrays share one time line: int64 nanoseconds of the trial's sync box. Raw device times
-stay in the store (`storage.recording.Recording`), for whoever needs them.
+stay in the store (`storage.trials.recording.Recording`), for whoever needs them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols import InputError, Plan, load_plan
-from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store as TrialStore
 from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store as TrialStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -245,7 +245,7 @@ class Store:
             ValueError: `where` cannot be answered.
             StoreError: a trial is damaged.
         """
-        from sliplab.storage.catalogue import catalogue, query
+        from sliplab.storage.trials.catalogue import catalogue, query
 
         table = catalogue(self._store)
         return table if where is None else query(table, where)
@@ -380,7 +380,7 @@ def open_store(place: str | Path) -> Store:
     Raises:
         StoreError: there is none, it is damaged, or a newer version wrote it.
     """
-    from sliplab.storage.mirror import open_mirror
+    from sliplab.storage.remote.mirror import open_mirror
     from sliplab.storage.urls import is_url
 
     if is_url(str(place)):

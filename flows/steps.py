@@ -24,7 +24,7 @@ STEPS = {
 def prepare_store(folder: Path) -> None:
     """Make the store and point Prefect at it; everything that imports Prefect comes after."""
     from sliplab.flows.running import orchestration
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     orchestration.prepare(Store.create(folder).folder)
 
@@ -37,7 +37,7 @@ def run_step(
     Args:
         dask: the scheduler whose workers take the trials.
     """
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)

@@ -24,7 +24,7 @@ from sliplab.flows.searching.holdout import STEP, measure_holdout
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.study_searches import Search, training_windows
 from sliplab.flows.syncing.sync import sync
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 COLLECT_S = {"tracks": 0.3, "video": 5.0}
 """What a simulated trial is expected to take on two cores, by what the camera hands over; a real

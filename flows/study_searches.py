@@ -24,8 +24,8 @@ from sliplab.flows.searching.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.searching.sensitivity import value_of
 from sliplab.flows.searching.tradeoff import tradeoff
 from sliplab.protocols.errors import InputError
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
 
 SCENE_TRIALS = 4
 ASK, AXES = Ask(), Axes()

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.lock import NoLocks, exclusive
+from sliplab.storage.trials.lock import NoLocks, exclusive
 
 ENVIRONMENT = "SLIPLAB_RUNTIME"
 _FOLDER = Path("/tmp/sliplab-rigs")

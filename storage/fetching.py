@@ -8,7 +8,7 @@ from pathlib import Path
 from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import read_json
 from sliplab.storage.names import safe_name
-from sliplab.storage.remote import Remote, RemoteError
+from sliplab.storage.objects import Remote, RemoteError
 from sliplab.storage.streams import Json
 
 ORIGIN = "origin.json"

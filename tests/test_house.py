@@ -22,7 +22,7 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
     }
     assert readers == {
         "flows/collecting/session.py",
-        "storage/recording.py",
+        "storage/trials/recording.py",
         "storage/schema/trial.py",
         "flows/labelling/label_errors.py",
         "flows/reviewing/view_streams.py",  # drawn beside the label, and called simulated

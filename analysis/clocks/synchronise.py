@@ -31,9 +31,9 @@ from sliplab.analysis.clocks.counters import split_at_restarts
 from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
-from sliplab.storage.hdf5 import StreamReader
-from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import Clocks, DeviceRecord
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.recording import Recording
 
 I64 = npt.NDArray[np.int64]
 

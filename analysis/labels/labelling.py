@@ -19,7 +19,7 @@ from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
 from sliplab.protocols.settings import Labelling
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.recording import Recording
 
 F64 = npt.NDArray[np.float64]
 VERSION = 5

@@ -13,8 +13,8 @@ from sliplab.analysis.windows.samples import choose_windows, consecutive_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
 from sliplab.protocols.settings import Samples, Windows
-from sliplab.storage.array_file import Arrays, map_arrays, write_arrays
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.array_file import Arrays, map_arrays, write_arrays
+from sliplab.storage.trials.recording import Recording
 
 VERSION = 1
 

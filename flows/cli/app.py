@@ -143,7 +143,7 @@ def collect(
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
     from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
     from sliplab.flows.running import orchestration
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     run_request = make_request(
         protocol,

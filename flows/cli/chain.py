@@ -110,7 +110,7 @@ def _chain(
     from sliplab.flows.reporting.report import read_summary
     from sliplab.flows.study import study as run
     from sliplab.flows.study_searches import searches
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)
     summary = read_summary(Store.open(folder))

@@ -40,7 +40,7 @@ def located(place: str) -> Path:
     Raises:
         StoreError: there is none.
     """
-    from sliplab.storage.mirror import open_mirror
+    from sliplab.storage.remote.mirror import open_mirror
     from sliplab.storage.urls import is_url
 
     if not is_url(place):

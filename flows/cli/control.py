@@ -14,7 +14,7 @@ from sliplab.flows.running import console
 
 if TYPE_CHECKING:
     from sliplab.flows.collecting.controlling import Outcome
-    from sliplab.storage.control import Kind
+    from sliplab.storage.trials.control import Kind
 
 StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
 TrialsArgument = Annotated[list[str], typer.Argument(help="Ids of trials, as in `sliplab plan`.")]
@@ -60,7 +60,7 @@ def stop(
 ) -> None:  # fmt: skip
     """Stop a running collection now, the arm first, as Ctrl-C in its terminal would."""
     from sliplab.flows.collecting.halting import halt
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     halted = halt(store)  # before anything that takes long to load
@@ -97,7 +97,7 @@ def register(app: typer.Typer) -> None:
 
 def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcome:
     from sliplab.flows.collecting import controlling
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     return controlling.request(Store.open(store), kind, who=who, why=why, limit_s=wait)
 
@@ -108,7 +108,7 @@ def _decide(
 ) -> None:  # fmt: skip
     from sliplab.flows.collecting import controlling
     from sliplab.protocols.errors import InputError
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     if not why.strip():
         raise InputError("--why", "", why, "must say something: it is kept with the trial")

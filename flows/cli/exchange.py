@@ -31,10 +31,10 @@ def import_(
     from dataclasses import replace
 
     from sliplab.flows.collecting.run_session import owned
-    from sliplab.storage.exchange.find import KINDS, kind_of, trials_in
-    from sliplab.storage.exchange.import_trials import import_trials
+    from sliplab.storage.formats.find import KINDS, kind_of, trials_in
+    from sliplab.storage.formats.import_trials import import_trials
     from sliplab.storage.names import safe_name
-    from sliplab.storage.store import Store, StoreError
+    from sliplab.storage.trials.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path
     kind = kind_of(where) if path is None else kind_or_path
@@ -68,9 +68,9 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trials as files that other programs read, or their labels as a table."""
-    from sliplab.storage.exchange.export_trials import SUFFIXES, export_trials
-    from sliplab.storage.exchange.tables import label_table, write_table
-    from sliplab.storage.store import Store
+    from sliplab.storage.formats.export_trials import SUFFIXES, export_trials
+    from sliplab.storage.formats.tables import label_table, write_table
+    from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}

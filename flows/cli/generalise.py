@@ -38,7 +38,7 @@ def generalise(
     as_json: JsonOption = False,
 ) -> None:
     """Train without a level and test on it; test the network on other simulated skins."""
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)

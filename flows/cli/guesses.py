@@ -24,7 +24,7 @@ def guesses(
     as_json: JsonOption = False,
 ) -> None:
     """Take some test trials again with each guess 20 % down and up, and judge them anew."""
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)

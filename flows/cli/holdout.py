@@ -25,7 +25,7 @@ def holdout(
     as_json: JsonOption = False,
 ) -> None:
     """Judge the network once on another simulated skin and seed, which choose nothing."""
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     store = Store.open(folder)
     prepare_store(folder)

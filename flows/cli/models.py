@@ -34,7 +34,7 @@ def export_model(
 ) -> None:
     """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
     from sliplab.flows.detecting.detect_order import load_model
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     if out.exists() and not out.is_dir():
         raise InputError("--out", "", str(out), "must be a folder")

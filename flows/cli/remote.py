@@ -12,7 +12,7 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplab.storage.store import Campaign, Store
+    from sliplab.storage.trials.store import Campaign, Store
 
 UrlArgument = Annotated[
     str, typer.Argument(help="Where pushed stores are: s3://bucket/folder, file:///shared/folder.")
@@ -49,10 +49,10 @@ def push(
     """
     from sliplab.flows.collecting.halting import holder_of
     from sliplab.flows.running import stopping
-    from sliplab.storage.push import PushOptions
-    from sliplab.storage.push import push as send
-    from sliplab.storage.remote import Remote
-    from sliplab.storage.store import Store
+    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.push import PushOptions
+    from sliplab.storage.remote.push import push as send
+    from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     chosen = _chosen(opened, campaign)
@@ -85,8 +85,8 @@ def pull(
     as_json: JsonOption = False,
 ) -> None:
     """Bring pushed trials into a store, each checked; run it again to bring what is new."""
-    from sliplab.storage.pull import pull as pull_trials
-    from sliplab.storage.remote import Remote
+    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.pull import pull as pull_trials
 
     with console.bar(f"pull {url} (trials)", 0) as bar:
 
@@ -108,8 +108,8 @@ def verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
         InputError: something was to be set aside there.
     """
     from sliplab.flows.running import stopping
-    from sliplab.storage.remote import Remote
-    from sliplab.storage.remote_check import verify_remote
+    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.verify import verify_remote
 
     if quarantine:
         raise InputError(

@@ -31,7 +31,7 @@ def review(
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
     from sliplab.flows.reviewing.review_server import serve
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     def ready(address: str, trials: TrialList) -> None:
         waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
@@ -58,7 +58,7 @@ def view(
 ) -> None:
     """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
     from sliplab.flows.reviewing import view as looking
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     subject = looking.find(Store.open(store), trial, campaign)
     if save is None:

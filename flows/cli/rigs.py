@@ -14,8 +14,8 @@ from sliplab.rigs.reach import reach
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from sliplab.rigs.rig_lock import held
-from sliplab.storage.lock import Locked
 from sliplab.storage.secrets import masked
+from sliplab.storage.trials.lock import Locked
 
 
 def rigs(

@@ -49,7 +49,7 @@ def serve(
         return
     prepare_store(store)
     from sliplab.flows.serving.serve import serve as run
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     run(
         Store.open(store),

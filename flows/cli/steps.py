@@ -184,7 +184,7 @@ def report(
     result = run_step(folder, campaign, "report")
     if against is not None:
         from sliplab.flows.reporting import report, report_against_page
-        from sliplab.storage.store import Store
+        from sliplab.storage.trials.store import Store
 
         compared = report.against(Store.open(folder), against)
         if as_json:

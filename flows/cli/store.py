@@ -29,8 +29,8 @@ def trials(
 ) -> None:
     """The catalogue of committed trials as a table, and what was set aside, with causes."""
     from sliplab.flows.collecting.aside_view import all_aside, show_aside
-    from sliplab.storage.catalogue import catalogue, query
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.catalogue import catalogue, query
+    from sliplab.storage.trials.store import Store
 
     unreadable: list[str] = []
     opened = Store.open(located(store))
@@ -47,7 +47,7 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from sliplab.storage.exchange.tables import write_table
+        from sliplab.storage.formats.tables import write_table
 
         write_table(table, output)
         console.say(f"{len(table)} trials: {output}")
@@ -81,10 +81,10 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Check every checksum, count and clock of a store; changes nothing unless told to."""
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.verify import set_aside, trial_folders
+    from sliplab.storage.trials.verify import verify as look
     from sliplab.storage.urls import is_url
-    from sliplab.storage.verify import set_aside, trial_folders
-    from sliplab.storage.verify import verify as look
 
     if is_url(store):
         from sliplab.flows.cli.remote import verify_pushed
@@ -130,10 +130,10 @@ def migrate(store: StoreArgument, as_json: JsonOption = False) -> None:
     `collect` does the same before it begins.
     """
     from sliplab.storage.errors import translated_disk_errors
-    from sliplab.storage.lock import exclusive
-    from sliplab.storage.migrate import kept
-    from sliplab.storage.migrate import migrate as migrate_store
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.lock import exclusive
+    from sliplab.storage.trials.migrate import kept
+    from sliplab.storage.trials.migrate import migrate as migrate_store
+    from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     with (

@@ -164,7 +164,7 @@ def _detector(
     options: dict[str, Any],
     as_json: bool,
 ) -> None:
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     folder = located(place)
     store = Store.open(folder)

@@ -8,7 +8,7 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.flows.planning.run_request import set_aside
 from sliplab.flows.running import console
 from sliplab.protocols import InputError
-from sliplab.storage.store import IMPORTED, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, Store, StoreError
 
 
 def all_aside(

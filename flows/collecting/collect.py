@@ -21,8 +21,8 @@ from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols import Trial
-from sliplab.storage import control
-from sliplab.storage.store import Store
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import Store
 
 MOCK_BATCH = 25
 

@@ -13,11 +13,12 @@ from sliplab.flows.collecting.run_session import owned
 from sliplab.flows.collecting.trial_gate import carry_out
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import InputError
-from sliplab.storage import control, process
-from sliplab.storage.control import Kind, Request
-from sliplab.storage.lock import Locked
-from sliplab.storage.store import Store
+from sliplab.storage import process
 from sliplab.storage.streams import Json
+from sliplab.storage.trials import control
+from sliplab.storage.trials.control import Kind, Request
+from sliplab.storage.trials.lock import Locked
+from sliplab.storage.trials.store import Store
 
 LOOK_S = 0.2
 

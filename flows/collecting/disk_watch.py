@@ -11,7 +11,7 @@ from sliplab.flows.planning.estimate import RESERVE, trial_bytes
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running.console import size
 from sliplab.protocols import Trial
-from sliplab.storage.store import Campaign
+from sliplab.storage.trials.store import Campaign
 
 _LOOK_BACK = 50
 """Committed trials that a session learns from when it begins."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from sliplab.storage.lock import STORE_LOCK, Locked, exclusive
 from sliplab.storage.process import send
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
 
 
 def holder_of(folder: Path) -> Json | None:

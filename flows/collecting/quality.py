@@ -21,11 +21,11 @@ from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.rig import TrialRun
-from sliplab.storage.columns import TRACKS
-from sliplab.storage.hdf5 import StreamReader
 from sliplab.storage.schema.trial import Clocks, Counts, Gate
 from sliplab.storage.streams import I64, StepTimes
-from sliplab.storage.writer import DATA
+from sliplab.storage.trials.columns import TRACKS
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.writer import DATA
 
 UNVOUCHED_S = 0.3
 """A recording may begin and end this much before and after the pulses on which a clock's fit

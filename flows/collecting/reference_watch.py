@@ -9,8 +9,8 @@ from __future__ import annotations
 from sliplab.flows.collecting.stops import CampaignStopped
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import Trial
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Campaign
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign
 
 
 def hold_rate(recording: Recording) -> float:

@@ -19,12 +19,12 @@ from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig_lock import held
-from sliplab.storage import control
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import sweep_temporary
-from sliplab.storage.lock import STORE_LOCK, exclusive
-from sliplab.storage.migrate import migrate
-from sliplab.storage.store import Campaign, Store
+from sliplab.storage.trials import control
+from sliplab.storage.trials.lock import STORE_LOCK, exclusive
+from sliplab.storage.trials.migrate import migrate
+from sliplab.storage.trials.store import Campaign, Store
 
 
 @dataclass(frozen=True)

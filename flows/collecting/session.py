@@ -35,9 +35,9 @@ from sliplab.storage.schema.trial import (
     Step,
     TrialRecord,
 )
-from sliplab.storage.store import Campaign
 from sliplab.storage.streams import Json
-from sliplab.storage.writer import TrialWriter
+from sliplab.storage.trials.store import Campaign
+from sliplab.storage.trials.writer import TrialWriter
 
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 

@@ -20,8 +20,8 @@ from sliplab.flows.planning.run_request import RunRequest, campaign_counts
 from sliplab.flows.running import orchestration, server_calls, stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_text
-from sliplab.storage.store import Store, StoreError
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store, StoreError
 
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0

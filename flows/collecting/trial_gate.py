@@ -16,10 +16,10 @@ from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
 from sliplab.flows.planning.run_request import RunRequest, pending_trials
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import Trial
-from sliplab.storage import control, decisions
-from sliplab.storage.control import Request
-from sliplab.storage.store import Campaign, Store
 from sliplab.storage.streams import Json
+from sliplab.storage.trials import control, decisions
+from sliplab.storage.trials.control import Request
+from sliplab.storage.trials.store import Campaign, Store
 
 PAUSE_LIMIT_S = 12 * 3600.0
 LOOK_S = 0.5

@@ -8,9 +8,9 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels import labelling
 from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
 from sliplab.protocols.settings import Labelling
-from sliplab.storage.derived import make_key
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

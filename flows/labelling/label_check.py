@@ -20,9 +20,9 @@ from sliplab.flows.labelling.label_errors import CHECK, rules_compared
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
-from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import write_text
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
 
 VERSION = 1
 TRIALS = 60

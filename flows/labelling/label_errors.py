@@ -8,8 +8,8 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP as LABELS
-from sliplab.storage.derived import Derived
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 
 KINDS = ("incipient", "gross")
 REFERENCES = ("hold_start", "hold_end")

@@ -13,11 +13,11 @@ from typing import Literal
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import console
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.recording import Recording
-from sliplab.storage.review import Decision, last
-from sliplab.storage.store import Store
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.review import Decision, last
+from sliplab.storage.trials.store import Store
 
 VERSION = 1
 State = Literal["open", "accepted", "adjusted", "rejected", "stale"]

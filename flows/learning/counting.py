@@ -14,8 +14,8 @@ from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows import dataset
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

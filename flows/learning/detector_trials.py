@@ -21,9 +21,9 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

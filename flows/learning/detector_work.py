@@ -13,8 +13,8 @@ from sliplab.analysis.detectors.rule_sweep import Choice, Counted, choose_smooth
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.protocols.settings import AnalysisSettings, Detection
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
 
 
 @dataclass(frozen=True)

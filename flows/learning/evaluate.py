@@ -27,9 +27,9 @@ from sliplab.flows.learning.window_scores import key_inputs, score_windows
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.settings import Detection
-from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

@@ -11,8 +11,8 @@ from sliplab.flows.learning.detector_work import DetectorWork
 from sliplab.flows.learning.train import Model
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

@@ -45,7 +45,7 @@ from sliplab.flows.learning.train import (
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 
 SPLITS = ("train", "validation", "test")
 CHECKED = 256

@@ -39,9 +39,9 @@ from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trial
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

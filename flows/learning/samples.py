@@ -17,8 +17,8 @@ from sliplab.flows.running.trial_work import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import Samples, Windows
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

@@ -26,9 +26,9 @@ from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.timing import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
-from sliplab.storage.derived import make_key
 from sliplab.storage.files import read_json, write_bytes, write_json, write_text
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.store import Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

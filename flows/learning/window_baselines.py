@@ -23,8 +23,8 @@ from sliplab.flows.learning.samples import STEP as SAMPLES
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.timing import timed
-from sliplab.storage.derived import Derived, make_key
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
 
 STEP = "baselines"
 EVALUATION = "evaluation"

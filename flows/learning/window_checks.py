@@ -22,7 +22,7 @@ from sliplab.flows.learning.evaluate import choose_model
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.running import console
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 
 EPOCHS = 3
 """Of each training on shuffled labels: as many as true labels need to be well above chance."""

@@ -29,9 +29,9 @@ from sliplab.flows.learning.samples import (
     split_trials,
 )
 from sliplab.flows.learning.train import Model, training_settings
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.labelling.reviewed import Labels

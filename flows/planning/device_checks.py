@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from sliplab.rigs.capabilities import ArmFault, DeviceHealth, RigError
-from sliplab.storage.lock import Locked
+from sliplab.storage.trials.lock import Locked
 
 if TYPE_CHECKING:
     from sliplab.flows.planning.run_request import RunRequest
@@ -87,8 +87,8 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's would be."""
     from sliplab.analysis.clocks.synchronise import streams_of, synchronise
-    from sliplab.storage.hdf5 import StreamReader
-    from sliplab.storage.writer import DATA, TrialWriter
+    from sliplab.storage.trials.hdf5 import StreamReader
+    from sliplab.storage.trials.writer import DATA, TrialWriter
 
     rate = run_request.plan.protocol.collection.recording.sync_rate
     with TemporaryDirectory() as folder:

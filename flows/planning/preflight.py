@@ -19,7 +19,7 @@ from sliplab.flows.running.console import size
 from sliplab.protocols import InputError
 from sliplab.rigs.calibration import COMMANDS, find_faults, measured_on
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 
 def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:

@@ -15,8 +15,8 @@ from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.decisions import skipped
-from sliplab.storage.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
 
 @dataclass(frozen=True)

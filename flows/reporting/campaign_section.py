@@ -17,10 +17,10 @@ from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
 from sliplab.protocols import Trial
 from sliplab.protocols.factors import Level
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import Gate
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

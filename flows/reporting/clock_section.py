@@ -9,7 +9,7 @@ from sliplab.analysis.report import figures_campaign
 from sliplab.analysis.report.report import Figure, Link, Section, number
 from sliplab.flows.syncing.sync_page import PAGE
 from sliplab.storage.schema.trial import DEVICES
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 
 def section(

@@ -8,7 +8,7 @@ from typing import Any
 
 from sliplab.analysis.report.report import Section, Table, number
 from sliplab.flows.reporting.report_trials import WORDS
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

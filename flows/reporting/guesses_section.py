@@ -8,7 +8,7 @@ from sliplab.analysis.report.figures_changes import Changed, ChangePanel, lowere
 from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.reporting.report_extras import command, odd_shape
 from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

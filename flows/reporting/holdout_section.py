@@ -9,7 +9,7 @@ from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.analysis.report.report import Section, Table, number, percent
 from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
 from sliplab.flows.reporting.report_trials import intervals, trial_summary
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

@@ -11,8 +11,8 @@ from sliplab.analysis.report.report import Figure, Section, Table, number, perce
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label_errors import KINDS, distances
 from sliplab.flows.reporting.results import source_text
-from sliplab.storage.derived import Derived
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 
 _ROWS = (
     ("paper", "paper's rule less the true crossing"),

@@ -14,7 +14,7 @@ from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
 from sliplab.flows.reporting.search_section import search
 from sliplab.flows.searching import tradeoff_page
 from sliplab.protocols.quantity import level_order
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

@@ -27,10 +27,10 @@ from sliplab.flows.reporting.summary import make_summary
 from sliplab.flows.running import timing
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
-from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import make_folder, read_json, write_json, write_text
 from sliplab.storage.names import safe_name
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
 
 STEP = "report"
 VERSION = 10

@@ -18,7 +18,7 @@ from typing import Any
 
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

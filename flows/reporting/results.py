@@ -13,8 +13,8 @@ from sliplab.flows.learning.evaluate import trial_counts
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note
 from sliplab.protocols.settings import Detection
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 
 def seconds(value: int | None, origin: int) -> float | None:

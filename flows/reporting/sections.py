@@ -24,7 +24,7 @@ from sliplab.flows.reporting import (
     trial_section,
 )
 from sliplab.flows.reporting.window_section import window_sections
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 

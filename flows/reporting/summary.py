@@ -20,8 +20,8 @@ from sliplab.flows.running import timing
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.derived import Derived
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 
 _PACKAGES = (
     "sliplab",

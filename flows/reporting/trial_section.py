@@ -16,9 +16,9 @@ from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 F64 = npt.NDArray[np.float64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sliplab.flows.reviewing.review_list import TrialList
 from sliplab.flows.reviewing.review_trial import Shown
-from sliplab.storage import review
-from sliplab.storage.review import Decision, Onsets, Verdict
+from sliplab.storage.trials import review
+from sliplab.storage.trials.review import Decision, Onsets, Verdict
 
 
 class LabelChanged(ValueError):

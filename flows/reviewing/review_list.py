@@ -15,11 +15,11 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.labelling.reviewed import State, state_of
 from sliplab.protocols.errors import InputError
-from sliplab.storage import review
-from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import IMPORTED, Store
 from sliplab.storage.streams import Json
+from sliplab.storage.trials import review
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import IMPORTED, Store
 
 LabelState = Literal["fresh", "stale", "missing"]
 _GRAVE, _ODD, _SLIGHT = 3, 2, 1

@@ -18,10 +18,10 @@ from sliplab.flows.reviewing.review_list import Row, TrialList, as_columns, chos
 from sliplab.flows.reviewing.review_plots import TimePlots
 from sliplab.flows.reviewing.review_trial import Shown, load
 from sliplab.flows.reviewing.review_widgets import ALL, Widgets
-from sliplab.storage import review
 from sliplab.storage.errors import StoreError
-from sliplab.storage.review import Onsets, Verdict
 from sliplab.storage.streams import U8
+from sliplab.storage.trials import review
+from sliplab.storage.trials.review import Onsets, Verdict
 
 REFRESH_MS = 2000
 

@@ -11,7 +11,7 @@ from bokeh.plotting import figure
 
 from sliplab.analysis.report.figure_style import BLUE, GREY, ORANGE, RED
 from sliplab.flows.reviewing.review_trial import Shown
-from sliplab.storage.review import Onsets
+from sliplab.storage.trials.review import Onsets
 
 Kind = Literal["incipient", "gross"]
 KINDS: tuple[Kind, Kind] = ("incipient", "gross")

@@ -28,7 +28,7 @@ from sliplab.flows.reviewing.review_page import Page
 from sliplab.flows.running.same_origin import own_hosts, refusal
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import user_name
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 HOST = "127.0.0.1"
 _KEEP_MS = 60_000

@@ -12,12 +12,12 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import STEP
 from sliplab.flows.reviewing.review_list import Row
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
-from sliplab.storage.review import Onsets
-from sliplab.storage.store import Store
 from sliplab.storage.streams import F64, I64, U8, Json
-from sliplab.storage.video import FrameReader
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.review import Onsets
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.video import FrameReader
 
 RATE_NS = 10_000_000
 """Width of a bin of the event rate."""

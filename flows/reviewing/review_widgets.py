@@ -21,7 +21,7 @@ from bokeh.models import (
 
 from sliplab.flows.labelling.reviewed import STATES
 from sliplab.flows.reviewing import review_words as words
-from sliplab.storage.review import Verdict
+from sliplab.storage.trials.review import Verdict
 
 ALL = "all"
 VERDICTS: tuple[tuple[Verdict, str, str], ...] = (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 
 from sliplab.flows.reviewing.review_trial import Shown
-from sliplab.storage.review import Decision, Onsets
+from sliplab.storage.trials.review import Decision, Onsets
 
 KEYS = (
     ("n, &darr;", "next"), ("p, &uarr;", "previous"), ("&larr; &rarr;", "frame"),

@@ -23,7 +23,7 @@ from sliplab.flows.reviewing.view_streams import Subject
 from sliplab.flows.running import stopping
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 APPLICATION = "sliplab"
 

@@ -28,11 +28,11 @@ from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of
 from sliplab.flows.reviewing.review_trial import event_rate
-from sliplab.storage import review
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
 from sliplab.storage.streams import I64, EventChunk, Json
+from sliplab.storage.trials import review
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 TIMELINE = "trial_time"
 BIN_NS = 5_000_000

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from sliplab.storage.control import FOLDER
 from sliplab.storage.files import make_folder, read_json, sweep_temporary, write_new_json
 from sliplab.storage.process import is_here, named, now, this_process
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.control import FOLDER
 
 EMBEDDED = "embedded"
 _ID = r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"

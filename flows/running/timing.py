@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 
 def _file(store: Store) -> Path:

@@ -17,11 +17,11 @@ from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.spread import Done, spread
 from sliplab.flows.running.timing import timed
-from sliplab.storage.derived import Derived
-from sliplab.storage.mirror import place_of, reach
-from sliplab.storage.recording import Recording
+from sliplab.storage.remote.mirror import place_of, reach
 from sliplab.storage.schema.trial import SyncResult
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

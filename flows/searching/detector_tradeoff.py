@@ -29,7 +29,7 @@ from sliplab.flows.searching.detector_tradeoff_runs import Kept, Run, make_run
 from sliplab.flows.searching.detector_tradeoff_text import flat
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json, write_text
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 PAGE, NUMBERS, TABLE = (f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv"))
 

@@ -25,9 +25,9 @@ from sliplab.flows.searching.detector_tradeoff_grid import Setting
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Samples
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import StoreError
 from sliplab.storage.streams import Json
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import StoreError
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.flows.searching.detector_tradeoff_data import Ask, Data, Used
 from sliplab.flows.searching.detector_tradeoff_grid import Setting, counted_stride
 from sliplab.protocols.settings import Network, Training, Windows
-from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import make_folder, write_bytes
+from sliplab.storage.trials.derived import Derived, make_key
 
 STEP = "tradeoff"
 VERSION = 1

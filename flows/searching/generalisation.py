@@ -41,9 +41,9 @@ from sliplab.flows.searching.other_rig import other_request
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.quantity import level_order
-from sliplab.storage.derived import make_key
 from sliplab.storage.files import make_folder, read_json, write_bytes, write_json, write_text
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.store import Store
 
 STEP, FILE, TABLE, VERSION = "generalisation", "results.json", "results.md", 1
 VALIDATION = 0.15

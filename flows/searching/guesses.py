@@ -39,9 +39,9 @@ from sliplab.flows.searching.sensitivity import CHANGE, LARGEST_POISSON, nested,
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Detection
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.derived import make_key
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.store import Store, StoreError
 
 STEP, FILE, VERSION = "guesses", "results.json", 1
 TRIALS = 20

@@ -31,9 +31,9 @@ from sliplab.flows.running import console
 from sliplab.flows.searching.other_rig import judge, other_request
 from sliplab.flows.searching.scene_runs import sample_trials
 from sliplab.protocols.settings import Detection
-from sliplab.storage.derived import make_key
 from sliplab.storage.files import make_folder, read_json, write_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.store import Store, StoreError
 
 STEP, FILE, VERSION = "holdout", "results.json", 1
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402

@@ -22,8 +22,8 @@ from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import make_folder, write_text
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 
 def other_request(

@@ -29,8 +29,8 @@ from sliplab.flows.serving.serve_watch import PageServer, ask_on, watch
 from sliplab.flows.serving.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import write_bytes
-from sliplab.storage.lock import exclusive
-from sliplab.storage.store import Store
+from sliplab.storage.trials.lock import exclusive
+from sliplab.storage.trials.store import Store
 
 LOCK = ".serve.lock"
 PORT = 4200

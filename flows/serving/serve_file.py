@@ -167,7 +167,7 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
 
 def _check_campaign(path: Path, name: str | None) -> None:
     from sliplab.storage.names import safe_name
-    from sliplab.storage.store import StoreError
+    from sliplab.storage.trials.store import StoreError
 
     try:
         safe_name("any" if name is None else name)

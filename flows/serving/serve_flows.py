@@ -18,8 +18,8 @@ from sliplab.flows.serving.serve_runs import HOOKS, run_of, until_of, when_free
 from sliplab.flows.serving.service import Service
 from sliplab.flows.steps import STEPS
 from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
-from sliplab.storage import control
-from sliplab.storage.store import Store
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import Store
 
 STEP, EVALUATE, STUDY, ASK = Step(), Evaluate(), Study(), Ask()
 served: Callable[..., Any] = partial(flow, persist_result=False, **HOOKS)

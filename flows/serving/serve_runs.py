@@ -24,8 +24,8 @@ from sliplab.flows.serving.service import Service, service
 from sliplab.protocols import InputError
 from sliplab.rigs.capabilities import RigError
 from sliplab.storage.errors import disk_error
-from sliplab.storage.lock import Locked
-from sliplab.storage.store import StoreError
+from sliplab.storage.trials.lock import Locked
+from sliplab.storage.trials.store import StoreError
 
 LOOK_S = 2.0
 """How often a rig that is in use is asked for again."""

@@ -19,10 +19,10 @@ from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.flows.syncing.sync_numbers import campaign_numbers
 from sliplab.flows.syncing.sync_page import PAGE, render
 from sliplab.flows.syncing.sync_trials import TrialClocks, read_trials
-from sliplab.storage.derived import Derived, make_key
 from sliplab.storage.files import write_text
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import SYNC, Store
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import SYNC, Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.clocks import synchronise
-from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import SyncResult
+from sliplab.storage.trials.recording import Recording
 
 POINTS = 200
 """So many residuals are kept of a device in a trial, evenly spread over it."""

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
 from sliplab.storage.schema.trial import Clocks, Gate, SyncResult
-from sliplab.storage.store import SYNC, Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import SYNC, Store
 
 F64 = npt.NDArray[np.float64]
 

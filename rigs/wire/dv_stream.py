@@ -4,14 +4,14 @@ The library's own writer (2.0.4) cannot stand in for a camera here: each of its 
 sockets without ever resting and takes a core, and events go in one by one, at 0.7 million a second.
 On the wire there is a header and then packets. A header is a length and a flatbuffer `IOHE` with
 the stream's description; a packet is stream and length (int32 each) and a flatbuffer with its
-length in front (`storage.exchange.dv_buffers`).
+length in front (`storage.formats.dv_buffers`).
 """
 
 from __future__ import annotations
 
 import struct
 
-from sliplab.storage.exchange.dv_buffers import events_buffer, header_buffer, triggers_buffer
+from sliplab.storage.formats.dv_buffers import events_buffer, header_buffer, triggers_buffer
 from sliplab.storage.streams import I64, EventChunk
 
 RISING_EDGE = 1

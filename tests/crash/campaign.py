@@ -11,8 +11,8 @@ import yaml
 from sliplab.flows.collecting.run_session import run_session
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
-from sliplab.storage.verify import UNFINISHED, verify
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import UNFINISHED, verify
 from tests.conftest import ROOT, SMALL
 
 NAME = "crash"

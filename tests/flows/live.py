@@ -21,7 +21,7 @@ from sliplab.flows.planning.run_request import (
 from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.wire.loopback import Loopback
-from sliplab.storage.store import Campaign, Store
+from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT, SMALL
 from tests.flows.conftest import write
 from tests.rigs.loopback import own_address

@@ -12,11 +12,11 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.labelling.label import STEP, label_key
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import sha256
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.store import Campaign, Store
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT
 
 NAME = "kinematic"

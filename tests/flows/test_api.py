@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import sliplab
-from sliplab.storage.derived import Derived
-from sliplab.storage.store import Store as TrialStore
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store as TrialStore
 from tests.flows.older import older_store
 
 FIRST = "depth=2.4mm,direction=0deg,speed=1.6mmps,r=1"

@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 from tests.command_line import answer
 from tests.flows.older import older_store
 

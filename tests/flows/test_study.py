@@ -31,9 +31,9 @@ from sliplab.flows.running import trial_work
 from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
 from sliplab.protocols.errors import InputError
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import write_bytes
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
 from tests.flows.conftest import tiny, tiny_gravity, write
 
 pytestmark = pytest.mark.programs

@@ -19,7 +19,7 @@ from sliplab.flows.searching.generalisation import measure_generalisation
 from sliplab.flows.study import Outcome, expected, study
 from sliplab.flows.study_searches import searches
 from sliplab.protocols.errors import InputError
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 pytestmark = pytest.mark.programs
 

@@ -85,7 +85,7 @@ def read_store(box: Path, name: str, data: bytes) -> None:
 
     Half of the files get a checksum that fits, so that what is behind the checksums meets them.
     """
-    from sliplab.storage.whole import sha256
+    from sliplab.storage.trials.checksums import sha256
 
     store = box / "store"
     if not store.exists():
@@ -111,12 +111,12 @@ def read_store(box: Path, name: str, data: bytes) -> None:
 def look_through(folder: Path, with_trials: bool = True) -> None:
     """Everything that reads a store without devices; one fault does not hide the others."""
     from sliplab.protocols.errors import InputError
-    from sliplab.storage.catalogue import catalogue
-    from sliplab.storage.control import open_requests, paused
-    from sliplab.storage.decisions import skipped
     from sliplab.storage.errors import StoreError
-    from sliplab.storage.store import Store
-    from sliplab.storage.verify import verify
+    from sliplab.storage.trials.catalogue import catalogue
+    from sliplab.storage.trials.control import open_requests, paused
+    from sliplab.storage.trials.decisions import skipped
+    from sliplab.storage.trials.store import Store
+    from sliplab.storage.trials.verify import verify
 
     store = Store.open(folder)
     if with_trials:
@@ -165,7 +165,7 @@ def read_recording(recording: Any) -> None:
 
 def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
     """A pickle of the lab's kind."""
-    from sliplab.storage.exchange import pickles
+    from sliplab.storage.formats import pickles
 
     _read_pickles_here()
     pickles.parse_pickle(data, name)
@@ -173,7 +173,7 @@ def read_foreign_pickle(box: Path, name: str, data: bytes) -> None:
 
 def _read_pickles_here() -> None:
     """Read pickles without the child process: the worker watches and limits this one."""
-    from sliplab.storage.exchange import pickle_child, pickles
+    from sliplab.storage.formats import pickle_child, pickles
 
     pickles.in_child = lambda data, seconds: pickle_child.answer(data)
 
@@ -181,8 +181,8 @@ def _read_pickles_here() -> None:
 def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
     from sliplab.protocols.errors import InputError
-    from sliplab.storage.exchange.find import kind_of, trials_in
-    from sliplab.storage.exchange.foreign import FormatError
+    from sliplab.storage.formats.find import kind_of, trials_in
+    from sliplab.storage.formats.foreign import FormatError
 
     _read_pickles_here()
     folder = box / "foreign"
@@ -203,9 +203,9 @@ def read_foreign(box: Path, name: str, data: bytes) -> None:
 
 def make_foreign(folder: Path) -> dict[str, bytes]:
     """One small file of each kind, by name."""
-    from sliplab.storage.exchange.export_trials import export_trials
-    from sliplab.storage.store import Store
-    from tests.storage.exchange.files import lab_cells, lab_hdf5
+    from sliplab.storage.formats.export_trials import export_trials
+    from sliplab.storage.trials.store import Store
+    from tests.storage.formats.files import lab_cells, lab_hdf5
 
     recording = Store.open(folder / "small-store").campaign("c").recording("a,r=1")
     lab_hdf5(folder / "lab.h5")
@@ -249,8 +249,8 @@ def pickle_seeds() -> dict[str, bytes]:
 
 def make_small_store(folder: Path) -> None:
     """A store with a bit of everything that may stand in one."""
-    from sliplab.storage import control, decisions
-    from tests.storage.trials import campaign, commit
+    from sliplab.storage.trials import control, decisions
+    from tests.storage.trial_files import campaign, commit
 
     made = campaign(folder)
     protocol = "protocol: 1\ncollection: {factors: {depth: {unit: mm, values: [2.4, 2.8]}}}\n"
@@ -262,7 +262,7 @@ def make_small_store(folder: Path) -> None:
     made.quarantine(commit(made, "d,r=1"), "gate sync_uncertainty")
     made.add_bench_record({"operator": "somebody", "temperature": 21.5})
     store_of = made.folder.parents[1]
-    from sliplab.storage.store import Store
+    from sliplab.storage.trials.store import Store
 
     opened = Store.open(store_of)
     control.answer(opened, control.ask(opened, "pause", who="a"), {"did": "paused"})

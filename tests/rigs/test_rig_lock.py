@@ -14,7 +14,7 @@ import pytest
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held, lock_names
-from sliplab.storage.lock import Locked
+from sliplab.storage.trials.lock import Locked
 from tests.conftest import ROOT
 
 HOLDER = """

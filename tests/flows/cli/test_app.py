@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
 from tests.command_line import SECRET, SLIPLAB, here, sliplab, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 
 from sliplab.flows.collecting import controlling
-from sliplab.storage import control
-from sliplab.storage.lock import exclusive
 from sliplab.storage.process import this_process
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials import control
+from sliplab.storage.trials.lock import exclusive
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
 from tests.command_line import SLIPLAB, answer, here, wait_for
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
@@ -155,7 +155,7 @@ SLEEPER = "import sys; print('up', flush=True); sys.stdin.read()"
 HOLDER = """
 import json, sys
 from pathlib import Path
-from sliplab.storage.lock import exclusive
+from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.process import this_process
 with exclusive(Path(sys.argv[1]), "the store"):
     print(json.dumps(this_process()), flush=True)

@@ -15,13 +15,13 @@ from sliplab.analysis.campaigns import collected
 from sliplab.flows.__main__ import _run
 from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols import InputError
-from sliplab.storage.exchange.aedat4 import Aedat4Writer, Stream
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
 from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.storage.exchange.files import lab_hdf5
-from tests.storage.trials import campaign, commit
+from tests.storage.formats.files import lab_hdf5
+from tests.storage.trial_files import campaign, commit
 
 
 @pytest.fixture

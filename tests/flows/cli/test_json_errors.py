@@ -16,7 +16,7 @@ from sliplab.flows.running import stopping
 from sliplab.flows.running.cluster import ClusterError
 from sliplab.rigs.capabilities import ArmFault
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 from tests.command_line import SECRET, here
 from tests.conftest import ROOT
 

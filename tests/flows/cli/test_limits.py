@@ -16,8 +16,8 @@ import pytest
 
 from sliplab.flows.running.limits import exhausted, too_few_threads
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
 from tests.command_line import here
 from tests.conftest import ROOT
 
@@ -132,7 +132,7 @@ def test_a_trial_that_cannot_be_read_now_is_not_damaged(
         raise OSError(number, os.strerror(number), str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"sliplab.storage.whole.{function}", fail)
+        patch.setattr(f"sliplab.storage.trials.checksums.{function}", fail)
         with pytest.raises(OSError, match=os.strerror(number)):
             verify(store)
         if function == "read_json":
@@ -149,8 +149,8 @@ def test_a_trial_that_cannot_be_read_now_is_not_damaged(
 FULL = """
 import resource, sys
 from pathlib import Path
-from sliplab.storage.hdf5 import StreamFile
-from tests.storage.trials import events
+from sliplab.storage.trials.hdf5 import StreamFile
+from tests.storage.trial_files import events
 path = Path(sys.argv[1])
 file = StreamFile(path)
 most = path.stat().st_size + 30_000

@@ -13,11 +13,11 @@ import pytest
 from sliplab.flows import __main__ as program
 from sliplab.flows.cli import remote as cli_remote
 from sliplab.flows.running import stopping
-from sliplab.storage.lock import STORE_LOCK, exclusive
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
-from tests.storage.remotes import tree
-from tests.storage.trials import campaign, commit
+from sliplab.storage.trials.lock import STORE_LOCK, exclusive
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.storage.remote.remotes import tree
+from tests.storage.trial_files import campaign, commit
 
 TRIALS = ("depth=2.4mm,r=1", "depth=2.8mm,r=1")
 

@@ -13,8 +13,8 @@ from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.run_session import run_session
 from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.lock import Locked, exclusive
-from sliplab.storage.store import FORMAT, Store, StoreError
+from sliplab.storage.trials.lock import Locked, exclusive
+from sliplab.storage.trials.store import FORMAT, Store, StoreError
 from tests.flows.collecting.test_faults import TRACKS, slides
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import write

@@ -18,8 +18,8 @@ from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.mock.fault_settings import KINDS
 from sliplab.rigs.rig import Rig
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import Campaign, Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.collecting.test_session import checksums, session, short
 from tests.flows.conftest import tiny_gravity

@@ -16,8 +16,8 @@ from sliplab.flows.collecting.session import Session
 from sliplab.rigs.capabilities import ArmFault, RigError
 from sliplab.storage.files import disk_full, write_json
 from sliplab.storage.schema.trial import TrialRecord
-from sliplab.storage.store import Campaign, Store, StoreError
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.verify import verify
 from tests.command_line import sliplab
 from tests.flows.collecting.test_session import checksums, session, short, take_all
 
@@ -71,7 +71,7 @@ def test_a_disk_too_full_for_the_cause_is_a_full_disk(
     def no_room(path: Path, data: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr("sliplab.storage.store.write_json", no_room)
+    monkeypatch.setattr("sliplab.storage.trials.store.write_json", no_room)
     with pytest.raises(StoreError, match="its disk is full"):
         take_all(work)
     monkeypatch.undo()
@@ -91,7 +91,7 @@ def test_a_disk_that_fills_up_at_the_commit(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         write_json(path, data)
 
-    monkeypatch.setattr("sliplab.storage.writer.write_json_aside", no_room)
+    monkeypatch.setattr("sliplab.storage.trials.writer.write_json_aside", no_room)
     with pytest.raises(StoreError, match="its disk is full"):
         take_all(work)
     monkeypatch.undo()

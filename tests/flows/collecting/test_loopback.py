@@ -14,9 +14,9 @@ from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.rigs.arms.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
 from tests.flows.live import (
     at_work,
     free_udp_port,

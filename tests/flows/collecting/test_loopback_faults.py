@@ -24,8 +24,8 @@ from sliplab.rigs.build import calibrated_arm
 from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.wire.loopback import Loopback
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Campaign, Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import checksums
 from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
 from tests.rigs.loopback import until

@@ -11,7 +11,7 @@ import pytest
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.quality import BURST_US, _event_burst
 from sliplab.protocols.settings import Labelling
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session
 from tests.flows.conftest import tiny_gravity
 

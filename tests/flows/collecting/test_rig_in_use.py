@@ -16,7 +16,7 @@ from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, lock_names
-from sliplab.storage.lock import Locked, exclusive
+from sliplab.storage.trials.lock import Locked, exclusive
 from tests.conftest import ROOT
 
 UR5 = ROOT / "rigs" / "ur5.yaml"

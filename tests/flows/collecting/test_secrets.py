@@ -16,9 +16,9 @@ from sliplab.rigs.rig_file import load_rig_file, rig_hash
 from sliplab.storage.files import read_json
 from sliplab.storage.process import this_process
 from sliplab.storage.secrets import MASK, masked
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
-from tests.storage.trials import campaign, commit
+from tests.storage.trial_files import campaign, commit
 
 SECRET = "marked-secret-7f3a"
 VARIABLES = ("PREFECT_API_KEY", "AWS_SECRET_ACCESS_KEY", "MY_TOKEN", "DB_PASSWORD")

@@ -19,8 +19,8 @@ from sliplab.flows.planning.run_request import (
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.capabilities import ArmFault, RigError
-from sliplab.storage.store import Campaign, Store, StoreError
-from sliplab.storage.verify import verify
+from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, tiny_gravity, write
 

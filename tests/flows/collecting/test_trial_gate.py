@@ -16,10 +16,10 @@ from sliplab.flows.collecting.trial_gate import TrialGate, carry_out, refuse_pau
 from sliplab.flows.planning.run_request import make_request, pending_trials, set_aside
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
-from sliplab.storage import control
-from sliplab.storage.decisions import skipped
-from sliplab.storage.store import Campaign, Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials import control
+from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import checksums, session, short
 
 

@@ -16,9 +16,9 @@ from sliplab.flows.collecting.trial_gate import TrialGate, carry_out
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
 from sliplab.flows.planning.run_request import RunRequest, make_request, pending_trials
 from sliplab.protocols import InputError, load_plan
-from sliplab.storage import control
-from sliplab.storage.store import Campaign, Store
-from sliplab.storage.verify import verify
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import session, short
 from tests.flows.conftest import tiny, write
 

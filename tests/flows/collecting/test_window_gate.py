@@ -13,8 +13,8 @@ from sliplab.flows.collecting.stops import WindowOver
 from sliplab.flows.collecting.trial_gate import TrialGate
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage import control
-from sliplab.storage.store import Store
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 

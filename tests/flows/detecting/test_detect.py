@@ -25,8 +25,8 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.capabilities import RigError
 from sliplab.rigs.rig import Rig
 from sliplab.rigs.rig_file import RigFile
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
 from tests.flows.detecting.detecting import (

@@ -9,7 +9,7 @@ import pytest
 
 from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.protocols.settings import Labelling
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import tiny, tiny_gravity
 

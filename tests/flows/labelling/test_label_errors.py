@@ -9,8 +9,8 @@ import pytest
 
 from sliplab.flows.labelling.label import STEP
 from sliplab.flows.labelling.label_errors import distances, holds_compared
-from sliplab.storage.derived import Derived
-from sliplab.storage.recording import Recording
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
 from tests.flows.reviewable import NAME, Reviewable, label
 
 MS = 1_000_000

@@ -13,10 +13,10 @@ from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.planning.run_request import describe_campaign, make_request, pending_trials
 from sliplab.rigs.build import build_rig
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
-from sliplab.storage.verify import verify
-from sliplab.storage.whole import write_sums
+from sliplab.storage.trials.checksums import write_sums
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, tiny_gravity, write
 

@@ -13,15 +13,15 @@ from sliplab.flows.learning import evaluate, train
 from sliplab.flows.reviewing.review_list import TrialList, chosen, doubts_of
 from sliplab.flows.reviewing.review_trial import load
 from sliplab.protocols.errors import InputError
-from sliplab.storage import review
-from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
-from sliplab.storage.exchange.find import trials_in
-from sliplab.storage.exchange.import_trials import import_trials
-from sliplab.storage.recording import Recording
-from sliplab.storage.review import Onsets, Verdict
+from sliplab.storage.formats.find import trials_in
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.trials import review
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.review import Onsets, Verdict
 from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
-from tests.storage.exchange.files import lab_hdf5
+from tests.storage.formats.files import lab_hdf5
 
 NEW = Onsets(300_000_000, 500_000_000)
 

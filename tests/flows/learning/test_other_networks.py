@@ -28,8 +28,8 @@ from sliplab.flows.reporting.report import read_summary, report
 from sliplab.flows.study import Outcome
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
-from sliplab.storage.derived import Derived
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
 

@@ -18,8 +18,8 @@ from sliplab.flows.learning.samples import load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_scores import kept_counts
 from sliplab.flows.planning.run_request import make_request
-from sliplab.storage.review import Onsets, decide
-from sliplab.storage.store import Store
+from sliplab.storage.trials.review import Onsets, decide
+from sliplab.storage.trials.store import Store
 from tests.flows.conftest import tiny, write
 
 

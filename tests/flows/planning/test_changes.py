@@ -12,10 +12,10 @@ from sliplab.flows.planning.changes import MOST, differences, format_differences
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.storage.trials import commit
+from tests.storage.trial_files import commit
 
 
 def test_differences_name_key_old_and_new() -> None:

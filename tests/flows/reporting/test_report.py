@@ -32,9 +32,9 @@ from sliplab.flows.reporting.report_trials import (
 )
 from sliplab.flows.searching.tradeoff_page import ERRORS
 from sliplab.flows.study import Outcome
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
 from tests.flows.conftest import write

@@ -12,7 +12,7 @@ import pytest
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report import against, report_folder
 from sliplab.flows.study import Outcome
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser
 
 pytestmark = needs_browser

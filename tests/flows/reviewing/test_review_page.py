@@ -18,7 +18,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from sliplab.storage import review
+from sliplab.storage.trials import review
 from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
 from tests.flows.reviewable import DOUBTFUL, NAME, Reviewable, label

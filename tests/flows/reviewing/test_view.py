@@ -17,10 +17,10 @@ import pytest
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.reviewing import view, view_streams
 from sliplab.protocols.errors import InputError
-from sliplab.storage import review
-from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
-from sliplab.storage.review import Onsets
+from sliplab.storage.trials import review
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.review import Onsets
 from tests.flows.listening import listening
 from tests.flows.reviewable import (
     EVENTS,

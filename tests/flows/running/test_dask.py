@@ -27,14 +27,14 @@ from sliplab.flows.running import stopping, trial_work
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.searching.tradeoff_runs import everywhere
 from sliplab.protocols.errors import InputError
-from sliplab.storage.mirror import open_mirror
-from sliplab.storage.push import push
-from sliplab.storage.remote import Remote
-from sliplab.storage.store import Store
+from sliplab.storage.objects import Remote
+from sliplab.storage.remote.mirror import open_mirror
+from sliplab.storage.remote.push import push
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.listening import listening
-from tests.storage.remotes import tree
+from tests.storage.remote.remotes import tree
 
 pytestmark = pytest.mark.programs
 

@@ -21,7 +21,7 @@ from sliplab.flows.labelling.label import label
 from sliplab.flows.running import trial_work
 from sliplab.flows.running.spread import WorkerKilled
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
 from tests.flows.serving.serving import until

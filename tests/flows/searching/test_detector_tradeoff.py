@@ -44,9 +44,9 @@ from sliplab.flows.searching.detector_tradeoff_rows import (
 from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, trial_counts
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Detection, Network, Windows
-from sliplab.storage.derived import Derived
 from sliplab.storage.errors import StoreError
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.reviewable import Reviewable, label

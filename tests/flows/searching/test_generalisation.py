@@ -21,7 +21,7 @@ from sliplab.flows.searching.generalisation import (
 )
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 
 

@@ -17,9 +17,9 @@ from sliplab.flows.searching import guesses
 from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
 from sliplab.flows.searching.guesses import Guesses, Setting, measure_guesses
 from sliplab.flows.study import Outcome
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 
 Json = dict[str, Any]

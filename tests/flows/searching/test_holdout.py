@@ -18,7 +18,7 @@ from sliplab.flows.searching import generalisation, holdout
 from sliplab.flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.store import Store, StoreError
+from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 
 SEEDS = (5, 6)

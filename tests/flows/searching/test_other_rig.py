@@ -8,7 +8,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.searching.other_rig import other_request
 from sliplab.flows.study import Outcome
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 
 
 def test_only_what_is_asked_for_differs(

@@ -27,10 +27,10 @@ from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
 from sliplab.flows.serving.serve_runs import until_of
 from sliplab.flows.serving.service import Service
 from sliplab.protocols import InputError
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.lock import Locked, exclusive
-from sliplab.storage.store import Store
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.lock import Locked, exclusive
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.serving.serving import Page

@@ -20,7 +20,7 @@ import pytest
 
 from sliplab.flows.serving import serve
 from sliplab.protocols import InputError
-from sliplab.storage.store import Store
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.serving.serving import Page, serving, until
 

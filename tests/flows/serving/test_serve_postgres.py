@@ -15,9 +15,9 @@ import pytest
 import yaml
 
 from sliplab.flows.running.embedded_server import EmbeddedServer
-from sliplab.storage import control
 from sliplab.storage.files import read_json
-from sliplab.storage.store import Store
+from sliplab.storage.trials import control
+from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
 from tests.flows.serving.serving import LIMIT_S, Page, serving, until

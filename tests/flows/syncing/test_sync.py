@@ -19,12 +19,12 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.reporting.summary import _sync as sync_summary
 from sliplab.flows.syncing.sync import sync
 from sliplab.flows.syncing.sync_fit import fit_again, same_clocks
-from sliplab.storage.catalogue import catalogue
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import read_json, sha256, write_json
-from sliplab.storage.recording import Recording
-from sliplab.storage.store import Store
-from sliplab.storage.writer import CHECKSUMS, RECORD
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.writer import CHECKSUMS, RECORD
 from tests.flows.conftest import tiny, write
 
 SHIFT_NS = 3_000_000

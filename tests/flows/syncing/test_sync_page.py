@@ -15,11 +15,11 @@ from sliplab.analysis.report.sync_figures import pooled
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
-from sliplab.storage.derived import Derived
 from sliplab.storage.files import write_json
-from sliplab.storage.store import Campaign
-from sliplab.storage.writer import RECORD
-from tests.storage.trials import record
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Campaign
+from sliplab.storage.trials.writer import RECORD
+from tests.storage.trial_files import record
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pytest
 from sliplab.storage.files import json_text
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.trial import Clocks, TrialRecord
-from tests.storage.trials import record
+from tests.storage.trial_files import record
 
 PATH = Path("record.json")
 

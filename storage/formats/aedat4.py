@@ -1,0 +1,374 @@
+"""AEDAT4 read and written: the files of iniVation's cameras and of dv-processing.
+
+A file is a line, a header that describes its streams in XML, and packets: stream, length, and a
+flatbuffer, mostly compressed. It is read here and not through dv-processing, which is C++ that
+believes what a file says; and it is written here, because that library takes events one by one.
+Both directions are held against it by tests. Times are microseconds as the file has them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow as pa
+from numba import njit
+
+from sliplab.storage.formats.dv_buffers import (
+    GREY,
+    events_buffer,
+    frame_buffer,
+    header_buffer,
+    triggers_buffer,
+)
+from sliplab.storage.formats.flatbuffer import Table
+from sliplab.storage.formats.foreign import LATEST_US, MOST_PX, FormatError, Triggers, event_chunk
+from sliplab.storage.streams import U8, EventChunk
+
+LINE = b"#!AER-DAT4.0\r\n"
+EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"
+_CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
+_MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
+_PACKET_EVENTS = 1 << 16
+_PIECE = 1 << 20
+_ZSTD = 3
+_MOST_RATIO = 64
+"""Of a packet's content to its bytes, up to which the size in its header is believed."""
+_START_OF_EXPOSURE, _END_OF_EXPOSURE = 3, 4
+"""Fields of a frame."""
+_COLOUR = {16: 3, 24: 4}
+"""OpenCV's numbers of 8-bit pictures with three and four channels."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One stream of a file: what is in it, and how large its pictures are."""
+
+    kind: str
+    name: str
+    size: tuple[int, int] | None
+    source: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame: grey levels (height, width), middle of exposure in ns."""
+
+    image: U8
+    t_ns: int
+
+
+class Aedat4File:
+    """A file that is open for reading; a context manager.
+
+    Raises:
+        FormatError: it is none, or damaged.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._handle = path.open("rb")
+        self._buffer = bytearray(_PIECE)
+        try:
+            self._bytes = path.stat().st_size
+            if (line := self._handle.read(len(LINE))) != LINE:
+                raise FormatError(f"is no AEDAT4 file: it begins with {line!r}, not with {LINE!r}")
+            header = self._exactly(_length(self._exactly(4), _MOST_HEADER))
+            table = Table.root(memoryview(_prefixed(header)), b"IOHE")
+            self._codec = _CODECS.get(table.number(0, "<i"), "")
+            if self._codec == "":
+                raise FormatError("is compressed in an unknown way")
+            end = table.number(1, "<q", -1)
+            self._begin = self._handle.tell()
+            self._end = self._bytes if end <= 0 else end
+            if not self._begin <= self._end <= self._bytes:
+                raise FormatError("is cut short")
+            self.streams = _streams(bytes(table.vector(2, 1)[1]))
+        except BaseException:
+            self._handle.close()
+            raise
+
+    def __enter__(self) -> Aedat4File:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._handle.close()
+
+    def first(self, kind: str) -> int | None:
+        """The first stream of a kind."""
+        return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
+
+    def events(self, number: int) -> Iterator[EventChunk]:
+        """The events of a stream, packets together up to `_PACKET_EVENTS` events.
+
+        A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
+        """
+        room = _empty(_PACKET_EVENTS)
+        filled = last = 0
+        for data in self._packets(number):
+            rows = np.frombuffer(Table.root(data, b"EVTS").vector(0, 16)[1], "<u8")
+            count = len(rows) // 2
+            if filled and filled + count > len(room):
+                yield _part(room, 0, filled)
+                filled = 0
+                room = _empty(_PACKET_EVENTS)
+            if count > len(room):
+                room = _empty(count)
+            if not rows.flags.aligned:
+                rows = rows.copy()
+            rows.flags.writeable = False  # `_split_events` is compiled for such
+            new = _part(room, filled, filled + count)
+            last = _split_events(rows, new.x, new.y, new.p, new.t_us, last)
+            if last < 0:
+                event_chunk(new.x, new.y, new.p, new.t_us)
+                raise FormatError("holds events whose times run backwards")
+            filled += count
+        if filled:
+            yield _part(room, 0, filled)
+
+    def triggers(self, number: int) -> Triggers:
+        """All triggers of a stream."""
+        found = [
+            (table.number(0, "<q"), table.number(1, "<B"))
+            for data in self._packets(number)
+            for table in Table.root(data, b"TRIG").tables(0)
+        ]
+        times = np.array([t for t, _ in found], np.int64)
+        if np.any(times < 0) or np.any(times >= LATEST_US) or np.any(times[1:] < times[:-1]):
+            raise FormatError("holds triggers whose times run backwards or are none")
+        return Triggers(times, np.array([kind for _, kind in found], np.uint8))
+
+    def pictures(self, number: int) -> Iterator[Picture]:
+        """The frames of a stream, colours as grey levels."""
+        last = -1
+        for data in self._packets(number):
+            table = Table.root(data, b"FRME")
+            t_ns, form = _middle_ns(table), table.number(5, "<b")
+            width, height = table.number(6, "<h"), table.number(7, "<h")
+            channels = 1 if form == GREY else _COLOUR.get(form, 0)
+            count, pixels = table.vector(10, 1)
+            if not channels or width <= 0 or height <= 0 or count != width * height * channels:
+                raise FormatError(
+                    f"holds a frame of {width} x {height} with {count} bytes of kind {form}; read "
+                    "are 8-bit frames with 1, 3 or 4 channels (kinds 0, 16 and 24)"
+                )
+            if not last <= t_ns < LATEST_US * 1000:
+                raise FormatError("holds frames whose times run backwards or are none")
+            last = t_ns
+            yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
+
+    def _packets(self, number: int) -> Iterator[memoryview]:
+        """Unpacked packets of one stream, each gone with the next; the others are passed over."""
+        self._handle.seek(self._begin)
+        while (at := self._handle.tell()) < self._end:
+            stream, size = struct.unpack("<ii", self._exactly(8))
+            if stream not in self.streams or not 0 <= size <= min(self._end - at - 8, _MOST_PACKET):
+                raise FormatError(
+                    f"holds a packet of {size} bytes in stream {stream}, at byte {at}"
+                )
+            if stream != number:
+                self._handle.seek(size, 1)
+                continue
+            try:
+                yield self._unpacked(self._exactly(size))
+            except (pa.ArrowException, OSError) as error:
+                raise FormatError(
+                    f"holds a packet that cannot be unpacked, at byte {at}: {error}"
+                ) from None
+
+    def _unpacked(self, data: bytes) -> memoryview:
+        """A packet's content, which may stand in a buffer that is used again."""
+        if self._codec is None:
+            return memoryview(data)
+        if self._codec == "zstd" and 0 < (size := _zstd_size(data)) <= _MOST_RATIO * len(data):
+            with suppress(pa.ArrowException, OSError):  # the stream below finds what is wrong
+                return memoryview(pa.decompress(data, size, "zstd"))
+        filled = 0
+        with pa.CompressedInputStream(pa.BufferReader(data), self._codec) as stream:
+            while part := stream.readinto(memoryview(self._buffer)[filled:]):
+                filled += part
+                if filled > _MOST_PACKET:
+                    raise FormatError("holds a packet that unpacks to too much")
+                if filled == len(self._buffer):  # room for what comes, not for what a header says
+                    self._buffer = self._buffer + bytearray(filled)
+        return memoryview(self._buffer)[:filled]
+
+    def _exactly(self, count: int) -> bytes:
+        found = self._handle.read(count)
+        if len(found) != count:
+            raise FormatError("is cut short")
+        return found
+
+
+def _middle_ns(frame: Table) -> int:
+    """The middle of a frame's exposure; its time stamp where the file has no start and end.
+
+    The time stamp is the start of exposure in what dv-processing writes, and the middle in what
+    older programs write, which leave start and end out.
+    """
+    start, end = frame.number(_START_OF_EXPOSURE, "<q"), frame.number(_END_OF_EXPOSURE, "<q")
+    if start <= 0 or end <= 0:
+        return frame.number(0, "<q") * 1000
+    if end < start:
+        raise FormatError(f"holds a frame whose exposure starts at {start} us and ends at {end} us")
+    return (start + end) * 500
+
+
+@njit(cache=True, nogil=True)
+def _split_events(words, x, y, p, t, last):  # type: ignore[no-untyped-def]
+    """Fill the columns of events from two 64-bit words each: time, and pixel with polarity.
+
+    Args:
+        last: the time of the event before, us.
+
+    Returns:
+        The time of the last event; -1 where a pixel is none, or a time earlier than the one before.
+    """
+    wrong: Any = False
+    for i in range(len(words) // 2):
+        now, place = np.int64(words[2 * i]), words[2 * i + 1]
+        x[i] = column = place & np.uint64(0xFFFF)
+        y[i] = row = place >> np.uint64(16) & np.uint64(0xFFFF)
+        p[i] = place >> np.uint64(32) & np.uint64(1)
+        t[i] = now
+        wrong |= now < last or column >= MOST_PX or row >= MOST_PX or now >= LATEST_US
+        last = now
+    return -1 if wrong else last
+
+
+def _empty(count: int) -> EventChunk:
+    return EventChunk(
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint16),
+        np.empty(count, np.uint8),
+        np.empty(count, np.int64),
+    )
+
+
+def _part(chunk: EventChunk, low: int, high: int) -> EventChunk:
+    part = slice(low, high)
+    return EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+
+
+def _length(data: bytes, most: int) -> int:
+    count = int(struct.unpack("<I", data)[0])
+    if count > most:
+        raise FormatError(f"has a header of {count} bytes")
+    return count
+
+
+def _prefixed(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _zstd_size(frame: bytes) -> int:
+    """The size of a zstd frame's content by its header (RFC 8878); 0 where it gives none."""
+    if len(frame) < 14 or frame[:4] != b"\x28\xb5\x2f\xfd":
+        return 0
+    single = frame[4] >> 5 & 1
+    at = 6 - single + (0, 1, 2, 4)[frame[4] & 3]
+    width = (single, 2, 4, 8)[frame[4] >> 6]
+    return int.from_bytes(frame[at : at + width], "little") + (256 if width == 2 else 0)
+
+
+def _grey(pixels: Any, height: int, width: int, channels: int) -> U8:
+    if channels == 1:
+        return np.array(pixels, np.uint8).reshape(height, width)
+    levels = pixels.reshape(height, width, channels)[..., :3].astype(np.uint32)  # blue, green, red
+    weighed = levels @ np.array([114, 587, 299], np.uint32) + 500
+    return np.asarray(weighed // 1000, np.uint8)
+
+
+def _streams(text: bytes) -> dict[int, Stream]:
+    if b"<!" in text:
+        raise FormatError("has a header that defines words of its own")
+    try:
+        root = ElementTree.fromstring(text.rstrip(b"\0").decode("utf-8"))
+        found = {}
+        for node in root.iterfind("./node[@name='outInfo']/node"):
+            values = {item.get("key"): item.text or "" for item in node.iter("attr")}
+            size = None
+            if "sizeX" in values and "sizeY" in values:
+                size = (int(values["sizeX"]), int(values["sizeY"]))
+            kind = values.get("typeIdentifier", "")
+            name = values.get("originalOutputName", kind)
+            found[int(node.get("name", ""))] = Stream(kind, name, size, values.get("source", ""))
+    except (ElementTree.ParseError, ValueError) as error:
+        raise FormatError(f"has a header that cannot be read: {error}") from None
+    return found
+
+
+class Aedat4Writer:
+    """Writes a file; packets are compressed with zstd. A context manager.
+
+    Args:
+        streams: those that will come, by number.
+    """
+
+    def __init__(self, path: Path, streams: dict[int, Stream]) -> None:
+        self._handle = path.open("wb")
+        self._handle.write(LINE + header_buffer(_described(streams), _ZSTD))
+
+    def __enter__(self) -> Aedat4Writer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._handle.close()
+
+    def events(self, number: int, chunk: EventChunk) -> None:
+        """Append events; times must not run backwards, over all calls."""
+        for start in range(0, len(chunk), _PACKET_EVENTS):
+            self._write(number, events_buffer(_part(chunk, start, start + _PACKET_EVENTS)))
+
+    def triggers(self, number: int, found: Triggers) -> None:
+        """Append triggers."""
+        if len(found.t_us):
+            self._write(number, triggers_buffer(found.t_us, found.kind))
+
+    def picture(self, number: int, image: U8, t_us: int) -> None:
+        """Append a frame of grey levels."""
+        self._write(number, frame_buffer(image, t_us))
+
+    def _write(self, number: int, made: bytes) -> None:
+        packed = pa.compress(made, codec="zstd", asbytes=True)
+        self._handle.write(struct.pack("<ii", number, len(packed)) + packed)
+
+
+def _described(streams: dict[int, Stream]) -> str:
+    root = ElementTree.Element("dv", version="2.0")
+    out = ElementTree.SubElement(root, "node", name="outInfo", path="/outInfo/")
+    for number, stream in sorted(streams.items()):
+        path = f"/outInfo/{number}/"
+        node = ElementTree.SubElement(out, "node", name=str(number), path=path)
+        for key, text in (
+            ("compression", "ZSTD"),
+            ("originalModuleName", "sliplab"),
+            ("originalOutputName", stream.name),
+            ("typeIdentifier", stream.kind),
+        ):
+            ElementTree.SubElement(node, "attr", key=key, type="string").text = text
+        info = ElementTree.SubElement(node, "node", name="info", path=f"{path}info/")
+        if stream.size is not None:
+            for axis, value in zip("XY", stream.size, strict=True):
+                item = ElementTree.SubElement(info, "attr", key=f"size{axis}", type="int")
+                item.text = str(value)
+        ElementTree.SubElement(info, "attr", key="source", type="string").text = stream.source
+    return ElementTree.tostring(root, encoding="unicode")

@@ -1,0 +1,154 @@
+"""Export of committed trials to files of other formats, one a trial; the store is only read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
+from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4Writer, Stream
+from sliplab.storage.formats.dsec import write_dsec
+from sliplab.storage.formats.foreign import Triggers
+from sliplab.storage.formats.import_trials import RISING
+from sliplab.storage.formats.manifest import FORMAT, MANIFEST
+from sliplab.storage.formats.read_aedat4 import SIMULATED
+from sliplab.storage.streams import I64, EventChunk, Json
+from sliplab.storage.trials.recording import Recording
+
+SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
+"""Of the files of each format."""
+_PIECE = 1 << 20
+
+
+def export_trials(
+    recordings: list[Recording],
+    folder: Path,
+    kind: str,
+    campaign: str,
+    on_trial: Callable[[str], None] = lambda name: None,
+) -> Json:
+    """Export trials to `folder`, each file whole or not at all, and a manifest last.
+
+    Returns:
+        ``trials``, ``events``, ``frames`` and ``triggers`` written, and ``files``.
+
+    Raises:
+        InputError: a trial does not fit the format.
+        StoreError: a trial is damaged.
+    """
+    make_folder(folder)
+    listed: list[Json] = []
+    for recording in recordings:
+        on_trial(recording.trial_id)
+        path = folder / f"{recording.trial_id}{SUFFIXES[kind]}"
+        temporary = path.with_name(f".{path.name[:200]}.{os.getpid()}.tmp")
+        try:
+            counts = _WRITERS[kind](recording, temporary)
+            sync_file(temporary)
+            os.replace(temporary, path)
+        except ValueError as error:
+            raise InputError("--format", "", kind, f"trial {recording.trial_id} {error}") from None
+        finally:
+            temporary.unlink(missing_ok=True)
+        listed.append(_listed(recording, path.name, counts))
+    sync_folder(folder)
+    simulated = any(recording.simulated for recording in recordings)
+    about = {"sliplab_export": FORMAT, "campaign": campaign, "format": kind, "simulated": simulated}
+    write_json(folder / MANIFEST, {**about, "trials": listed})
+    totals = {name: sum(item[name] for item in listed) for name in ("events", "frames", "triggers")}
+    return {"trials": len(listed), **totals, "files": [item["file"] for item in listed]}
+
+
+def _listed(recording: Recording, name: str, counts: dict[str, int]) -> Json:
+    record = recording.record
+    kept = record.model_dump(
+        mode="json", include={"experiment", "role", "clocks", "steps"}, exclude_unset=True
+    )
+    return {
+        "trial": recording.trial_id,
+        "file": name,
+        "condition": record.condition,
+        "repetition": record.repetition,
+        "record": kept,
+        **counts,
+    }
+
+
+def _source(recording: Recording) -> str:
+    return f"sliplab {SIMULATED}" if recording.simulated else "sliplab"
+
+
+def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
+    """Everything on the event camera's clock, us; frames at the middle of their exposure."""
+    triggers = _triggers(recording)
+    streams = {0: Stream(EVENTS, "events", _size(recording), _source(recording))}
+    frame_us = np.empty(0, np.int64)
+    if recording.has_video:
+        frame_us = recording.clock("events").to_device(recording.frame_times()) // 1000
+        first = recording.frame(0) if len(frame_us) else np.empty((1, 1))
+        height, width = first.shape
+        streams[1] = Stream(FRAMES, "frames", (width, height), _source(recording))
+    streams[2] = Stream(TRIGGERS, "triggers", None, _source(recording))
+    if len(frame_us) and int(frame_us.min()) < 0:
+        raise ValueError("has frames before the event camera's clock began")
+    with Aedat4Writer(path, streams) as file:
+        count = 0
+        for chunk in _pieces(recording):
+            file.events(0, chunk)
+            count += len(chunk)
+        file.triggers(2, triggers)
+        if recording.has_video:
+            for image, t_us in zip(recording.frames(), frame_us.tolist(), strict=True):
+                file.picture(1, image, t_us)
+    return {"events": count, "frames": len(frame_us), "triggers": len(triggers.t_us)}
+
+
+def _dsec(recording: Recording, path: Path) -> dict[str, int]:
+    """Events and triggers; frames have no place in DSEC's event file."""
+    triggers = _triggers(recording)
+    with recording.open() as reader:
+        events = reader.events()
+    write_dsec(path, events, triggers, simulated=recording.simulated)
+    return {"events": len(events), "frames": 0, "triggers": len(triggers.t_us)}
+
+
+_WRITERS: dict[str, Callable[[Recording, Path], dict[str, int]]] = {
+    "aedat4": _aedat4,
+    "dsec": _dsec,
+}
+
+
+def _pieces(recording: Recording) -> Iterator[EventChunk]:
+    """All events, about `_PIECE` at a time."""
+    with recording.open() as reader:
+        cuts = np.unique(reader.event_times()[::_PIECE]).tolist()
+        for start, end in zip(cuts, [*cuts[1:], None], strict=True):
+            yield reader.events(start, end)
+
+
+def _triggers(recording: Recording) -> Triggers:
+    """As they were imported, or else the sync pulses as rising edges."""
+    with recording.open() as reader:
+        if reader.has("triggers/t"):
+            t_ns: I64 = reader.column("triggers/t")
+            kinds = reader.column("triggers/kind").astype(np.uint8)
+        else:
+            t_ns = reader.pulses("event_pulses")
+            kinds = np.full(len(t_ns), RISING, np.uint8)
+    return Triggers(t_ns // 1000, kinds)
+
+
+def _size(recording: Recording) -> tuple[int, int]:
+    """Columns and rows of the event camera, or what its events need."""
+    if (known := recording.record.geometry.event_px) is not None:
+        return known
+    with recording.open() as reader:
+        events = reader.events()
+    return (
+        int(events.x.max(initial=0)) + 1,
+        int(events.y.max(initial=0)) + 1,
+    )

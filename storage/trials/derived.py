@@ -1,0 +1,98 @@
+"""Derived results: each stands under its step and name, with the key of what made it.
+
+A key is the hash of a result's inputs, its parameters and its step's own version constant. A
+result whose key is still the wanted one is fresh and is not made again; anything else is stale.
+Raw data are never touched, and the whole folder may be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.protocols.hashing import hash_data
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json, write_bytes, write_json
+from sliplab.storage.names import inside, safe_name
+from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.store import Store
+
+DocumentT = TypeVar("DocumentT", bound=Document)
+
+
+def make_key(step: str, version: int, inputs: Any, parameters: Any) -> str:
+    """The key of a result."""
+    return hash_data([step, version, inputs, parameters])
+
+
+@dataclass(frozen=True)
+class Derived:
+    """The results of one step."""
+
+    folder: Path
+
+    @staticmethod
+    def of(store: Store, step: str, campaign: str | None = None) -> Derived:
+        """Results of `step`; those about single trials stand under their campaign."""
+        folder = store.folder / "derived" / safe_name(step)
+        folder = folder if campaign is None else folder / safe_name(campaign)
+        return Derived(inside(folder, store.folder))
+
+    def key(self, name: str) -> str | None:
+        """The key that the result `name` was made with; None if there is none."""
+        try:
+            return str(read_json(self.folder / f"{safe_name(name)}.json")["key"])
+        except (OSError, ValueError, KeyError):
+            return None
+
+    def fresh(self, name: str, key: str) -> bool:
+        """Whether `name` was made with `key`."""
+        return self.key(name) == key
+
+    def write(self, name: str, key: str, data: Json, arrays: dict[str, Any] | None = None) -> None:
+        """Keep a result; the JSON with its key is written last and decides."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if arrays is not None:
+            buffer = io.BytesIO()
+            np.savez_compressed(buffer, **arrays)
+            write_bytes(self.arrays_path(name), buffer.getvalue())
+        write_json(self.folder / f"{safe_name(name)}.json", {"key": key, **data})
+
+    def read(self, name: str) -> Json:
+        """A result's JSON.
+
+        Raises:
+            FileNotFoundError: it was never made.
+        """
+        return read_json(self.folder / f"{safe_name(name)}.json")
+
+    def load(self, name: str, kind: type[DocumentT]) -> DocumentT:
+        """Read a result's JSON as a document.
+
+        Raises:
+            FileNotFoundError: it was never made.
+            StoreError: it is damaged, or was written by a newer version.
+        """
+        try:
+            return kind.load(self.folder / f"{safe_name(name)}.json")
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
+            raise StoreError(
+                f"{error}; it is damaged: delete it, and its step makes it again"
+            ) from None
+
+    def arrays_path(self, name: str) -> Path:
+        """The file that holds a result's arrays."""
+        return self.folder / f"{safe_name(name)}.npz"
+
+    def arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
+        """A result's arrays."""
+        with np.load(self.arrays_path(name), allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}

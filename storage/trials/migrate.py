@@ -1,0 +1,85 @@
+"""Brings a store of an older format to this version's, with copies of what is changed.
+
+| from | to | what changes |
+| --- | --- | --- |
+| 1 | 2 | every campaign gets `checksums.json` for its description, protocol and rig file; trials
+            may hold columns that format 1 did not know how to read |
+
+Committed trials are never rewritten: this version reads the files of every format. A migration
+that is interrupted is begun again: copies that are complete stay as they are, each step gives
+the same result however often it runs, and the store's format is written last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from sliplab.storage.files import make_folder, write_bytes, write_json
+from sliplab.storage.trials.checksums import write_sums
+from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, Store, StoreError
+from sliplab.storage.trials.writer import CHECKSUMS
+
+Step = Callable[[Store], None]
+
+
+def _describe_with_sums(store: Store) -> None:
+    for campaign in store.campaigns():
+        names = (PROTOCOL, RIG, INFO)
+        missing = [name for name in names if not (campaign.folder / name).is_file()]
+        if missing:
+            raise StoreError(
+                f"{campaign.folder / missing[0]}: is missing: put it back from a copy, or move "
+                f"{campaign.folder} away; nothing was changed"
+            )
+        write_sums(campaign.folder, names)
+
+
+STEPS: dict[int, Step] = {1: _describe_with_sums}
+"""By the format that each begins with."""
+
+
+def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
+    """Bring a store to the newest format; whoever calls this holds the store's lock.
+
+    Args:
+        steps: by the format that each begins with; all that there are by default.
+
+    Returns:
+        The formats that it had until now, oldest first; empty when it is the newest already.
+
+    Raises:
+        StoreError: a campaign's description is damaged.
+    """
+    steps = STEPS if steps is None else steps
+    passed = []
+    while (found := store.format) in steps:
+        _keep(store, found)
+        steps[found](store)
+        write_json(store.folder / STORE, {"format": found + 1})
+        passed.append(found)
+    return passed
+
+
+def kept(store: Store, number: int) -> Path:
+    """Where copies of what a migration changed are kept, by the format that they are of."""
+    return store.folder / "before" / f"format-{number}"
+
+
+def _keep(store: Store, number: int) -> None:
+    folder = kept(store, number)
+    if (folder / STORE).exists():
+        return  # complete: it is copied last
+    for path in _changeable(store):
+        copy = folder / path.relative_to(store.folder)
+        if path.is_file():
+            make_folder(copy.parent)
+            write_bytes(copy, path.read_bytes())
+
+
+def _changeable(store: Store) -> Iterable[Path]:
+    """Everything that is not a committed trial and not made by analysis."""
+    for campaign in store.campaigns():
+        for name in (PROTOCOL, RIG, INFO, CHECKSUMS):
+            yield campaign.folder / name
+    yield store.folder / STORE

@@ -1,0 +1,309 @@
+"""A committed trial as the analysis sees it: raw streams, clock maps, record."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.errors import StoreError
+from sliplab.storage.fetching import fetch
+from sliplab.storage.schema.document import DocumentError, NewerFormat
+from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
+from sliplab.storage.streams import F64, I64, U8, EventChunk, Json
+from sliplab.storage.trials.checksums import byte_problem, read_sums, to_fetch
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.video import FrameReader, read_frame, read_frames
+from sliplab.storage.trials.writer import DATA, FRAMES, RECORD
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Where the markers were in each of n frames, by the camera's own account; pixels."""
+
+    markers_px: F64
+    """(n, m, 2) in the order of the record's layout, NaN where a marker was not seen whole."""
+    plate_px: F64 | None
+    """(n, 2), NaN where the plate's marker was not seen; None without one."""
+
+
+class Recording:
+    """One trial on disk. Times on the trial's time line are the sync box's clock, int64 ns.
+
+    A committed trial is never rewritten, and never read where it is not what was committed: each
+    of its files is held against its checksum before this object first reads it. Where its clocks
+    were fitted again and came out otherwise, the new ones stand among the derived results, and are
+    used in the record's place.
+
+    Args:
+        folder: the trial's own folder.
+        sync_file: where the result of fitting its clocks again is, once there is one.
+    """
+
+    def __init__(self, folder: Path, sync_file: Path | None = None) -> None:
+        self.folder = folder
+        self.sync_file = sync_file
+        self._checked: set[str] = set()
+
+    def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None]]:
+        """To another process goes where the trial is, not what was read of it."""
+        return Recording, (self.folder, self.sync_file)
+
+    @cached_property
+    def record(self) -> TrialRecord:
+        """The trial's record.
+
+        Raises:
+            StoreError: it is damaged, or was written by a newer version.
+        """
+        path = self._sound(RECORD)
+        try:
+            return TrialRecord.load(path)
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
+            raise self._damaged(str(error)) from None
+
+    @property
+    def trial_id(self) -> str:
+        """The trial's id."""
+        return self.record.trial
+
+    @cached_property
+    def raw_checksum(self) -> str:
+        """One hash that stands for the raw data of this trial and its record."""
+        return "".join(str(self._sums[name]["sha256"])[:16] for name in sorted(self._sums))
+
+    @cached_property
+    def _sums(self) -> Json:
+        """The trial's checksums."""
+        try:
+            return read_sums(self.folder)
+        except ValueError as error:
+            raise self._damaged(str(error)) from None
+
+    def _sound(self, name: str) -> Path:
+        """One of the trial's files, once it has been held against its checksum.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        path = self.folder / name
+        if name not in self._checked:
+            if name not in self._sums:
+                raise self._damaged(f"{path}: is not among the checksums")
+            if to_fetch(path):
+                fetch(path, self._sums[name])
+            if (problem := byte_problem(path, self._sums[name])) is not None:
+                raise self._damaged(f"{path}: {problem}")
+            self._checked.add(name)
+        return path
+
+    def _damaged(self, what: str) -> StoreError:
+        store = self.folder.parents[3] if len(self.folder.parents) > 3 else self.folder
+        return StoreError(
+            f"{what}: this trial is damaged; `sliplab verify {store} --quarantine` sets it aside, "
+            "and `sliplab collect` takes it again"
+        )
+
+    @property
+    def checksum(self) -> str:
+        """What stands for all that analysis reads of this trial: raw data and clocks in use."""
+        refitted = self._refitted
+        return self.raw_checksum if refitted is None else self.raw_checksum + refitted.key
+
+    @cached_property
+    def clocks(self) -> Clocks:
+        """The clocks of the trial: fitted again, or else as the record has them."""
+        refitted = self._refitted
+        found = None if refitted is None else refitted.clocks
+        return self.record.clocks if found is None else found
+
+    @property
+    def refitted(self) -> bool:
+        """Whether other clocks are in use than those of the record."""
+        return self._refitted is not None
+
+    @cached_property
+    def _refitted(self) -> SyncResult | None:
+        """The result of fitting again, where it holds other clocks than the record's."""
+        if self.sync_file is None or not self.sync_file.exists():
+            return None
+        try:
+            found = SyncResult.load(self.sync_file)
+            # a trial that was taken anew under this id has nothing to do with it
+            if found.raw != self.raw_checksum or found.clocks is None:
+                return None
+            if found.clocks.events is None:
+                raise DocumentError(f"{self.sync_file}: clocks.events: is missing")
+        except NewerFormat as error:
+            raise StoreError(str(error)) from None
+        except DocumentError as error:
+            raise StoreError(
+                f"{error}; it is damaged: delete it, and `sliplab sync` makes it again"
+            ) from None
+        return found
+
+    @property
+    def clocks_elsewhere(self) -> SyncResult | None:
+        """What another process needs to use the same clocks (`use_clocks`): None, the record's."""
+        return self._refitted
+
+    def use_clocks(self, refitted: SyncResult | None) -> None:
+        """Use the clocks that `clocks_elsewhere` was in another process, whatever is kept here."""
+        self.__dict__.pop("clocks", None)
+        self.__dict__["_refitted"] = refitted
+
+    def forget_clocks(self) -> None:
+        """Look for refitted clocks anew: they have just been written."""
+        for name in ("_refitted", "clocks"):
+            self.__dict__.pop(name, None)
+
+    @property
+    def has_video(self) -> bool:
+        """Whether the frames themselves were recorded."""
+        return FRAMES in self._sums
+
+    @cached_property
+    def has_tracks(self) -> bool:
+        """Whether the markers' places were recorded instead of a video."""
+        with self.open() as reader:
+            return reader.has("tracks/markers")
+
+    @property
+    def frame_source(self) -> str:
+        """``video``, ``tracks`` or ``none``: what is there of the outside camera."""
+        if self.has_video:
+            return "video"
+        # frames that are in no video are tracks, and the record is a small file
+        return "tracks" if self.record.counts.frames else "none"
+
+    @property
+    def event_px(self) -> tuple[int, int]:
+        """Columns and rows of the event camera.
+
+        Raises:
+            StoreError: they are unknown, as of an imported trial.
+        """
+        found = self.record.geometry.event_px
+        if found is None:
+            raise StoreError(f"{self.folder}: the size of its event camera is unknown")
+        return found
+
+    @property
+    def frame_px(self) -> tuple[int, int]:
+        """Columns and rows of the frames.
+
+        Raises:
+            StoreError: the trial was recorded without frames.
+        """
+        found = self.record.geometry.frame_px
+        if found is None:
+            raise StoreError(f"{self.folder}: was recorded without frames")
+        return found
+
+    @property
+    def layout_px(self) -> F64:
+        """Places of the markers at rest from the frame's centre, pixels; float64 (m, 2).
+
+        Raises:
+            StoreError: the trial holds no scale.
+        """
+        geometry = self.record.geometry
+        if geometry.px_per_mm is None:
+            raise StoreError(f"{self.folder}: the scale of its frames is unknown")
+        layout = np.asarray(geometry.skin_mm, np.float64) * geometry.px_per_mm
+        layout[:, 1] *= -1  # rows count downwards
+        return layout
+
+    def open(self) -> StreamReader:
+        """The HDF5 file, as a context manager."""
+        return StreamReader(self._sound(DATA))
+
+    def clock(self, device: str) -> ClockMap:
+        """The map from a device's clock (``events``, ``frames``, ``arm``) to the time line.
+
+        Raises:
+            StoreError: the trial has no such clock.
+        """
+        known = self.clocks.devices()
+        if device not in known:
+            names = ", ".join(sorted(known)) or "none"
+            raise StoreError(f"{self.folder}: the trial has no clock '{device}'; it has: {names}")
+        return known[device].map
+
+    def events(self, start_ns: int | None = None, end_ns: int | None = None) -> EventChunk:
+        """Events between two times of the time line, on the camera's own clock."""
+        clock = self.clock("events")
+        bounds = [
+            None if t is None else -(-int(clock.to_device(t)) // 1000) for t in (start_ns, end_ns)
+        ]
+        with self.open() as reader:
+            return reader.events(*bounds)
+
+    def frame_times(self) -> I64:
+        """Middle of exposure of every frame on the time line, ns."""
+        with self.open() as reader:
+            times = reader.column("frames/t")
+        return np.asarray(self.clock("frames").to_reference(times))
+
+    def frames(self, threads: int = 1) -> Iterator[U8]:
+        """Decoded frames, uint8 of shape (height, width)."""
+        return read_frames(self._sound(FRAMES), threads)
+
+    def frame(self, index: int) -> U8:
+        """One decoded frame."""
+        return read_frame(self._sound(FRAMES), index)
+
+    def frame_reader(self) -> FrameReader:
+        """The video, opened for frames in any order; a context manager."""
+        return FrameReader(self._sound(FRAMES))
+
+    def tracks(self) -> Tracks:
+        """The markers' places, where they were recorded instead of a video.
+
+        Raises:
+            ValueError: the trial has none.
+        """
+        if not self.has_tracks:
+            raise ValueError(f"{self.folder}: holds no tracks")
+        with self.open() as reader:
+            plate = reader.column("tracks/plate") if reader.has("tracks/plate") else None
+            markers = reader.column("tracks/markers")
+        return Tracks(
+            markers.astype(np.float64), None if plate is None else plate.astype(np.float64)
+        )
+
+    def step(self, phase: str) -> tuple[int, int]:
+        """Start and end of a phase of the motion on the time line, ns.
+
+        The last step of that name is meant, which is the recorded one.
+
+        Raises:
+            KeyError: the motion has no such phase.
+        """
+        clock = self.clock("arm")
+        for step in reversed(self.record.steps):
+            if step.phase == phase:
+                return clock.to_reference(step.start_ns), clock.to_reference(step.end_ns)
+        raise KeyError(f"{self.trial_id}: no step '{phase}'")
+
+    @property
+    def motion_phase(self) -> str:
+        """``slide`` or ``retract``: the phase in which slip is looked for."""
+        phases = {step.phase for step in self.record.steps}
+        return "slide" if "slide" in phases else "retract"
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a mock rig made this."""
+        return self.record.simulated
+
+    def simulation_truth(self) -> dict[str, Any] | None:
+        """What really happened, on the time line; only for tests and error reports."""
+        return self.record.simulation_truth

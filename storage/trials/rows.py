@@ -1,0 +1,152 @@
+"""Reading columns of an HDF5 file through the library's own calls.
+
+h5py's files and datasets make a window of 30 ms cost twice as much as its events do. What is read
+must be in the file itself: links, external and virtual data would lead out of it.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # noqa: F401  (registers the filters)
+import numpy as np
+
+from sliplab.storage.streams import I64
+from sliplab.storage.trials.columns import Array
+
+_BLOCK = 1 << 15
+_FEW = 16
+_CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
+"""Of unpacked chunks, a column. A chunk of events fits; more than the processor's own cache holds
+would make every chunk go through main memory."""
+
+
+@cache
+def _access() -> Any:
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)  # as h5py does: columns close with their file
+    access.set_cache(0, _CACHE_SLOTS, _CACHE_BYTES, 0.75)
+    return access
+
+
+class RowFile:
+    """An HDF5 file that is open for reading.
+
+    Raises:
+        OSError: it cannot be opened, or is none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = h5py.h5f.open(os.fsencode(path), h5py.h5f.ACC_RDONLY, fapl=_access())
+        self._opened: dict[str, Rows] = {}
+
+    def close(self) -> None:
+        """Close it, and every column of it."""
+        self._opened.clear()
+        self._file.close()
+
+    def attribute(self, name: str, otherwise: int) -> int:
+        """An integer attribute of the file."""
+        if not h5py.h5a.exists(self._file, name.encode()):
+            return otherwise
+        value = np.empty((), np.int64)
+        h5py.h5a.open(self._file, name.encode()).read(value)
+        return int(value)
+
+    def integers(self, name: str) -> list[int] | None:
+        """A small attribute of the file with integers in a row; None where there is no such one."""
+        if not h5py.h5a.exists(self._file, name.encode()):
+            return None
+        found = h5py.h5a.open(self._file, name.encode())
+        if found.dtype.kind not in "iu" or len(found.shape) != 1 or found.shape[0] > _FEW:
+            return None
+        values = np.empty(found.shape, found.dtype)
+        found.read(values)
+        return [int(value) for value in values]
+
+    def has(self, name: str) -> bool:
+        """Whether there is a column of this name."""
+        if name in self._opened:
+            return True
+        parts = name.split("/")
+        paths = ("/".join(parts[: end + 1]).encode() for end in range(len(parts)))
+        return all(self._file.links.exists(path) for path in paths)
+
+    def rows(self, name: str) -> Rows:
+        """A column, opened once.
+
+        Raises:
+            KeyError: there is none of this name.
+            ValueError: its values are not in this file.
+        """
+        if name not in self._opened:
+            self._opened[name] = self._open(name)
+        return self._opened[name]
+
+    def _open(self, name: str) -> Rows:
+        at = b""
+        for part in name.encode().split(b"/"):
+            at += b"/" + part
+            if self._file.links.get_info(at).type != h5py.h5l.TYPE_HARD:
+                raise ValueError(f"{self.path}: {name} points out of the file")
+        data = h5py.h5d.open(self._file, at)
+        kept = data.get_create_plist()
+        if kept.get_layout() == h5py.h5d.VIRTUAL or kept.get_external_count():
+            raise ValueError(f"{self.path}: {name} points out of the file")
+        return Rows(data)
+
+
+class Rows:
+    """One column: a dataset whose first axis is read in ranges.
+
+    Attributes:
+        shape: all of it, rows first; () for a single value.
+    """
+
+    def __init__(self, data: Any) -> None:
+        self._data = data
+        self.shape: tuple[int, ...] = data.shape
+        self._dtype = data.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, low: int = 0, high: int | None = None) -> Array:
+        """Rows low to high, the last one not included; all by default."""
+        if not self.shape or (low == 0 and high in {None, self.shape[0]}):
+            values = np.empty(self.shape, self._dtype)
+            if values.size:
+                self._data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+            return values
+        high = min(len(self) if high is None else high, len(self))
+        low = min(low, high)
+        values = np.empty((high - low, *self.shape[1:]), self._dtype)
+        self._read(low, values)
+        return values
+
+    def _read(self, low: int, values: Array) -> None:
+        """Fill `values` from row `low` on."""
+        if values.size:
+            place = self._data.get_space()
+            place.select_hyperslab((low, *(0 for _ in self.shape[1:])), values.shape)
+            self._data.read(h5py.h5s.create_simple(values.shape), place, values)
+
+    def added(self, low: int, high: int, amount: int) -> I64:
+        """Rows low to high of a column of integers, as int64, with `amount` added to each.
+
+        Narrower rows are read into the end of the result and widened from its beginning, block by
+        block: fresh memory costs as much as unpacking what goes into it.
+        """
+        values = np.empty(high - low, np.int64)
+        narrow = values.view(self._dtype)[-len(values) :] if len(values) else values
+        self._read(low, narrow)
+        for start in range(0, len(values), _BLOCK):
+            block = values[start : start + _BLOCK]
+            block[...] = narrow[start : start + _BLOCK]  # never reaches rows that are still to come
+            block += amount
+        return values

@@ -1,0 +1,262 @@
+"""Is everything in a store what it was when it was committed? Looks, and changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.yaml_file import parse_yaml
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import own_fault, read_json, temporary_files
+from sliplab.storage.schema.document import NewerFormat
+from sliplab.storage.schema.trial import Provenance, TrialRecord
+from sliplab.storage.streams import Json
+from sliplab.storage.trials.checksums import ELSEWHERE, byte_problem, read_sums, to_fetch
+from sliplab.storage.trials.columns import TIMING, TRACKS
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
+from sliplab.storage.trials.video import count_frames
+from sliplab.storage.trials.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD
+
+_KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
+_FOLDERS = ("trials", "incoming", "quarantine", "bench")
+DAMAGED, UNFINISHED = "damaged", "unfinished"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong.
+
+    Attributes:
+        path: the file or folder.
+        what: what is wrong with it.
+        kind: ``damaged``, or ``unfinished`` for what a killed program left, which the next
+            collection clears up.
+        campaign: whose it is; empty for the store's own files.
+        trial: the committed trial that it belongs to; empty for any other file.
+    """
+
+    path: str
+    what: str
+    kind: str = DAMAGED
+    campaign: str = ""
+    trial: str = ""
+
+
+def verify(store: Store, on_trial: Callable[[str], None] | None = None) -> list[Problem]:
+    """Check every trial of every campaign; an empty list means all is well.
+
+    Args:
+        on_trial: called with each trial's id before it is checked.
+    """
+    problems = _temporary(store.folder, "")
+    derived = store.folder / "derived"
+    for folder in (derived, *(store.folder / name for name in ("models", "report", "control"))):
+        problems += _temporary(folder, "")
+    folder = store.folder / "campaigns"
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if path.is_symlink() or not path.is_dir():
+            problems.append(Problem(str(path), "is no folder of a campaign"))
+        else:
+            problems += _campaign(store, Campaign(path), on_trial)
+    return problems
+
+
+def _campaign(
+    store: Store, campaign: Campaign, on_trial: Callable[[str], None] | None
+) -> list[Problem]:
+    problems = _description(store, campaign)
+    for trial in trial_folders(campaign):
+        if on_trial is not None:
+            on_trial(trial.name)
+        problems += verify_trial(trial)
+    return problems + _leftovers(campaign)
+
+
+def trial_folders(campaign: Campaign) -> list[Path]:
+    """Everything that stands where committed trials do, whole or not."""
+    folder = campaign.folder / "trials"
+    return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+def verify_trial(folder: Path) -> list[Problem]:
+    """Checksums, sizes, counts and clocks of one committed trial."""
+    return [
+        Problem(str(path), what, DAMAGED, folder.parent.parent.name, folder.name)
+        for path, what in _trial(folder)
+    ]
+
+
+Found = list[tuple[Path, str]]
+
+
+def _trial(folder: Path) -> Found:
+    if folder.is_symlink() or not folder.is_dir():
+        return [(folder, "is no folder of a trial")]
+    try:
+        sums = read_sums(folder)
+    except ValueError as error:
+        return [(folder / CHECKSUMS, f"cannot be used: {error}")]
+    found = [
+        (folder / name, problem)
+        for name, said in sorted(sums.items())
+        if not to_fetch(folder / name)
+        and (problem := byte_problem(folder / name, said)) is not None
+    ]
+    found += [
+        (path, "does not belong here")
+        for path in sorted(folder.iterdir())
+        if path.name not in _KNOWN or (path.name == FRAMES and FRAMES not in sums)
+    ]
+    try:
+        Provenance.load(folder / PROVENANCE)
+    except (OSError, ValueError) as error:
+        if own_fault(error):
+            raise
+        found.append((folder / PROVENANCE, f"cannot be read: {error}"))
+    if found or any(to_fetch(folder / name) for name in sums):
+        return found
+    try:
+        return _contents(folder)
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        if own_fault(error):
+            raise
+        return [(folder, f"cannot be read: {error}")]
+
+
+def _description(store: Store, campaign: Campaign) -> list[Problem]:
+    """The campaign's own files."""
+
+    def problem(path: Path, what: str, kind: str = DAMAGED) -> Problem:
+        return Problem(str(path), what, kind, campaign.name)
+
+    folder, found = campaign.folder, []
+    if not campaign.begun:
+        return [problem(folder, "is a campaign that was not begun yet", UNFINISHED)]
+    for name in _FOLDERS:
+        if (folder / name).is_symlink() or not (folder / name).is_dir():
+            found.append(problem(folder / name, "is missing, or no folder"))
+    names = (PROTOCOL, RIG, INFO)
+    sums: Json = {}
+    if store.format > 1 and not (folder / CHECKSUMS).exists():
+        what = "is missing; the next `sliplab collect` writes it"
+        found.append(problem(folder / CHECKSUMS, what, UNFINISHED))
+    elif store.format > 1:
+        try:
+            sums = read_sums(folder, names)
+        except ValueError as error:
+            found.append(problem(folder / CHECKSUMS, f"cannot be used: {error}"))
+    for name in names:
+        path = folder / name
+        try:
+            if name == INFO:
+                _ = campaign.info
+            else:
+                parse_yaml(path.read_text("utf-8"), path)
+        except (OSError, ValueError, StoreError, InputError) as error:
+            found.append(problem(path, f"cannot be read: {error}"))
+            continue
+        if name in sums and (wrong := byte_problem(path, sums[name])) is not None:
+            found.append(problem(path, f"{wrong}; `sliplab collect` writes it again"))
+    return found + [
+        Problem(item.path, item.what, item.kind, campaign.name)
+        for place in (folder, folder / "bench")
+        for item in _temporary(place, campaign.name)
+    ]
+
+
+def _temporary(folder: Path, campaign: str) -> list[Problem]:
+    """Temporary files whose program is gone."""
+    what = "is what a killed program left; the next `sliplab collect` deletes it"
+    return [
+        Problem(str(path), what, UNFINISHED, campaign)
+        for path, runs in temporary_files(folder)
+        if not runs
+    ]
+
+
+def _contents(folder: Path) -> Found:
+    problems: Found = []
+    try:
+        record = TrialRecord.load(folder / RECORD)
+    except NewerFormat as error:
+        return [(folder / RECORD, f"was written by a newer version (format {error.format})")]
+    if record.trial != folder.name:
+        problems.append((folder / RECORD, f"is of trial {record.trial}"))
+    with StreamReader(folder / DATA) as reader:
+        counts = reader.counts()
+        made = [name for name in TIMING if reader.has(name)]
+        tracks = [name for name in TRACKS if reader.has(name)]
+        for name in ("events/t", "event_pulses/t", "sync_pulses/t", "poses/t", "frames/t", *made):
+            if np.any(np.diff(reader.column(name)) < 0):
+                problems.append((folder / DATA, f"{name} runs backwards"))
+    found = {
+        "events": counts["events/t"],
+        "frames": counts["frames/t"],
+        "poses": counts["poses/t"],
+        "pulses": counts["sync_pulses/t"],
+    }
+    for name, count in found.items():
+        said = getattr(record.counts, name)
+        if count != said:
+            problems.append((folder / DATA, f"{count} {name}, the record says {said}"))
+    problems += _frame_problems(folder, tracks, counts)
+    if not record.quality.passed:
+        problems.append((folder / RECORD, "was committed although a gate failed"))
+    return problems
+
+
+def _frame_problems(folder: Path, tracks: list[str], counts: dict[str, int]) -> Found:
+    """A row of tracks, or a picture in the video, for every frame."""
+    frames, video = counts["frames/t"], (folder / FRAMES).exists()
+    problems: Found = [
+        (folder / DATA, f"{counts[name]} rows of {name}, not {frames}")
+        for name in tracks
+        if counts[name] != frames
+    ]
+    if frames and not video and "tracks/markers" not in tracks:
+        problems.append((folder / DATA, "has frames, but neither video nor tracks"))
+    if video and count_frames(folder / FRAMES) != frames:
+        problems.append((folder / FRAMES, f"does not hold {frames} frames"))
+    return problems
+
+
+def _leftovers(campaign: Campaign) -> list[Problem]:
+    """What stands aside, and what is in quarantine without a cause."""
+    found = []
+    folder = campaign.folder / "incoming"
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        what = "is an unfinished trial; the next `sliplab collect` quarantines it"
+        found.append(Problem(str(path), what, UNFINISHED, campaign.name))
+    folder = campaign.folder / "quarantine"
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        try:
+            read_json(path / CAUSE)["cause"]
+        except (OSError, ValueError, KeyError) as error:
+            what = f"does not say why it is there: {error}"
+            found.append(Problem(str(path / CAUSE), what, DAMAGED, campaign.name))
+    return found
+
+
+def set_aside(store: Store, problems: list[Problem]) -> list[str]:
+    """Quarantine every committed trial that has a problem; whoever calls holds the store's lock.
+
+    Returns:
+        The ids, which the next collection takes again.
+    """
+    causes: dict[tuple[str, str], list[str]] = {}
+    for problem in problems:
+        if problem.trial:
+            what = f"{Path(problem.path).name}: {problem.what}"
+            causes.setdefault((problem.campaign, problem.trial), []).append(what)
+    moved = []
+    for (name, trial), said in causes.items():
+        folder = store.campaign(name).folder / "trials" / trial
+        if folder.is_dir() and not folder.is_symlink():
+            store.campaign(name).quarantine(folder, f"damaged: {'; '.join(said)}")
+            moved.append(trial)
+    return moved

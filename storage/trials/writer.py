@@ -1,0 +1,206 @@
+"""A trial being written: it stands aside until it is whole, then becomes visible by one rename."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from sliplab.storage.files import sha256, sync_file, sync_folder, write_json_aside
+from sliplab.storage.schema.trial import Provenance, TrialRecord
+from sliplab.storage.secrets import masked
+from sliplab.storage.streams import (
+    I64,
+    U8,
+    ClockReads,
+    EventChunk,
+    FrameChunk,
+    Json,
+    PoseChunk,
+    PulseChunk,
+)
+from sliplab.storage.trials.hdf5 import StreamFile
+from sliplab.storage.trials.spool import Spool
+from sliplab.storage.trials.video import VideoWriter
+
+DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
+SPOOL = "frames.raw"
+CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
+
+
+class TrialWriter:
+    """A `storage.streams.Sink` that ends in exactly one of `commit` and `abandon`.
+
+    Args:
+        folder: the trial's folder aside; must not exist.
+        target: where it stands once committed.
+        frame_px: (width, height) of the frames, or None without a frame camera. Whether there will
+            be a video shows with the first frame: a camera may hand over tracks instead.
+        spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
+            encode as fast as their camera delivers.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        target: Path,
+        frame_px: tuple[int, int] | None,
+        rate_hz: int,
+        *,
+        spool: bool = False,
+    ) -> None:
+        self.folder, self.target = folder, target
+        folder.mkdir(parents=True)
+        self._streams = StreamFile(folder / DATA)
+        self._frame_px = frame_px
+        self._rate_hz = rate_hz
+        self._spool = Spool(folder / SPOOL) if spool and frame_px else None
+        self._video: VideoWriter | None = None
+        self._sealed = False
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Rows written so far, by column."""
+        return dict(self._streams.counts)
+
+    def add_events(self, chunk: EventChunk) -> None:
+        """Append events."""
+        self._streams.add_events(chunk)
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses seen by the event camera."""
+        self._streams.add_pulses("event_pulses", chunk)
+
+    def add_arm_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses seen by the arm."""
+        self._streams.add_pulses("arm_pulses", chunk)
+
+    def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        """Append pulses sent by the sync box."""
+        self._streams.add_pulses("sync_pulses", chunk)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        """Append starts of exposures seen by the sync box."""
+        self._streams.add_exposures(chunk)
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the sync box's clock."""
+        self._streams.add_clock_reads("box_reads", chunk)
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        """Append reads of the frame camera's clock."""
+        self._streams.add_clock_reads("frame_camera_reads", chunk)
+
+    def add_triggers(self, t_ns: I64, kind: U8) -> None:
+        """Append what else an event camera noted, of an imported trial."""
+        self._streams.add_triggers(t_ns, kind)
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        """Append arm poses."""
+        self._streams.add_poses(chunk)
+
+    def add_frames(self, chunk: FrameChunk) -> None:
+        """Append frames, or the tracks that stand for them, and their times."""
+        if self._frame_px is None or not len(chunk):
+            return
+        self._streams.add_frame_times(chunk)
+        if chunk.markers_px is not None:
+            self._streams.add_tracks(chunk)
+        elif self._spool is not None:
+            self._spool.write(chunk.images)
+        else:
+            if self._video is None:
+                self._video = VideoWriter(self.folder / FRAMES, *self._frame_px, self._rate_hz)
+            self._video.write(chunk.images)
+
+    def seal(self) -> Path:
+        """Finish data and video files, so that they can be read before the commit.
+
+        Returns:
+            The folder aside.
+        """
+        if self._sealed:
+            return self.folder
+        self._sealed = True
+        self._streams.finish()
+        if self._spool is not None and self._frame_px is not None:
+            self._spool.close()
+            self._encode_spool(self._spool.path, self._frame_px)
+        if self._video is not None:
+            self._video.close()
+        return self.folder
+
+    def _encode_spool(self, spool: Path, frame_px: tuple[int, int]) -> None:
+        width, height = frame_px
+        frames = (
+            np.memmap(spool, np.uint8, "r").reshape(-1, height, width)
+            if (spool.stat().st_size)
+            else np.empty((0, height, width), np.uint8)
+        )
+        self._video = VideoWriter(self.folder / FRAMES, width, height, self._rate_hz)
+        for start in range(0, len(frames), 64):
+            self._video.write(frames[start : start + 64])
+        self._video.close()
+        del frames
+        spool.unlink()
+
+    def commit(self, record: TrialRecord, provenance: Provenance) -> Path:
+        """Write record and checksums, flush everything, and make the trial visible.
+
+        Returns:
+            The committed trial's folder.
+
+        Raises:
+            FileExistsError: the trial is there already; nothing was changed.
+        """
+        self.seal()
+        if self.target.exists():
+            raise FileExistsError(f"{self.target}: this trial is committed already")
+        self._finish_folder(record, provenance)
+        os.rename(self.folder, self.target)
+        sync_folder(self.target.parent)
+        return self.target
+
+    def set_aside(
+        self, quarantine: Path, record: TrialRecord, provenance: Provenance, cause: Json
+    ) -> None:
+        """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
+        self.seal()
+        write_json_aside(
+            self.folder / "cause.json", {**cause, "cause": masked(str(cause["cause"]))}
+        )
+        self._finish_folder(record, provenance)
+        os.rename(self.folder, quarantine)
+        sync_folder(quarantine.parent)
+
+    def _finish_folder(self, record: TrialRecord, provenance: Provenance) -> None:
+        write_json_aside(self.folder / RECORD, record.to_json())
+        write_json_aside(self.folder / PROVENANCE, provenance.to_json())
+        sums = {}
+        for name in (DATA, FRAMES, RECORD):
+            path = self.folder / name
+            if path.exists():
+                if name != RECORD:  # whose writer did it
+                    sync_file(path)
+                sums[name] = {"sha256": sha256(path), "bytes": path.stat().st_size}
+        write_json_aside(self.folder / CHECKSUMS, sums)
+        sync_folder(self.folder)
+
+    def abandon(self) -> None:
+        """Close what is open and leave the folder as it is, for quarantine."""
+        if not self._sealed:
+            self._sealed = True
+            self._streams.abandon()
+            if self._spool is not None:
+                with suppress(OSError):
+                    self._spool.close()
+            if self._video is not None:
+                self._video.close()
+
+    def discard(self) -> None:
+        """Close what is open and delete it; for motions that are no trial."""
+        self.abandon()
+        shutil.rmtree(self.folder)

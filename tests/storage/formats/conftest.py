@@ -1,0 +1,12 @@
+"""What the tests of foreign files share."""
+
+import pytest
+
+from sliplab.storage.formats import lab_pickles
+from tests.storage.formats.files import SMALL
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the lab's camera one of few pixels: 307,200 lists take seconds to make."""
+    monkeypatch.setattr(lab_pickles, "SIZES", (SMALL,))

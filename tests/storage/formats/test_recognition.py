@@ -1,0 +1,295 @@
+"""Foreign files known by their content: names without endings, sizes, nothing in them."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from sliplab.protocols.errors import InputError
+from sliplab.storage.formats.aedat4 import Aedat4Writer, Stream
+from sliplab.storage.formats.find import kind_of, trials_in
+from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.streams import EventChunk
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.verify import verify
+from tests.storage.formats.files import SMALL, lab_cells, lab_hdf5
+
+SIZE = SMALL[::-1]
+
+
+def _import(folder: Path, path: Path, kind: str = "") -> list[Recording]:
+    made = Store.create(folder)
+    kind = kind or kind_of(path)
+    import_trials(made, "theirs", trials_in(path, kind), path, kind)
+    assert verify(made) == []
+    return list(made.campaign("theirs").recordings())
+
+
+def _pickled(path: Path, cells: Any) -> None:
+    path.write_bytes(pickle.dumps(cells))
+
+
+def _saved(path: Path, cells: Any) -> None:
+    with path.open("wb") as file:
+        np.save(file, cells, allow_pickle=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "stem", "write"),
+    [
+        ("d2_s1.0_dir_right_r0_events_{}", "d2_s1.0_dir_right_r0", _pickled),
+        ("taps_trial_0_pose_3_events_{}", "taps_trial_0_pose_3", _pickled),
+        ("20-7.5-4-1_{}.pickle", "20-7.5-4-1", _pickled),
+        ("4-1_{}", "4-1", _pickled),
+        ("Wool_trial_2_{}.npy", "Wool_trial_2", _saved),
+        ("d2_s1.0_dir_right_r0_events_{}.npy", "d2_s1.0_dir_right_r0", _saved),
+        ("d2_s1.0_dir_right_r0_events_{}", "d2_s1.0_dir_right_r0", _saved),
+    ],
+)
+@pytest.mark.usefixtures("small")
+def test_the_labs_names_with_and_without_ending(
+    tmp_path: Path, name: str, stem: str, write: Callable[[Path, Any], None]
+) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    write(folder / name.format("on"), lab_cells(SIZE, {(3, 5): [10, 12]}))
+    write(folder / name.format("off"), lab_cells(SIZE, {(7, 0): [11]}).T)
+    (folder / "light_on").write_text("a note")
+    (folder / "starting_timestamps.pickle").write_bytes(pickle.dumps([1, 2]))
+    (found,) = _import(tmp_path / "store", folder)
+    assert found.trial_id == stem
+    events = found.events()
+    assert events.t_us.tolist() == [10_000, 11_000, 12_000]
+    assert [events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
+        [3, 7, 3], [5, 0, 5], [1, 0, 1],
+    ]  # fmt: skip
+    assert found.record.geometry.event_px == SIZE
+    assert "OFF events" not in found.record.imported.unknown
+    if stem.startswith("d2"):
+        assert found.record.condition == {"depth": "2", "speed": "1.0", "direction": "right"}
+
+
+def test_cameras_of_the_lab_and_lists_of_one_length(tmp_path: Path) -> None:
+    """A smaller camera columns first; numpy makes lists of one length an array of numbers."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    on = np.zeros((240, 180, 1))
+    on[7, 100] = 3.5
+    _saved(folder / "a_events_on.npy", on)
+    _pickled(folder / "a_events_off", lab_cells((180, 240), {(2, 1): [1.0]}))
+    (found,) = _import(tmp_path / "store", folder)
+    events = found.events()
+    assert len(events) == 240 * 180 + 1
+    late = np.flatnonzero(events.t_us == 3500)
+    assert [events.x[late].tolist(), events.y[late].tolist()] == [[7], [100]]
+    off = np.flatnonzero(events.p == 0)
+    assert [events.x[off].tolist(), events.y[off].tolist()] == [[1], [2]]
+    assert found.record.geometry.event_px == (240, 180)
+
+
+@pytest.mark.usefixtures("small")
+def test_two_files_of_one_polarity_are_refused(tmp_path: Path) -> None:
+    for name in ("a_events_on", "a_events_on.pickle"):
+        _pickled(tmp_path / name, lab_cells(SIZE, {}))
+    with pytest.raises(InputError, match="ON events of a, as a_events_on does"):
+        kind_of(tmp_path)
+
+
+def _aedat4(path: Path, chunk: EventChunk) -> None:
+    with Aedat4Writer(path, {0: Stream("EVTS", "e", (64, 48), "x")}) as file:
+        file.events(0, chunk)
+
+
+def _events(x: list[int]) -> EventChunk:
+    column = np.array(x, np.uint16)
+    return EventChunk(column, column // 2, column.astype(np.uint8) % 2, np.arange(len(x)))
+
+
+@pytest.mark.parametrize("ending", ["", ".bin", ".raw"])
+def test_content_comes_before_the_ending(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"d2_s1.0_stream{ending}"
+    _aedat4(path, _events([3, 4]))
+    (found,) = _import(tmp_path / "a", path)
+    assert found.events().x.tolist() == [3, 4]
+    if not ending:
+        assert found.trial_id == "d2_s1.0_stream"
+    lab_hdf5(path)
+    assert kind_of(path) == "lab-hdf5"
+    (found,) = _import(tmp_path / "b", path)
+    assert len(found.events()) == 50
+
+
+def _stream(path: Path, resolution: Any, x: list[int], y: list[int]) -> None:
+    """As the lab's own program writes it: truth values, 16-bit pixels, attributes."""
+    with h5py.File(path, "w") as file:
+        file["events/ps"] = np.array([True, False])
+        file["events/ts"] = np.array([1_700_000_000.25, 1_700_000_000.5])
+        file["events/xs"], file["events/ys"] = np.array(x, "int16"), np.array(y, "int16")
+        file.attrs["t0"], file.attrs["num_events"] = 1_700_000_000.0, 2
+        file.attrs["sensor_resolution"] = resolution
+
+
+@pytest.mark.parametrize(
+    ("resolution", "x", "y", "size"),
+    [
+        (np.array([640, 480]), [1, 639], [2, 479], [640, 480]),
+        (np.array([180, 240]), [1, 239], [2, 179], [240, 180]),  # rows first, as others write it
+        (np.array([180, 240, 3]), [1, 9], [2, 9], [240, 180]),
+        (np.array([480, 640]), [1, 2], [2, 500], [480, 640]),  # a sensor that stands upright
+        (np.array([[640, 480]]), [1, 2], [2, 3], None),
+        ("640x480", [1, 2], [2, 3], None),
+        (np.zeros(1000, int), [1, 2], [2, 3], None),
+        (np.array([0, -1]), [1, 2], [2, 3], None),
+    ],
+)
+def test_the_resolution_of_the_labs_streams(
+    tmp_path: Path, resolution: Any, x: list[int], y: list[int], size: list[int] | None
+) -> None:
+    _stream(tmp_path / "a.h5", resolution, x, y)
+    (found,) = _import(tmp_path / "store", tmp_path / "a.h5")
+    assert found.record.geometry.event_px == (None if size is None else tuple(size))
+    assert ("sensor size" in found.record.imported.unknown) == (size is None)
+    events = found.events()
+    assert [events.p.tolist(), events.x.tolist(), events.y.tolist()] == [[1, 0], x, y]
+
+
+def _es(path: Path) -> None:
+    """Of a sensor of 320 x 16, with an event in row 200."""
+    path.write_bytes(b"Event Stream\2\0\0\1\x40\1\x10\0" + bytes([7, 1, 0, 200, 0]))
+
+
+def _raw(path: Path, header: str = "% evt 2.0\n", words: tuple[int, ...] = ()) -> None:
+    path.write_bytes(header.encode() + struct.pack(f"<{len(words)}I", *words))
+
+
+def _empty_dsec(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        for name in "xypt":
+            file[f"events/{name}"] = np.zeros(0, np.int64)
+
+
+def _text(path: Path) -> None:
+    path.write_text("not events")
+
+
+NAME = "d2_s1.0_dir_right_r0_events_on"
+BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "an empty aedat4": ("a.aedat4", lambda path: _aedat4(path, _events([])), "holds no events"),
+    "an empty dsec": ("a.h5", _empty_dsec, "holds no events"),
+    "empty pickles": (NAME, lambda path: _pickled(path, lab_cells(SIZE, {})), "holds no events"),
+    "aedat4 outside of its camera": (
+        "a.aedat4", lambda path: _aedat4(path, _events([3, 64])),
+        r"a\.aedat4: holds events up to column 64 and row 32, outside of the 64 x 48 pixels",
+    ),
+    "a stream outside of its camera": (
+        "a.h5", lambda path: _stream(path, [64, 48], [3, 64], [3, 64]),
+        r"a\.h5: holds events up to column 64 and row 64, .*sensor_resolution 64 x 48",
+    ),
+    "an older aedat": (
+        "a.aedat4", lambda path: path.write_bytes(b"#!AER-DAT3.1\r\n" + bytes(50)),
+        r"begins with b'#!AER-DAT3\.1.*, not with b'#!AER-DAT4\.0",
+    ),
+    "text by the lab's name": (NAME, _text, f"{NAME}: byte 0: is no whole pickle"),
+    "an empty file by the lab's name": (NAME, lambda path: path.touch(), "the file is empty"),
+    "a pickle cut short": (
+        NAME, lambda path: path.write_bytes(pickle.dumps(lab_cells(SIZE, {}))[:-1]),
+        r"byte \d+: is no whole pickle: it ends after \d+ bytes .* as a copy cut short; .*dump",
+    ),
+    "npy cut short": (
+        "a_on.npy", lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2)))[:-3]),
+        r"a_on\.npy: is cut short",
+    ),
+    "npy of 8 TB": (
+        "a_on.npy",
+        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"8, 2), ", b"8, 9**9)"))
+       ,
+        r"a_on\.npy: has a damaged numpy header",
+    ),
+    "npy whose header does not end": (
+        "a_on.npy",
+        lambda path: path.write_bytes(_npy(np.zeros((6, 8, 2))).replace(b"2), }", b"2 , }")),
+        r"a_on\.npy: has a damaged numpy header",
+    ),
+    "npy of 20 million bytes": (
+        "a_on.npy", lambda path: _saved(path, np.zeros((6, 8, 420_000), np.uint8)),
+        r"a_on\.npy: holds 20160000 times, as many in every pixel",
+    ),
+    "npy with another pickle in it": (
+        "a_on.npy",
+        lambda path: path.write_bytes(
+            _npy(lab_cells(SIZE, {})).split(b"\n")[0] + b"\n" + pickle.dumps([1])
+        ),
+        r"a_on\.npy: holds something else than the array \(8, 6\)",
+    ),
+    "npy of counts": (
+        "a_on.npy", lambda path: _saved(path, np.zeros((39, 2, 250))),
+        r"shape \(39, 2, 250\); the lab's",
+    ),
+    "a pickle of another camera": (
+        NAME, lambda path: _pickled(path, lab_cells((5, 5), {})),
+        r"shape \(5, 5\); the lab's files hold",
+    ),
+}  # fmt: skip
+
+
+def _npy(cells: Any) -> bytes:
+    file = io.BytesIO()
+    np.save(file, cells, allow_pickle=True)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("name", BAD)
+@pytest.mark.usefixtures("small")
+def test_a_bad_file_is_named_with_what_would_be_right(tmp_path: Path, name: str) -> None:
+    file, write, says = BAD[name]
+    write(tmp_path / file)
+    with pytest.raises(InputError, match=says) as caught:
+        _import(tmp_path / "store", tmp_path / file)
+    assert caught.value.message.count(file) == 1
+    assert Store.open(tmp_path / "store").campaigns() == []
+
+
+@pytest.mark.parametrize(
+    ("file", "write", "says"),
+    [
+        ("a.es", _es, r"after 0 events faery stops with: y overflow .*outside of the 320 x 16"),
+        ("a.raw", lambda path: _raw(path, f"% evt 2.0\n% {'x' * 47}\n"), "holds no events"),
+        ("a.raw", lambda path: _raw(path, "% date today\n"), "gives no format: a .raw file"),
+        ("a.dat", _text, "gives no format"),
+    ],
+)
+def test_a_bad_file_of_faerys(tmp_path: Path, file: str, write: Any, says: str) -> None:
+    pytest.importorskip("faery")
+    write(tmp_path / file)
+    with pytest.raises(InputError, match=says) as caught:
+        _import(tmp_path / "store", tmp_path / file)
+    assert caught.value.message.count(file) == 1
+    assert Store.open(tmp_path / "store").campaigns() == []
+
+
+EVT2 = (0x80000001, 1 << 28 | 2 << 22 | 5 << 11 | 7, 3 << 22 | 1500 << 11 | 1400)
+"""Time 64 us and on: an ON event at column 5, row 7, and an OFF one at column 1500, row 1400."""
+
+
+@pytest.mark.parametrize(
+    ("header", "size"), [("", None), ("% format EVT2;width=1600;height=1500\n", [1600, 1500])]
+)
+def test_a_size_that_no_header_gives_is_unknown(
+    tmp_path: Path, header: str, size: list[int] | None
+) -> None:
+    pytest.importorskip("faery")
+    _raw(tmp_path / "a", f"% evt 2.0\n{header}", EVT2)
+    (found,) = _import(tmp_path / "store", tmp_path / "a")
+    assert found.record.geometry.event_px == (None if size is None else tuple(size))
+    assert ("sensor size" in found.record.imported.unknown) == (size is None)
+    events = found.events()
+    assert [events.x.tolist(), events.y.tolist()] == [[5, 1500], [7, 1400]]

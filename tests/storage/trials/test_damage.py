@@ -1,0 +1,265 @@
+"""Whatever happens to a store's files, verify names it, and what is whole stays readable."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pytest
+
+from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
+from sliplab.storage.schema.trial import Provenance
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign, Store, StoreError
+from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, set_aside, verify
+from tests.storage.trial_files import campaign, commit, fill, record
+
+NOBODY = 2**22 + 1
+"""No process has this number."""
+
+
+def _link(path: Path, target: Path) -> None:
+    path.rename(target)
+    path.symlink_to(target)
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+DAMAGE: dict[str, tuple[Callable[[Path, Path], object], str, str]] = {
+    "description gone": (
+        lambda c, t: (c / "campaign.json").unlink(), "campaign.json: cannot be read", DAMAGED),
+    "description no JSON": (
+        lambda c, t: (c / "campaign.json").write_text("{"), "is not JSON", DAMAGED),
+    "description too deep": (
+        lambda c, t: (c / "campaign.json").write_text("[" * 100_000), "is not JSON", DAMAGED),
+    "description of something else": (
+        lambda c, t: (c / "campaign.json").write_text("{}"), "lacks 'name'", DAMAGED),
+    "protocol changed": (
+        lambda c, t: (c / "protocol.yaml").write_text("protocol: 2\n"),
+        "protocol.yaml: does not match its checksum; `sliplab collect`", DAMAGED),
+    "protocol no YAML": (
+        lambda c, t: (c / "protocol.yaml").write_text("a: &x [*x]"), "cannot be read", DAMAGED),
+    "rig file not UTF-8": (
+        lambda c, t: (c / "rig.yaml").write_bytes(b"\xff"), "cannot be read", DAMAGED),
+    "rig file gone": (lambda c, t: (c / "rig.yaml").unlink(), "rig.yaml: cannot be", DAMAGED),
+    "checksums of a campaign gone": (
+        lambda c, t: (c / "checksums.json").unlink(), "collect` writes it", UNFINISHED),
+    "checksums of a campaign damaged": (
+        lambda c, t: (c / "checksums.json").write_text('{"a": 1}'), "no list of", DAMAGED),
+    "folder gone": (lambda c, t: (c / "bench").rmdir(), "is missing, or no folder", DAMAGED),
+    "campaign that never began": (
+        lambda c, t: (c.parent / "d").mkdir(), "d: is a campaign that was not begun", UNFINISHED),
+    "file among campaigns": (
+        lambda c, t: (c.parent / "x").write_text(""), "x: is no folder of a campaign", DAMAGED),
+    "campaign elsewhere": (
+        lambda c, t: _link(c, c.parents[2] / "away"), "is no folder of a campaign", DAMAGED),
+    "temporary file": (
+        lambda c, t: (c / f".campaign.json.{NOBODY}.tmp").write_text(""),
+        "is what a killed program left", UNFINISHED),
+    "quarantine without cause": (
+        lambda c, t: (c / "quarantine" / "t.1").mkdir(), "does not say why", DAMAGED),
+    "empty trial": (lambda c, t: (c / "trials" / "e").mkdir(), "checksums.json: cannot", DAMAGED),
+    "file among trials": (
+        lambda c, t: (c / "trials" / "e").write_text(""), "e: is no folder of a trial", DAMAGED),
+    "trial elsewhere": (
+        lambda c, t: _link(t, c.parents[2] / "away"), "is no folder of a trial", DAMAGED),
+    "data elsewhere": (
+        lambda c, t: _link(t / "data.h5", c.parents[2] / "away"), "is no plain file", DAMAGED),
+    "checksums lead elsewhere": (
+        lambda c, t: write_json(t / "checksums.json", {"../../x": {"sha256": "", "bytes": 0}}),
+        "is no list of checksums", DAMAGED),
+    "checksums without data": (
+        lambda c, t: write_json(t / "checksums.json", {}), "no checksum of data.h5", DAMAGED),
+    "provenance gone": (
+        lambda c, t: (t / "provenance.json").unlink(), "provenance.json: cannot be", DAMAGED),
+    "bytes changed in place": (
+        lambda c, t: _flip(t / "data.h5"), "does not match its checksum", DAMAGED),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_verify_names_it_and_what_is_whole_stays_readable(name: str, tmp_path: Path) -> None:
+    damage, says, kind = DAMAGE[name]
+    where = campaign(tmp_path / "s")
+    trial, whole = commit(where, "t"), commit(where, "whole")
+    damage(where.folder, trial)
+    store = Store.open(tmp_path / "s")
+    problems = verify(store)
+    said = [f"{item.path}: {item.what}" for item in problems if item.kind == kind]
+    assert any(says in text for text in said), said or problems
+    assert all(item.trial != "whole" for item in problems)
+    json.dumps([vars(item) for item in problems])
+    if whole.exists() and not where.folder.is_symlink():
+        assert len(Recording(whole).events()) == 1000
+
+
+def test_what_is_damaged_is_never_read(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    _flip(commit(where, "t") / "data.h5")
+    _flip(commit(where, "u") / "record.json")
+    commit(where, "whole")
+    recording = where.recording("t")
+    assert recording.record.trial == "t"
+    with pytest.raises(StoreError, match=r"does not match its checksum.*verify .* --quarantine"):
+        recording.events()
+    unreadable: list[str] = []
+    assert list(catalogue(Store.open(tmp_path / "s"), unreadable)["trial"]) == ["t", "whole"]
+    assert len(unreadable) == 1
+
+
+def test_what_is_partial_is_no_trial_and_is_quarantined_with_its_cause(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    (commit(where, "short") / "data.h5").write_bytes(b"x")
+    (commit(where, "lost") / "record.json").unlink()
+    (where.folder / "trials" / "empty").mkdir()
+    commit(where, "whole")
+    assert where.committed() == {"whole"}
+    assert [recording.trial_id for recording in where.recordings()] == ["whole"]
+    unreadable: list[str] = []
+    assert len(catalogue(Store.open(tmp_path / "s"), unreadable)) == 1
+    assert len(unreadable) == 3
+    assert where.sweep() == 3
+    causes = {item["trial"]: item["cause"] for item in where.quarantined()}
+    assert causes["short"].startswith("damaged: ")
+    assert causes["short"].endswith("data.h5: has 1 bytes, not " + causes["short"].split()[-1])
+    assert causes["lost"].endswith("record.json: is missing")
+    assert "checksums.json: cannot be read" in causes["empty"]
+    assert where.failed_attempts() == {}
+    assert verify(Store.open(tmp_path / "s")) == []
+    commit(where, "short")
+
+
+def test_a_partial_trial_gives_way_to_the_one_that_is_taken(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    (commit(where, "t") / "frames.mkv").unlink()
+    commit(where, "t")
+    assert where.committed() == {"t"}
+    assert where.quarantined()[0]["cause"].endswith("frames.mkv: is missing")
+
+
+def test_damaged_trials_are_set_aside_when_asked(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    _flip(commit(where, "t") / "data.h5")
+    commit(where, "whole")
+    store = Store.open(tmp_path / "s")
+    assert set_aside(store, verify(store)) == ["t"]
+    assert where.committed() == {"whole"}
+    assert where.quarantined()[0]["cause"] == "damaged: data.h5: does not match its checksum"
+    assert verify(store) == []
+
+
+def test_a_cause_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    writer = where.begin("t", None, 100)
+    writer.abandon()
+    (where.quarantine(writer.folder, "gate: x") / "cause.json").write_text("{")
+    assert where.quarantined()[0]["cause"] == "unknown"
+    assert where.failed_attempts() == {}
+
+
+def test_a_damaged_description_says_what_to_do(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    commit(where, "t")
+    (where.folder / "campaign.json").unlink()
+    assert where.begun
+    with pytest.raises(StoreError, match="put it back from a copy, or move"):
+        _ = where.info
+
+
+# -- only ever inside ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inner", ["incoming", "trials", "bench", "quarantine"])
+def test_a_link_does_not_lead_a_write_out_of_the_store(inner: str, tmp_path: Path) -> None:
+    where, away = campaign(tmp_path / "s"), tmp_path / "away"
+    _link(where.folder / inner, away)
+    with pytest.raises(StoreError, match="leads out of the store"):
+        where.update(where.info, "protocol: 2\n", "rig: 1\n")
+    if inner in {"incoming", "trials"}:
+        with pytest.raises(StoreError, match="leads out of the store"):
+            where.begin("t", None, 100)
+    if inner == "bench":
+        with pytest.raises(StoreError, match="leads out of the store"):
+            where.add_bench_record({})
+    assert list(away.iterdir()) == []
+
+
+def test_a_campaign_cannot_be_named_out_of_the_store(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "s")
+    for name in ("..", "../x", "/etc", "a/../../b", "a\\..\\b/", "", ".", "é"):
+        with pytest.raises(StoreError, match="cannot be the name"):
+            store.campaign(name)
+
+
+def test_data_that_point_out_of_their_file_are_refused(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    writer = where.begin("t", None, 100)
+    fill(writer, with_frames=False)
+    path = writer.seal() / "data.h5"
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["t"] = [1, 2]
+    with h5py.File(path, "r+") as file:
+        del file["arm_pulses/t"]
+        file["arm_pulses/t"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "/t")
+    writer.commit(record("t"), Provenance())
+    with (
+        pytest.raises(ValueError, match="points out of the file"),
+        where.recording("t").open() as reader,
+    ):
+        reader.pulses("arm_pulses")
+
+
+# -- disks ---------------------------------------------------------------------------------
+
+
+def test_a_disks_faults_are_said_in_words() -> None:
+    assert disk_fault(OSError(28, "x")) == "is full"
+    assert disk_fault(OSError(30, "x")) == "is read-only"
+    told = RuntimeError("Can't decrement id ref count (file write failed: errno = 28, ...)")
+    assert disk_fault(told) == "is full"
+    assert disk_fault(RuntimeError("anything else")) is None
+    assert disk_fault(FileNotFoundError(2, "x")) is None
+
+
+def test_errors_of_other_devices_are_left_alone(tmp_path: Path) -> None:
+    class Serial(RuntimeError):
+        pass
+
+    with pytest.raises(Serial), translated_disk_errors(tmp_path, Serial):
+        raise Serial from OSError(5, "the cable was pulled")
+    with (
+        pytest.raises(StoreError, match="its disk reports errors"),
+        translated_disk_errors(tmp_path),
+    ):
+        raise OSError(5, "Input/output error")
+
+
+def test_temporary_files_are_swept_when_their_program_is_gone(tmp_path: Path) -> None:
+    for name in (f".a.json.{NOBODY}.tmp", f".b.{os.getpid()}.tmp", f".c.{os.getppid()}.tmp", "d"):
+        (tmp_path / name).write_text("")
+    assert sweep_temporary(tmp_path) == 2
+    assert {path.name for path in tmp_path.iterdir()} == {f".c.{os.getppid()}.tmp", "d"}
+
+
+def test_a_long_name_has_room_for_its_temporary_file(tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 250 + ".json")
+    write_bytes(path, b"{}")
+    assert read_json(path) == {}
+
+
+def test_bench_records_never_take_each_others_place(tmp_path: Path) -> None:
+    where: Campaign = campaign(tmp_path / "s")
+    for number in range(3):
+        where.add_bench_record({"number": number})
+    (where.folder / "bench" / "0001.json").unlink()
+    where.add_bench_record({"number": 3})
+    assert sorted(path.name for path in (where.folder / "bench").iterdir()) == [
+        "0002.json", "0003.json", "0004.json"
+    ]  # fmt: skip

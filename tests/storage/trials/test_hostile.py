@@ -1,0 +1,225 @@
+"""Stores whose files somebody wrote who means harm, or a fuzzer: nothing leaves, nothing escapes.
+
+Each record here was once read without a question, and ended in an exception that says nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import read_json, sha256
+from sliplab.storage.trials import control
+from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.checksums import read_sums
+from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign, Store
+from sliplab.storage.trials.verify import verify
+from tests.storage.trial_files import campaign, commit
+
+Change = Callable[[dict[str, Any]], Any]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+    """One trial."""
+    where = campaign(tmp_path_factory.mktemp("hostile") / "store")
+    commit(where, "t")
+    return where
+
+
+def _with(folder: Path, data: bytes) -> Recording:
+    """The trial with another record, whose checksum fits."""
+    (folder / "record.json").write_bytes(data)
+    sums = read_json(folder / "checksums.json")
+    sums["record.json"] = {"sha256": sha256(folder / "record.json"), "bytes": len(data)}
+    (folder / "checksums.json").write_text(json.dumps(sums))
+    return Recording(folder)
+
+
+RECORDS: dict[str, Change] = {
+    "a condition that is text": lambda r: r.update(condition="2.4 mm"),
+    "a level that is no number": lambda r: r["condition"].update(depth="deep mm"),
+    "a level without end": lambda r: r["condition"].update(depth="1e999 mm"),
+    "a knot that is a float": lambda r: r["clocks"]["events"]["map"].update(reference_ns=[1e-300]),
+    "no clock of events": lambda r: r["clocks"].pop("events"),
+    "an uncertainty that is text": lambda r: r["clocks"]["events"].update(uncertainty_ns="1"),
+    "counts that are negative beyond all": lambda r: r["counts"].update(events=-(2**70)),
+    "no quality": lambda r: r.pop("quality"),
+    "a name that is a list": lambda r: r.update(trial=[1]),
+    "steps that are no steps": lambda r: r.update(steps=[1]),
+    "a step outside of time": lambda r: r.update(
+        steps=[{"phase": "slide", "start_ns": 2**64, "end_ns": 0}]
+    ),
+    "a format that is text": lambda r: r.update(format="9"),
+    "seconds that are not finite": lambda r: r.update(recorded_s=float("nan")),
+}
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_record_of_another_shape_is_damage(made: Campaign, name: str) -> None:
+    folder = made.folder / "trials" / "t"
+    whole = (folder / "record.json").read_bytes()
+    data = json.loads(whole)
+    RECORDS[name](data)
+    with pytest.raises(StoreError, match=r"record\.json"):
+        _ = _with(folder, json.dumps(data).encode()).record
+    unreadable: list[str] = []
+    assert len(catalogue(Store.open(made.folder.parents[1]), unreadable)) == 0
+    assert len(unreadable) == 1
+    assert [p.trial for p in verify(Store.open(made.folder.parents[1]))] == ["t"]
+    _with(folder, whole)
+
+
+def test_a_record_that_is_no_json_is_damage(made: Campaign) -> None:
+    folder = made.folder / "trials" / "t"
+    whole = (folder / "record.json").read_bytes()
+    for data in (b"{", b"\xb9", b"[1]", b'{"a":' * 50_000):
+        with pytest.raises(StoreError, match=r"record\.json"):
+            _ = _with(folder, data).record
+    _with(folder, whole)
+
+
+def test_a_record_without_steps_has_no_phases(made: Campaign) -> None:
+    recording = made.recording("t")
+    assert recording.record.steps == ()
+    assert recording.motion_phase == "retract"
+    with pytest.raises(KeyError, match="no step 'slide'"):
+        recording.step("slide")
+
+
+def test_a_trial_without_a_clock_says_which_it_has(made: Campaign) -> None:
+    folder = made.folder / "trials" / "t"
+    whole = (folder / "record.json").read_bytes()
+    data = json.loads(whole)
+    data["clocks"].pop("frames", None)
+    recording = _with(folder, json.dumps(data).encode())
+    with pytest.raises(StoreError, match=r"no clock 'frames'; it has: .*events"):
+        recording.frame_times()
+    _with(folder, whole)
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "/etc/passwd", "a/b", "", ".", "..", "a\0b", "C:\\x", ".x", "x" * 200]
+)
+def test_checksums_name_files_beside_them_only(tmp_path: Path, name: str) -> None:
+    sums = {name: {"sha256": "0", "bytes": 1}}
+    (tmp_path / "checksums.json").write_text(json.dumps(sums))
+    with pytest.raises(ValueError, match="no list of checksums"):
+        read_sums(tmp_path, ())
+
+
+@pytest.mark.parametrize("said", [{"sha256": 1, "bytes": 1}, {"sha256": "0", "bytes": "1"}, [], 1])
+def test_checksums_are_text_and_a_number(tmp_path: Path, said: Any) -> None:
+    (tmp_path / "checksums.json").write_text(json.dumps({"a": said}))
+    with pytest.raises(ValueError, match="no list of checksums"):
+        read_sums(tmp_path, ())
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../x", "/x", "a/b", "..", "", ".hidden", "a\\b", "a\nb", "a\0b", "C:x", "x" * 252, "a..b"],
+)
+def test_names_stay_in_the_store(tmp_path: Path, name: str) -> None:
+    store = Store.create(tmp_path / "store")
+    for use in (
+        lambda: store.campaign(name),
+        lambda: store.campaign("c").recording(name),
+        lambda: store.campaign("c").begin(name, None, 100),
+        lambda: Derived.of(store, name),
+        lambda: Derived.of(store, "labels", "c").key(name),
+    ):
+        with pytest.raises(StoreError):
+            use()
+
+
+@pytest.mark.parametrize("name", ["campaigns", "control", "derived", "models", "report", "before"])
+def test_a_link_out_of_the_store_is_refused(tmp_path: Path, name: str) -> None:
+    store = Store.create(tmp_path / "store")
+    (tmp_path / "outside").mkdir()
+    (store.folder / "inside").mkdir()
+    os.symlink(tmp_path / "outside", store.folder / name)
+    with pytest.raises(StoreError, match="leads out of the store"):
+        Store.open(store.folder)
+    (store.folder / name).unlink()
+    os.symlink("inside", store.folder / name)
+    Store.open(store.folder)
+
+
+def test_a_quarantine_that_leads_out_is_refused(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "store")
+    folder = commit(where, "t")
+    (tmp_path / "outside").mkdir()
+    (where.folder / "quarantine").rmdir()
+    os.symlink(tmp_path / "outside", where.folder / "quarantine")
+    with pytest.raises(StoreError, match="leads out of the store"):
+        where.quarantine(folder, "gate")
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_derived_results_that_lead_out_are_refused(tmp_path: Path) -> None:
+    store = Store.create(tmp_path / "store")
+    (tmp_path / "outside").mkdir()
+    (store.folder / "derived").mkdir()
+    os.symlink(tmp_path / "outside", store.folder / "derived" / "labels")
+    with pytest.raises(StoreError, match="leads out of the store"):
+        Derived.of(store, "labels", "c")
+
+
+@pytest.mark.parametrize(
+    "change", [{"campaign": "../../x"}, {"trials": ["../x"]}, {"trials": 1}, {"kind": "delete"}]
+)
+def test_a_request_that_leads_out_is_left_out(tmp_path: Path, change: dict[str, Any]) -> None:
+    store = Store.create(tmp_path / "store")
+    control.ask(store, "again", campaign="c", trials=("t",))
+    path = store.folder / "control" / "000001.json"
+    path.write_text(json.dumps({**read_json(path), **change}))
+    assert control.requests(store) == []
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"did": 1}', "{", '{"did": {"a": NaN}}'])
+def test_a_damaged_answer_is_an_empty_one(tmp_path: Path, text: str) -> None:
+    store = Store.create(tmp_path / "store")
+    asked = control.ask(store, "pause")
+    (store.folder / "control" / "000001.done.json").write_text(text)
+    assert control.answered(store, asked) == {"did": {}}
+
+
+def test_set_aside_without_by_whom_is_damage(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "store")
+    (where.folder / "skipped.json").write_text('{"t": 1}')
+    with pytest.raises(StoreError, match="who set which trial aside"):
+        skipped(where)
+
+
+def test_json_without_numbers_that_are_none(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"a": NaN}')
+    with pytest.raises(ValueError, match="no number of JSON"):
+        read_json(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        '{"key": "k", "raw": RAW, "clocks": 1}',
+        '{"key": "k", "raw": RAW, "clocks": {}}',
+        '{"key": 1, "raw": RAW, "clocks": {}}',
+        "{",
+    ],
+)
+def test_refitted_clocks_of_another_shape_are_damage(
+    made: Campaign, tmp_path: Path, told: str
+) -> None:
+    recording = made.recording("t")
+    file = tmp_path / "t.json"
+    file.write_text(told.replace("RAW", json.dumps(recording.raw_checksum)))
+    with pytest.raises(StoreError, match="sliplab sync"):
+        _ = Recording(recording.folder, file).clocks
