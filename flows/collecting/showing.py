@@ -169,7 +169,7 @@ class _Page:
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
     def _report_figure(self, client: Any) -> None:
-        from sliplab.analysis.report.campaign_figure import event_rates
+        from sliplab.analysis.report.figures.campaign import event_rates
 
         numbers, rates = self._rates()
         if rates:

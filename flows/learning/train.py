@@ -16,7 +16,7 @@ from prefect.cache_policies import NO_CACHE
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.networks import model_file, training, training_device
 from sliplab.analysis.networks.epoch_record import EpochRecord
-from sliplab.analysis.report.figures import training_curves
+from sliplab.analysis.report.figures.windows import training_curves
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report import figures, figures_campaign
-from sliplab.analysis.report.report import Figure, Section, Table, number
+from sliplab.analysis.report.figures import campaign as figures
+from sliplab.analysis.report.page import Figure, Section, Table, number
 from sliplab.flows.collecting.reference_watch import hold_rate
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
@@ -152,7 +152,7 @@ def _over_campaign(item: Collected, simulated: bool) -> Figure:
     )
     again = dict(sorted(failed.items()))
     return Figure(
-        figures_campaign.over_campaign(
+        figures.over_campaign(
             numbers, rates, [share for share, _ in nearest], again, simulated=simulated
         ),
         f"Campaign {item.name}, trial by trial. Top: events a second; a drift or a step would be "
@@ -260,7 +260,7 @@ def _wear(rows: Sequence[Json]) -> list[str]:
 def _references(item: Collected, rows: list[Json], simulated: bool) -> Figure:
     places = [row["place"] for row in rows]
     return Figure(
-        figures_campaign.references(
+        figures.references(
             places,
             {label: [row[name] for row in rows] for name, label in WEAR},
             simulated=simulated,

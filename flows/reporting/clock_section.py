@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report import figures_campaign
-from sliplab.analysis.report.report import Figure, Link, Section, number
+from sliplab.analysis.report.figures import clocks as figures
+from sliplab.analysis.report.page import Figure, Link, Section, number
 from sliplab.flows.syncing.sync_page import PAGE
 from sliplab.storage.schema.trial import DEVICES
 from sliplab.storage.trials.store import Store
@@ -56,7 +56,7 @@ def _figure(campaigns: list[Collected], grades: dict[str, str], simulated: bool)
             title = f"{device}, {grades[device]}" if device in grades else device
             drawn[title] = ([k for k, _ in there], [value for _, value in there])
     return Figure(
-        figures_campaign.clocks(drawn, starts, simulated=simulated),
+        figures.uncertainty_by_trial(drawn, starts, simulated=simulated),
         "Uncertainty of each trial's clocks: of events their own, of frames and arm that of events "
         "against them. It limits every latency; a jump would be a loose wire or lost pulses.",
         "clocks",

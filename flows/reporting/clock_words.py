@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.analysis.report.report import number
+from sliplab.analysis.report.page import number
 from sliplab.protocols.timing import WIRED
 
 _NO_GRADE = "unknown clocks"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.analysis.report.detector_figure import latency_over_rate
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent
+from sliplab.analysis.report.figures.tradeoffs import latency_over_rate
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent
 
 _WORDS = {
     "smoothing": "paper's rule",

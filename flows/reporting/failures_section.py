@@ -6,7 +6,7 @@ import shlex
 from collections import Counter
 from typing import Any
 
-from sliplab.analysis.report.report import Section, Table, number
+from sliplab.analysis.report.page import Section, Table, number
 from sliplab.flows.reporting.report_trials import WORDS
 from sliplab.storage.trials.store import Store
 

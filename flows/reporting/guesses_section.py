@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from sliplab.analysis.report.figures_changes import Changed, ChangePanel, lowered_and_raised
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent
+from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent
 from sliplab.flows.reporting.report_extras import command, odd_shape
 from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
 from sliplab.storage.trials.store import Store

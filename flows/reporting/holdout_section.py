@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.analysis.report.report import Section, Table, number, percent
+from sliplab.analysis.report.page import Section, Table, number, percent
 from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
 from sliplab.flows.reporting.report_trials import intervals, trial_summary
 from sliplab.storage.trials.store import Store

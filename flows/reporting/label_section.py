@@ -6,8 +6,8 @@ from collections import Counter
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.figures_campaign import label_uncertainty
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent
+from sliplab.analysis.report.figures.trials import label_uncertainty
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent
 from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label_errors import KINDS, distances
 from sliplab.flows.reporting.results import source_text

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sliplab.analysis.report.report import Table
+from sliplab.analysis.report.page import Table
 
 Json = dict[str, Any]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
-from sliplab.analysis.report.figure_style import BLUE, GREEN, ORANGE, RED
-from sliplab.analysis.report.figures_conditions import Panel, by_condition
+from sliplab.analysis.report.figures.intervals import Panel, by_condition
+from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.reporting.detector_section import choice_note
 from sliplab.flows.reporting.report_trials import OUTCOMES, VALUES, WORDS, Conditions, values

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from sliplab.analysis.report.figures_conditions import Share, shares
-from sliplab.analysis.report.report import Figure, Link, Section, Table, percent
+from sliplab.analysis.report.figures.intervals import Share, shares
+from sliplab.analysis.report.page import Figure, Link, Section, Table, percent
 from sliplab.flows.reporting import label_tables
 from sliplab.flows.reporting.report_extras import FILES, command, odd_shape
 from sliplab.flows.reporting.search_section import search

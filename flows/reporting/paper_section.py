@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sliplab.analysis.report.figures import CLASS_WORDS
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.page import Section, Table, number, percent
 from sliplab.analysis.report.published import PAPER
-from sliplab.analysis.report.report import Section, Table, number, percent
 
 Json = dict[str, Any]
 

@@ -14,7 +14,7 @@ from prefect import flow
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks import model_file
-from sliplab.analysis.report import report as page
+from sliplab.analysis.report import page
 from sliplab.flows.labelling import label_errors
 from sliplab.flows.learning import evaluate, other_networks
 from sliplab.flows.learning.train import wanted_models

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sliplab.analysis.report.figures_conditions import differences
-from sliplab.analysis.report.report import Figure, Number, Section, Table, render_page
+from sliplab.analysis.report.figures.intervals import differences
+from sliplab.analysis.report.page import Figure, Number, Section, Table, render_page
 from sliplab.flows.reporting.report_against import BASES
 
 Json = dict[str, Any]

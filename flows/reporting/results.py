@@ -6,8 +6,9 @@ from typing import Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
-from sliplab.analysis.report import figures
-from sliplab.analysis.report.report import Figure, Section, Table, number
+from sliplab.analysis.report.figures import trials as figures
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.page import Figure, Section, Table, number
 from sliplab.analysis.windows import dataset
 from sliplab.flows.learning.evaluate import trial_counts
 from sliplab.flows.reporting import clock_words
@@ -72,7 +73,7 @@ def outputs(
                             ("raw", found["counts"]),
                             ("smoothed", detections.smoothed),
                         )
-                        for k, word in enumerate(figures.CLASS_WORDS)
+                        for k, word in enumerate(CLASS_WORDS)
                     },
                 },
                 "the same two rows, for one of its trials.",

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.report.figures_front import Point, cost_and_error
-from sliplab.analysis.report.report import Figure, Table, number
+from sliplab.analysis.report.figures.tradeoffs import Panel, Point, cost_and_error
+from sliplab.analysis.report.page import Figure, Table, number
 
 Json = dict[str, Any]
 
@@ -47,10 +47,10 @@ def search(found: Json, simulated: bool) -> tuple[Figure, Table]:
         KeyError, TypeError: it is of another shape.
     """
     rows = list(found["rows"])
-    cost, early = ("work", "us_per_s"), ("test", "strict")
+    cost = ("work", "us_per_s")
     panels = [
-        (FIGURES[cost][0], f"{FIGURES[key][0]}, test trials", _points(rows, cost, key))
-        for key in (("test", "mean_ms"), early)
+        Panel(cost[1], key[1], FIGURES[cost][0], f"{FIGURES[key][0]}, test trials")
+        for key in (("test", "mean_ms"), ("test", "strict"))
     ]
     data: dict[str, Sequence[object]] = {
         heading: [row[name] for row in rows] for name, heading in SETTINGS.items()
@@ -59,7 +59,7 @@ def search(found: Json, simulated: bool) -> tuple[Figure, Table]:
         data[heading] = [None if (v := _mean(row, key)) is None else factor * v for row in rows]
     data["on the front"] = [row["front"] for row in rows]
     figure = Figure(
-        cost_and_error(panels, simulated=simulated),
+        cost_and_error([_point(row) for row in rows], panels, simulated=simulated),
         "Each dot is a network with a rule: how much it computes for a second of events, against "
         "its mean latency and its accuracy (means over seeds). Blue: no other is better in every "
         "figure. The star has the paper's settings.",
@@ -90,14 +90,12 @@ def _mean(row: Json, key: tuple[str, str]) -> float | None:
     return float(np.mean(values))
 
 
-def _points(rows: Sequence[Json], cost: tuple[str, str], error: tuple[str, str]) -> list[Point]:
-    found = []
-    for row in rows:
-        x, y = _mean(row, cost), _mean(row, error)
-        if x and y is not None:
-            point = Point(x, FIGURES[error][1] * y, bool(row["front"]), bool(row["paper"]))
-            found.append(point)
-    return found
+def _point(row: Json) -> Point:
+    values = {
+        key[1]: None if (value := _mean(row, key)) is None else factor * value
+        for key, (_, factor, _) in FIGURES.items()
+    }
+    return Point(values, bool(row["front"]), bool(row["paper"]))
 
 
 def _cell(row: Json, key: tuple[str, str]) -> str:

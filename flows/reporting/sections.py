@@ -7,7 +7,7 @@ from typing import Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.networks.training import Fitted
-from sliplab.analysis.report.report import Number, Section, number, percent
+from sliplab.analysis.report.page import Number, Section, number, percent
 from sliplab.flows.reporting import (
     campaign_section,
     clock_section,

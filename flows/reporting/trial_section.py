@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report import figures
+from sliplab.analysis.report.figures import trials as figures
+from sliplab.analysis.report.page import Figure, Section
 from sliplab.analysis.report.published import PAPER
-from sliplab.analysis.report.report import Figure, Section
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
 from sliplab.flows.labelling.label import STEP as LABELS

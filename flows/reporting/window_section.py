@@ -8,9 +8,10 @@ import numpy as np
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks.training import Fitted
-from sliplab.analysis.report import figures, window_figures
+from sliplab.analysis.report.figures import windows as figures
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent
 from sliplab.analysis.report.published import PAPER
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent
 from sliplab.flows.reporting import others_section, work_section
 from sliplab.flows.reporting.work_section import METHODS
 
@@ -48,7 +49,7 @@ def _network(windows: Json, baselines: Json, fitted: Fitted, simulated: bool) ->
         )
     classes = [
         [word, percent(windows["precision"][name]), percent(windows["recall"][name])]
-        for name, word in zip(CLASSES, figures.CLASS_WORDS, strict=True)
+        for name, word in zip(CLASSES, CLASS_WORDS, strict=True)
     ]
     missing = (
         [] if baselines else ["Stronger methods are compared by `sliplab evaluate --baselines`."]
@@ -71,10 +72,10 @@ def _network(windows: Json, baselines: Json, fitted: Fitted, simulated: bool) ->
                 "two highest spike counts are equal. Everything off the diagonal is an error.",
                 "confusion",
                 {
-                    "true class": list(figures.CLASS_WORDS),
+                    "true class": list(CLASS_WORDS),
                     **{
                         f"called {word} (windows)": [row[k] for row in windows["confusion"]]
-                        for k, word in enumerate((*figures.CLASS_WORDS, "undecided"))
+                        for k, word in enumerate((*CLASS_WORDS, "undecided"))
                     },
                 },
                 f"accuracy {PAPER['accuracy'].text}; incipient precision "
@@ -137,7 +138,7 @@ def _where(windows: Json, simulated: bool) -> Section:
         ],
         [
             Figure(
-                window_figures.recall_by_tenth(windows["by_tenth"], simulated=simulated),
+                figures.recall_by_tenth(windows["by_tenth"], simulated=simulated),
                 "Recall by where the window's middle lies in its class's phase: no slip ends and "
                 "incipient slip begins at the first slip, gross slip begins at the centre's. Bars "
                 "are 95 % intervals over trials. It falls where a phase looks like its neighbour.",
@@ -178,7 +179,7 @@ def _lead(windows: Json, simulated: bool) -> Section:
         said,
         [
             Figure(
-                window_figures.reliability(windows["reliability"], simulated=simulated),
+                figures.reliability(windows["reliability"], simulated=simulated),
                 "Share of windows called rightly, by how far the winner leads; below, how many "
                 "windows there are. Bars are 95 % intervals over trials. "
                 "The paper's detection asks for a lead of 2 with one output neuron a "

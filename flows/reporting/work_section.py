@@ -5,7 +5,7 @@ from __future__ import annotations
 from statistics import fmean
 from typing import Any
 
-from sliplab.analysis.report.report import Section, Table, number, percent
+from sliplab.analysis.report.page import Section, Table, number, percent
 
 Json = dict[str, Any]
 

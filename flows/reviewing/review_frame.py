@@ -9,7 +9,7 @@ from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
 from bokeh.palettes import grey
 from bokeh.plotting import figure
 
-from sliplab.analysis.report.figure_style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
 from sliplab.flows.reviewing.review_trial import Shown
 from sliplab.storage.schema.trial import Point
 from sliplab.storage.streams import U8

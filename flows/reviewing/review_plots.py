@@ -9,7 +9,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource, CustomJS, Label, NumeralTickFormatter, Range1d, Span
 from bokeh.plotting import figure
 
-from sliplab.analysis.report.figure_style import BLUE, GREY, ORANGE, RED
+from sliplab.analysis.report.figures.style import BLUE, GREY, ORANGE, RED
 from sliplab.flows.reviewing.review_trial import Shown
 from sliplab.storage.trials.review import Onsets
 

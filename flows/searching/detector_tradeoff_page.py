@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sliplab.analysis.report.detector_tradeoff_figure import (
+from sliplab.analysis.report.figures.tradeoffs import (
     Bar,
     Panel,
     Point,
     factor_lines,
     front_panels,
 )
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent, render_page
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent, render_page
 from sliplab.flows.searching.detector_tradeoff_compare import FACTORS
 from sliplab.flows.searching.detector_tradeoff_rows import (
     LOOSE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sliplab.analysis.report.report import number, percent
+from sliplab.analysis.report.page import number, percent
 from sliplab.flows.searching.detector_tradeoff_rows import Row, mean, objective, short_list
 
 COLUMNS = (

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sliplab.analysis.metrics.classification import CLASSES
-from sliplab.analysis.report import figures
-from sliplab.analysis.report.report import Figure, Section, Table, number, percent, render_page
+from sliplab.analysis.report.figures import tradeoffs as figures
+from sliplab.analysis.report.page import Figure, Section, Table, number, percent, render_page
 from sliplab.analysis.sweeps.scene_windows import PHASES
 
 FAMILIES = {

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.report import Figure, Number, Section, Table, number, render_page
-from sliplab.analysis.report.sync_figures import over_trials, residuals
+from sliplab.analysis.report.figures.clocks import over_trials, residuals
+from sliplab.analysis.report.page import Figure, Number, Section, Table, number, render_page
 from sliplab.flows.syncing import sync_tables
 from sliplab.flows.syncing.sync_series import (
     All,

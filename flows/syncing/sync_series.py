@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sliplab.analysis.report.sync_figures import Gate, OverTrials, Residuals
+from sliplab.analysis.report.figures.clocks import Gate, OverTrials, Residuals
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 from sliplab.storage.schema.trial import DEVICES
 

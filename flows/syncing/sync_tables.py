@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.report import Table, number
+from sliplab.analysis.report.page import Table, number
 from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
 from sliplab.flows.syncing.sync_series import All
 from sliplab.flows.syncing.sync_trials import TrialClocks

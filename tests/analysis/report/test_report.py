@@ -9,16 +9,17 @@ from xml.etree import ElementTree
 
 import pytest
 
-from sliplab.analysis.report import figures_campaign as campaign
-from sliplab.analysis.report.figures_conditions import (
+from sliplab.analysis.report.figures import campaign, clocks, trials
+from sliplab.analysis.report.figures.intervals import (
     Panel,
     Share,
     by_condition,
     differences,
     shares,
 )
-from sliplab.analysis.report.figures_front import Point, cost_and_error
-from sliplab.analysis.report.report import Figure, Section, Table, csv_text, render
+from sliplab.analysis.report.figures.tradeoffs import Panel as Pair
+from sliplab.analysis.report.figures.tradeoffs import Point, cost_and_error
+from sliplab.analysis.report.page import Figure, Section, Table, csv_text, render
 
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
 ROWS = ["0.165 kg, 0.3 mm/s", "0.205 kg, 0.3 mm/s"]
@@ -58,13 +59,13 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
         ("events (1/s)", "first slip (ms)"),
     ),
     "clocks": (
-        lambda simulated: campaign.clocks(
+        lambda simulated: clocks.uncertainty_by_trial(
             {"events, trigger input": ([1, 2], [0.3, 0.4])}, {"kinematic": 1}, simulated=simulated
         ),
         ("uncertainty, 95 % (µs)", "kinematic", "events, trigger input"),
     ),
     "labels": (
-        lambda simulated: campaign.label_uncertainty(
+        lambda simulated: trials.label_uncertainty(
             {"paper's rule": {"incipient": [1.0, 4.0], "gross": [2.0]}},
             {"incipient": [3.0], "gross": []}, simulated=simulated,
         ),
@@ -72,8 +73,11 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
     ),
     "front": (
         lambda simulated: cost_and_error(
-            [("work (µs/s)", "latency (ms)", [Point(10.0, 90.0, True, False),
-                                               Point(20.0, 95.0, False, True)])],
+            [
+                Point({"x": 10.0, "y": 90.0}, True, False),
+                Point({"x": 20.0, "y": 95.0}, False, True),
+            ],
+            [Pair("x", "y", "work (µs/s)", "latency (ms)")],
             simulated=simulated,
         ),
         ("work (µs/s)", "latency (ms)", "Pareto front", "paper's settings"),

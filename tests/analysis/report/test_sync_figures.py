@@ -2,7 +2,7 @@
 
 import pytest
 
-from sliplab.analysis.report.sync_figures import OverTrials, over_trials
+from sliplab.analysis.report.figures.clocks import OverTrials, over_trials
 
 
 @pytest.mark.parametrize("count", [1, 2, 40])

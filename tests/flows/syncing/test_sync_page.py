@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report.sync_figures import pooled
+from sliplab.analysis.report.figures.clocks import pooled
 from sliplab.flows.reporting import clock_words
 from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks

@@ -1,4 +1,4 @@
-"""Figures by condition: a row for each, dots for its trials, their mean with its interval."""
+"""Figures of values with intervals, a row each: by condition, shares, differences, changes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from sliplab.analysis.metrics.intervals import interval
-from sliplab.analysis.report.figure_style import BLUE, GREY, ORANGE, STYLE, WIDTH, svg_text
-
-_ROW, _AROUND = 0.26, 1.25
-_SEED = 0
+from sliplab.analysis.report.figures.style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    STYLE,
+    WIDTH,
+    svg_text,
+)
 
 
 @dataclass(frozen=True)
@@ -45,12 +49,12 @@ def by_condition(
         rows: names, from top to bottom.
         breaks: a thin line goes above each of these rows, which begin a new group.
     """
-    height = _ROW * max(len(rows), 3) + _AROUND
+    height = 0.26 * max(len(rows), 3) + 1.25
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(
             1, len(panels), figsize=(WIDTH, height), sharey=True, squeeze=False
         )
-        rng = np.random.default_rng(_SEED)
+        rng = np.random.default_rng(0)
         for axes, panel in zip(grid[0], panels, strict=True):
             for place, row in enumerate(rows):
                 there = np.asarray(panel.values.get(row, ()), np.float64)
@@ -169,4 +173,75 @@ def differences(
         axes.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlabel(label)
+        return svg_text(figure, simulated)
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A figure at one setting: 0 is where it stands unchanged.
+
+    Attributes:
+        change: None where the figure cannot be computed.
+        span: its interval.
+    """
+
+    change: float | None
+    span: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class ChangePanel:
+    """One figure over all rows.
+
+    Attributes:
+        label: of the axis, with its unit.
+        lower, higher: by row.
+        note: what it is unchanged, in words.
+    """
+
+    label: str
+    lower: Mapping[str, Changed]
+    higher: Mapping[str, Changed]
+    note: str
+
+
+def lowered_and_raised(
+    rows: Sequence[str], panels: Sequence[ChangePanel], *, simulated: bool, percent: float
+) -> str:
+    """Panels beside each other that share their rows: changes with intervals, as SVG.
+
+    Args:
+        rows: names, from top to bottom.
+        percent: how much each number was lowered and raised.
+    """
+    with plt.rc_context(STYLE):
+        figure, grid = plt.subplots(
+            1, len(panels), figsize=(WIDTH, 0.3 * max(len(rows), 3) + 1.5),
+            sharey=True, squeeze=False,
+        )  # fmt: skip
+        for axes, panel in zip(grid[0], panels, strict=True):
+            axes.axvline(0, color=GREY, lw=0.8)
+            styles = ((panel.lower, -0.16, ORANGE, "v", "less"),
+                      (panel.higher, 0.16, BLUE, "^", "more"))  # fmt: skip
+            for values, off, colour, marker, word in styles:
+                for place, row in enumerate(rows):
+                    found = values.get(row)
+                    if found is None or found.change is None:
+                        continue
+                    if found.span is not None:
+                        axes.plot(found.span, [place + off] * 2, color=colour, lw=1.1)
+                    axes.plot(
+                        found.change, place + off, marker, color=colour, ms=4.5,
+                        label=f"{percent:.0f} % {word}",
+                    )  # fmt: skip
+            axes.set_title(panel.note, fontsize=7.5, color=GREY)
+            axes.set_xlabel(panel.label, fontsize=8)
+            axes.tick_params(axis="x", labelsize=7.5)
+            axes.set_ylim(len(rows) - 0.5, -0.5)
+            for place in range(len(rows) - 1):
+                axes.axhline(place + 0.5, color=GREY, lw=0.2)
+        grid[0][0].set_yticks(range(len(rows)), list(rows), fontsize=8)
+        handles = dict(zip(*reversed(grid[0][0].get_legend_handles_labels()), strict=True))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2,
+                      fontsize=7.5)  # fmt: skip
         return svg_text(figure, simulated)

@@ -1,4 +1,4 @@
-"""Figures about clocks: residuals over a trial, and one value a trial over a campaign."""
+"""Figures of clocks: uncertainty by trial, residuals over a trial, any value over a campaign."""
 
 from __future__ import annotations
 
@@ -9,17 +9,71 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from sliplab.analysis.report.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, svg_text
+from sliplab.analysis.report.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    STYLE,
+    WIDTH,
+    svg_text,
+)
 
 F64 = npt.NDArray[np.float64]
 
+
 COLOURS = {"events": BLUE, "frames": ORANGE, "arm": GREEN}
+
+
 MARKS = {"events": "o", "frames": "s", "arm": "^"}
+
+
 BINS = 40
+
+
 DENSE = 2000
 """From this many marks on they are drawn as pixels, not as shapes."""
+
+
+def uncertainty_by_trial(
+    devices: Mapping[str, tuple[Sequence[int], Sequence[float]]],
+    starts: Mapping[str, int],
+    *,
+    simulated: bool,
+) -> str:
+    """Each device's uncertainty over all trials of a store, SVG.
+
+    Args:
+        devices: name, with its grade, to numbers of trials and microseconds.
+        starts: the number of each campaign's first trial.
+    """
+    marks = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"))
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(WIDTH, 2.8))
+        for (name, (numbers, values)), (colour, mark) in zip(devices.items(), marks, strict=False):
+            axes.plot(
+                numbers, values, mark, color=colour, ms=2.5, mew=0, alpha=0.6, label=name,
+                rasterized=len(numbers) >= 250,
+            )  # fmt: skip
+        axes.set_yscale("log")
+        axes.margins(y=0.35)
+        for place, (name, first) in enumerate(starts.items()):
+            axes.axvline(first, color=GREY, lw=0.6)
+            axes.annotate(  # below each other: a small campaign is narrower than its name
+                f" {name}", (first, 1), xycoords=("data", "axes fraction"), fontsize=7, va="top",
+                xytext=(0, -8 * place), textcoords="offset points",
+            )  # fmt: skip
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set_ylabel("uncertainty, 95 % (µs)")
+        axes.set_xlabel("trial, campaign after campaign")
+        axes.legend(
+            loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=3, fontsize=8, markerscale=2
+        )
+        return svg_text(figure, simulated)
 
 
 @dataclass(frozen=True)

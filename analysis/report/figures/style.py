@@ -1,4 +1,4 @@
-"""What all figures share: colours, style, and how a picture becomes SVG text.
+"""Colours and style of all figures, and the SVG text of a picture.
 
 Colours are told apart by the colour-blind (Okabe and Ito's palette), and a simulated figure says so
 in the picture itself, so that it still says so when somebody copies it out of its page.
@@ -7,9 +7,11 @@ in the picture itself, so that it still says so when somebody copies it out of i
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
+import numpy.typing as npt
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -23,6 +25,9 @@ BLUE, ORANGE, GREEN, RED, PURPLE, GREY = (
     "#CC79A7",
     "#666666",
 )
+Array = npt.NDArray[Any]
+CLASS_COLOURS = (BLUE, ORANGE, RED)
+CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
 WIDTH = 6.4
 """Inches: what still can be read when a telephone shrinks it."""
 _DPI = 150
@@ -42,7 +47,7 @@ STYLE = {
 
 
 def svg_text(figure: Any, simulated: bool) -> str:
-    """The picture as SVG, and the end of it in memory."""
+    """Return the picture as SVG text, and close it."""
     if simulated:
         figure.suptitle("simulated", x=0.995, ha="right", fontsize=8, color=GREY, style="italic")
     buffer = io.StringIO()
@@ -52,3 +57,19 @@ def svg_text(figure: Any, simulated: bool) -> str:
     plt.close(figure)
     text = buffer.getvalue()
     return text[text.index("<svg") :]
+
+
+def name_cells(
+    axes: Any,
+    rows: Sequence[object],
+    columns: Sequence[object],
+    row_name: str,
+    column_name: str,
+) -> None:
+    """Write the names of a table of cells along its left and lower edge."""
+    axes.set_xticks(range(len(columns)), [str(item) for item in columns])
+    axes.set_yticks(range(len(rows)), [str(item) for item in rows])
+    axes.set_xlabel(column_name)
+    axes.set_ylabel(row_name)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
