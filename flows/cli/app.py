@@ -1,39 +1,18 @@
-"""The command line. Heavy libraries load inside the commands that use them."""
+"""The command line, put together. Heavy libraries load inside the commands that use them."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli.calibrate import calibrate_app, teach_app
-from sliplab.flows.cli.chain import register as register_chain
-from sliplab.flows.cli.common import (
-    EnableOption,
-    JsonOption,
-    ProtocolArgument,
-    RigOption,
-    StoreOption,
-    finish,
-)
-from sliplab.flows.cli.control import register as register_control
-from sliplab.flows.cli.detect import register as register_detect
-from sliplab.flows.cli.exchange import register as register_exchange
+from sliplab.flows.cli import collect, control, detect, exchange, review, rigs, steps, store, study
 from sliplab.flows.cli.generalise import register as register_generalise
 from sliplab.flows.cli.guesses import register as register_guesses
 from sliplab.flows.cli.holdout import register as register_holdout
-from sliplab.flows.cli.models import register as register_models
-from sliplab.flows.cli.remote import register as register_remote
-from sliplab.flows.cli.review import register as register_review
-from sliplab.flows.cli.rigs import rigs
 from sliplab.flows.cli.schema import register as register_schema
-from sliplab.flows.cli.serve import register as register_serve
-from sliplab.flows.cli.steps import register as register_steps
-from sliplab.flows.cli.store import register as register_store
 from sliplab.flows.cli.tradeoff import register as register_tradeoff
 from sliplab.flows.running import console
-from sliplab.flows.steps import prepare_store
 
 app = typer.Typer(
     name="sliplab",
@@ -63,133 +42,23 @@ def options(
     """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
 
 
-@app.command()
-def plan(
-    protocol: ProtocolArgument,
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="A rig file or name, for bytes.")
-    ] = None,
-    enable: EnableOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Print the trials in the order they will be taken, with hours and (given a rig) bytes."""
-    from sliplab.flows.planning import plan_view
-    from sliplab.protocols.plan import load_plan
-
-    found = load_plan(protocol, enable or ())
-    needed, scene = None, None
-    if rig is not None:
-        from sliplab.flows.planning.estimate import plan_bytes
-        from sliplab.flows.planning.plan_scene import scene_of
-        from sliplab.rigs.rig_file import check_plan, load_rig_file
-
-        rig_file, _ = load_rig_file(rig)
-        check_plan(rig_file, found, str(rig))
-        needed = round(plan_bytes(rig_file, found))
-        scene = scene_of(rig_file, found)
-    if as_json:
-        console.print_json(plan_view.as_json(found, needed, scene))
-    else:
-        plan_view.show(found, needed, scene)
-
-
-@app.command()
-def check(
-    protocol: ProtocolArgument,
-    rig: RigOption,
-    store: StoreOption,
-    enable: EnableOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Look at everything that can be known before anything moves."""
-    from sliplab.flows.planning import preflight
-
-    found = preflight.check(protocol, rig, store, tuple(enable or ()))
-    if as_json:
-        console.print_json(preflight.as_json(found))
-    else:
-        rows = [["ok" if item.passed else "FAILED", item.name, item.finding] for item in found]
-        console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
-    if not all(item.passed for item in found):
-        raise typer.Exit(console.FAILED)
-
-
-@app.command()
-def collect(
-    protocol: ProtocolArgument,
-    rig: RigOption,
-    store: StoreOption,
-    enable: EnableOption = None,
-    trials: Annotated[
-        int | None,
-        typer.Option(
-            "--trials", min=1, max=1_000_000, help="Take so many of the missing, no more."
-        ),
-    ] = None,
-    campaign: Annotated[
-        str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
-    ] = None,
-    operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
-    temperature: Annotated[
-        float | None,
-        typer.Option("--temperature", min=-50, max=100, help="Of the room, degrees Celsius."),
-    ] = None,
-    humidity: Annotated[
-        float | None, typer.Option("--humidity", min=0, max=100, help="Relative, percent.")
-    ] = None,
-    note: Annotated[str, typer.Option("--note", help="Anything worth keeping.")] = "",
-    as_json: JsonOption = False,
-) -> None:
-    """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
-    from sliplab.flows.planning.run_request import SessionMetadata, check_disk, make_request
-    from sliplab.flows.running import orchestration
-    from sliplab.storage.trials.store import Store
-
-    run_request = make_request(
-        protocol,
-        rig,
-        store,
-        enable=tuple(enable or ()),
-        campaign=campaign,
-        metadata=SessionMetadata(operator, temperature, humidity, note),
-        most=trials,
-    )
-    for warning in run_request.plan.warnings():
-        console.say(f"note: {warning}")
-    check_disk([run_request])
-    prepare_store(store)
-    if run_request.wanted(Store(store).campaign(run_request.campaign)):
-        orchestration.begin()  # starts beside all that is imported below
-    from sliplab.flows.collecting.collect import collect as run
-
-    result = run(run_request)
-    if not result["taken"]:
-        console.say("nothing to do: the store holds every trial that can be taken")
-    if not as_json:
-        from sliplab.flows.collecting.aside_view import show_aside
-
-        show_aside(result["causes"])
-        result = {key: value for key, value in result.items() if key != "causes"}
-    finish(result, f"collected into {store}", as_json)
-    if result["missing"] > result["left_out"]:
-        raise typer.Exit(console.FAILED)
-
-
-register_steps(app)
-register_tradeoff(app)
-register_generalise(app)
-register_guesses(app)
-register_holdout(app)
-register_chain(app)
-register_store(app)
-register_remote(app)
-app.command()(rigs)
-register_control(app)
-register_serve(app)
-register_exchange(app)
-register_review(app)
-register_detect(app)
-register_models(app)
-register_schema(app)
-app.add_typer(teach_app, name="teach")
-app.add_typer(calibrate_app, name="calibrate")
+sweeps, schemas = typer.Typer(), typer.Typer()
+register_tradeoff(sweeps)
+register_generalise(sweeps)
+register_guesses(sweeps)
+register_holdout(sweeps)
+register_schema(schemas)
+for part in (
+    collect.app,
+    steps.app,
+    sweeps,
+    study.app,
+    store.app,
+    rigs.app,
+    control.app,
+    exchange.app,
+    review.app,
+    detect.app,
+    schemas,
+):
+    app.add_typer(part)

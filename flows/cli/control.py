@@ -1,6 +1,7 @@
-"""`sliplab pause`, `resume`, `stop`, `skip` and `again`: a campaign led from another terminal.
+"""`sliplab pause`, `resume`, `stop`, `skip`, `again`, `serve`: control from elsewhere.
 
-Each one keeps in STORE/control/ who asked for what, when and why.
+Those before `serve` are for another terminal: each keeps in STORE/control/ who asked for what,
+when and why. `serve` offers one rig's deployments on Prefect's page, with schedules.
 """
 
 from __future__ import annotations
@@ -10,13 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sliplab.flows.cli.common import JsonOption, RigOption, StoreArgument, StoreOption
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 
 if TYPE_CHECKING:
     from sliplab.flows.collecting.controlling import Outcome
     from sliplab.storage.trials.control import Kind
 
-StoreArgument = Annotated[Path, typer.Argument(help="A store's folder.")]
+app = typer.Typer()
+
 TrialsArgument = Annotated[list[str], typer.Argument(help="Ids of trials, as in `sliplab plan`.")]
 WhyOption = Annotated[str, typer.Option("--why", help="The reason, kept with the request.")]
 NeededWhyOption = Annotated[
@@ -29,11 +33,9 @@ WaitOption = Annotated[
 CampaignOption = Annotated[
     str | None, typer.Option("--campaign", help="Whose trials, where several have them.")
 ]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="One JSON object on standard output, the rest on error.")
-]
 
 
+@app.command()
 def pause(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
@@ -43,6 +45,7 @@ def pause(
     _finish([outcome], as_json, _pause_words(store, outcome))
 
 
+@app.command()
 def resume(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
     as_json: JsonOption = False,
@@ -54,6 +57,7 @@ def resume(
     _finish([outcome], as_json, words)
 
 
+@app.command()
 def stop(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
     as_json: JsonOption = False,
@@ -71,6 +75,7 @@ def stop(
     _finish([outcome], as_json, words)
 
 
+@app.command()
 def skip(
     store: StoreArgument, trials: TrialsArgument, why: NeededWhyOption,
     campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
@@ -80,6 +85,7 @@ def skip(
     _decide(store, "skip", trials, campaign, who, why, wait, as_json)
 
 
+@app.command()
 def again(
     store: StoreArgument, trials: TrialsArgument, why: NeededWhyOption,
     campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
@@ -87,12 +93,6 @@ def again(
 ) -> None:  # fmt: skip
     """Take trials again: what is committed is moved to quarantine, never deleted."""
     _decide(store, "again", trials, campaign, who, why, wait, as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    for command in (pause, resume, stop, skip, again):
-        app.command()(command)
 
 
 def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcome:
@@ -149,3 +149,56 @@ def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
             f"({kind}, number {outcomes[0].request.number})"
         )
         raise typer.Exit(console.FAILED)
+
+
+@app.command()
+def serve(
+    store: StoreOption,
+    rig: RigOption,
+    schedules: Annotated[
+        Path | None, typer.Argument(help="A file of schedules (YAML): nights, weekends.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Of the deployments; the rig's by default.")
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Of the embedded server's page; 0: any.")
+    ] = 4200,
+    poll: Annotated[
+        float, typer.Option("--poll", min=0.2, max=60, help="Look for new runs so often, s.")
+    ] = 3.0,
+    check: Annotated[
+        bool, typer.Option("--check", help="Read the file, say what would run when, and end.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Serve collect, label, train, evaluate, report, study and chain; Ctrl-C ends, arm first."""
+    from sliplab.flows.serving.serve_file import load_schedules
+    from sliplab.rigs.rig_file import load_rig_file
+    from sliplab.rigs.rig_inheritance import rig_path
+
+    found = [] if schedules is None else load_schedules(schedules)
+    file, _ = load_rig_file(rig)
+    if check:
+        rows = [[i.name, i.flow, i.cron, i.timezone, i.active, i.parameters] for i in found]
+        if as_json:
+            console.print_json({"schedules": [item.model_dump() for item in found]})
+        else:
+            columns = ["name", "flow", "cron", "time zone", "active", "parameters"]
+            console.print_table(f"schedules of {schedules}", columns, rows)
+        return
+    prepare_store(store)
+    from sliplab.flows.serving.serve import serve as run
+    from sliplab.storage.trials.store import Store
+
+    run(
+        Store.open(store),
+        str(rig_path(rig).resolve()),
+        name or file.name,
+        found,
+        folders=[Path.cwd(), *([] if schedules is None else [schedules.parent])],
+        port=port,
+        poll_s=poll,
+    )
+    if as_json:
+        console.print_json({"served": str(store), "name": name or file.name})

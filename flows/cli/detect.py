@@ -10,7 +10,10 @@ import typer
 from sliplab.flows.cli.common import EnableOption, JsonOption, RigOption
 from sliplab.flows.running import console
 
+app = typer.Typer()
 
+
+@app.command()
 def detect(
     rig: RigOption,
     model: Annotated[Path, typer.Option("--model", help="A trained network: models/seed0.pt.")],
@@ -108,8 +111,3 @@ def _spread(values: dict[str, Any]) -> str | None:
     if not values["n"]:
         return None
     return f"median {values['median']:.2f}, 99 % {values['p99']:.2f}, most {values['max']:.2f}"
-
-
-def register(app: typer.Typer) -> None:
-    """Make it a command of `app`."""
-    app.command()(detect)

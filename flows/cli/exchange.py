@@ -1,17 +1,21 @@
-"""`sliplab import` and `export`: trials from and to the files of others."""
+"""`sliplab import`, `export` and `export-model`: files of other programs."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from sliplab.flows.cli.common import JsonOption, StoreArgument, StoreOption, finish
+from sliplab.flows.cli.common import CampaignOption, JsonOption, StoreArgument, StoreOption, finish
 from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
 from sliplab.protocols.errors import InputError
 
+app = typer.Typer()
 
+
+@app.command("import")
 def import_(
     kind_or_path: Annotated[
         str, typer.Argument(metavar="[KIND] PATH", help="A file, or a folder of files.")
@@ -57,6 +61,7 @@ def import_(
     finish(result, f"imported into {store}", as_json)
 
 
+@app.command()
 def export(
     store: StoreArgument,
     what: Annotated[str, typer.Argument(help="A campaign, or a trial of one.")],
@@ -105,7 +110,60 @@ def export(
     finish(result, f"exported to {output}", as_json)
 
 
-def register(app: typer.Typer) -> None:
-    """Make them commands of `app`."""
-    app.command("import")(import_)
-    app.command()(export)
+@app.command("export-model")
+def export_model(
+    model: Annotated[Path, typer.Argument(help="A trained network: STORE/models/seed0.pt.")],
+    out: Annotated[Path, typer.Option("--out", help="A folder; made if missing.")],
+    store: Annotated[
+        Path | None,
+        typer.Option("--store", help="Whose windows it is checked on; the model's own by default."),
+    ] = None,
+    campaign: CampaignOption = None,
+    onnx: Annotated[
+        bool, typer.Option("--onnx/--no-onnx", help="Write ONNX, checked against Sinabs.")
+    ] = True,
+    windows: Annotated[
+        int,
+        typer.Option(
+            "--windows", min=1, max=1_000_000, help="Windows that the ONNX file is checked on."
+        ),
+    ] = 256,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
+    from sliplab.flows.detecting.detect_order import load_model
+    from sliplab.storage.trials.store import Store
+
+    if out.exists() and not out.is_dir():
+        raise InputError("--out", "", str(out), "must be a folder")
+    fitted = load_model(model)
+    folder = store or model.resolve().parent.parent
+    if store is None and not (folder / "store.json").exists():
+        raise InputError("--store", "", None, f"is needed: {model} lies in no store")
+    opened = Store.open(folder)
+    prepare_store(folder)
+    from sliplab.flows.learning.model_export import export_model as run
+
+    result = run(model, fitted, out, opened, campaign, onnx=onnx, checked=windows)
+    for warning in (*result["warnings"], *result["problems"]):
+        console.say(f"warning: {warning}")
+    if as_json:
+        console.print_json(result)
+    else:
+        simulated = " (simulated data)" if result["simulated"] else ""
+        console.print_pairs(f"exported to {out}{simulated}", _model_pairs(result))
+
+
+def _model_pairs(result: dict[str, Any]) -> dict[str, Any]:
+    change, accuracy = result["change"], result["accuracy"]
+    checked = result["onnx_windows_equal"]
+    return {
+        "files": ", ".join(Path(file).name for file in result["files"]),
+        "onnx": f"{checked} of {checked} windows as in Sinabs" if checked else "not written",
+        "speck": "fits, one core a layer" if result["speck_fits"] else "does not fit",
+        "8 bits: equal counts": f"{change['equal_counts']:.1%} of {change['windows']} windows",
+        "8 bits: equal class": f"{change['equal_class']:.1%}",
+        "strict accuracy": f"{accuracy['real']['strict']:.1%}, with 8 bits "
+        f"{accuracy['whole']['strict']:.1%}",
+        "synaptic operations a window": f"{result['synaptic_operations']:,.0f}",
+    }

@@ -14,7 +14,10 @@ from sliplab.protocols.errors import InputError
 if TYPE_CHECKING:
     from sliplab.flows.reviewing.review_list import TrialList
 
+app = typer.Typer()
 
+
+@app.command()
 def review(
     store: StoreArgument,
     port: Annotated[
@@ -45,6 +48,7 @@ def review(
     serve(Store.open(store), campaign or (), port, who, ready)
 
 
+@app.command()
 def view(
     store: StoreArgument,
     trial: Annotated[str, typer.Argument(help="A trial's id, as in `sliplab trials`.")],
@@ -74,9 +78,3 @@ def view(
     else:
         summary = {**counts, "bytes": console.size(counts["bytes"])}
         console.print_pairs(f"{save} (open it with `rerun {save}`)", summary)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    for command in (review, view):
-        app.command()(command)

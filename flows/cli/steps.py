@@ -21,6 +21,8 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import run_step
 from sliplab.protocols.errors import InputError
 
+app = typer.Typer()
+
 
 class Engine(StrEnum):
     """Engines that count the spikes of a model file."""
@@ -34,6 +36,7 @@ ReviewedOption = Annotated[
 ]
 
 
+@app.command()
 def sync(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -57,6 +60,7 @@ def sync(
     console.show(f"Page{simulated}: {Path(result['page']).resolve()}")
 
 
+@app.command()
 def label(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -67,6 +71,7 @@ def label(
     step(store, campaign, as_json, "label", dask=dask)
 
 
+@app.command()
 def train(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -78,6 +83,7 @@ def train(
     step(store, campaign, as_json, "train", dask=dask, reviewed=reviewed)
 
 
+@app.command()
 def evaluate(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -166,6 +172,7 @@ def _judged(result: dict[str, Any]) -> dict[str, Any]:
     return shown
 
 
+@app.command()
 def report(
     store: PlaceArgument,
     campaign: CampaignOption = None,
@@ -195,9 +202,3 @@ def report(
             console.show(f"Page: {compared['page']}")
     finish(result, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")
-
-
-def register(app: typer.Typer) -> None:
-    """Make them commands of `app`."""
-    for command in (sync, label, train, evaluate, report):
-        app.command()(command)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sliplab.flows import __main__ as program
-from sliplab.flows.cli import remote as cli_remote
+from sliplab.flows.cli.store import FOLLOW_S
 from sliplab.flows.running import stopping
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Store
@@ -122,4 +122,4 @@ def test_follow_ends_with_the_collection(
     monkeypatch.setattr(stopping, "wait", meanwhile)
     code, sent, _ = sliplab("push", store, f"file://{tmp_path}/shared", "--follow")
     assert (code, sent["trials"], sent["pushed"], sent["there"]) == (0, 4, 4, 3)
-    assert waited == [cli_remote.FOLLOW_S] * 2
+    assert waited == [FOLLOW_S] * 2

@@ -333,29 +333,28 @@ def test_a_wrong_rig_file(case: str, command: str, tmp_path: Path) -> None:
         assert secret not in line
 
 
-def _options() -> dict[str, tuple[Any, typer.models.ParameterInfo]]:
+def _options(
+    group: typer.Typer = app, prefix: str = ""
+) -> dict[str, tuple[Any, typer.models.ParameterInfo]]:
     """Type and information of every numeric option of every command, by their names."""
-    groups = {
-        "": app,
-        **{f"{group.name} ": group.typer_instance for group in app.registered_groups},
-    }
     found = {}
-    for prefix, group in groups.items():
-        assert group is not None
-        for command in group.registered_commands:
-            assert command.callback is not None
-            name = command.name or command.callback.__name__.replace("_", "-")
-            hints = get_type_hints(command.callback, include_extras=True)
-            for parameter, hint in hints.items():
-                plain, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-                leaves = {
-                    plain,
-                    *get_args(plain),
-                    *(x for y in get_args(plain) for x in get_args(y)),
-                }
-                info = [item for item in more if isinstance(item, typer.models.ParameterInfo)]
-                if leaves & {int, float} and info:
-                    found[f"{prefix}{name} {parameter}"] = (leaves, info[0])
+    for command in group.registered_commands:
+        assert command.callback is not None
+        name = command.name or command.callback.__name__.replace("_", "-")
+        hints = get_type_hints(command.callback, include_extras=True)
+        for parameter, hint in hints.items():
+            plain, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+            leaves = {
+                plain,
+                *get_args(plain),
+                *(x for y in get_args(plain) for x in get_args(y)),
+            }
+            info = [item for item in more if isinstance(item, typer.models.ParameterInfo)]
+            if leaves & {int, float} and info:
+                found[f"{prefix}{name} {parameter}"] = (leaves, info[0])
+    for inner in group.registered_groups:
+        assert inner.typer_instance is not None
+        found |= _options(inner.typer_instance, f"{inner.name} " if inner.name else prefix)
     return found
 
 

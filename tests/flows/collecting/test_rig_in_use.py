@@ -33,9 +33,10 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a device was opened")
 
     for place in (
-        "flows.collecting.run_session.build_rig", "rigs.build.build_rig", "flows.cli.rigs.reach",
+        "flows.collecting.run_session.build_rig",
+        "rigs.build.build_rig",
         "rigs.reach.reach",
-    ):  # fmt: skip
+    ):
         monkeypatch.setattr(f"sliplab.{place}", opened)
     name = next(iter(lock_names(load_rig_file(UR5)[0])))
     with exclusive(folder / name, "the arm", about={"store": "/data/other"}):

@@ -13,7 +13,10 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 from sliplab.flows.study_defaults import HELD_OUT, LABELS_CHECKED, study_protocols
 
+app = typer.Typer()
 
+
+@app.command()
 def study(
     folder: Annotated[Path, typer.Argument(help="The study's store; made if missing.")],
     rig: RigOption = Path("rehearsal"),
@@ -78,6 +81,7 @@ def _status(folder: Path, as_json: bool) -> None:
         print_rows(rows)
 
 
+@app.command()
 def demo(
     folder: Annotated[Path, typer.Argument(help="Where its store goes.")] = Path("sliplab-demo"),
     rig: RigOption = Path("rehearsal"),
@@ -139,9 +143,3 @@ def _chain(
     rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
     console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
     console.show(f"Report{simulated}: {page.resolve()}")
-
-
-def register(app: typer.Typer) -> None:
-    """Make them commands of `app`."""
-    for command in (study, demo):
-        app.command()(command)
