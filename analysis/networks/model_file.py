@@ -13,8 +13,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from sliplab.analysis.networks.epoch_record import EpochRecord
-from sliplab.analysis.networks.training import Fitted, restore
+from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.storage.files import write_bytes
 

@@ -4,11 +4,17 @@ Each layer has one scale. It is the largest whole number that keeps the layer's 
 within 8 bits, and because the threshold is 1 it is the threshold too: exactly, without rounding.
 Every potential is then a whole number, which float32 adds without error: what is computed here is
 what an integer machine computes.
+
+On the fast kernels, which take one threshold for all layers: a whole potential u reaches a whole
+threshold s exactly where m u reaches any T above m (s - 1) and up to m s. So each layer's weights
+are multiplied by a whole number of its own, and one T serves them all. Sums stay whole, and float32
+holds them exactly below 2^24, which is 2^24 / T thresholds. Potentials are not cut off at the
+chip's 16 bits there (`chip_run` does that): those that far down do not come back in a window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -215,3 +221,41 @@ def _numbers(net: nn.Sequential, layer: str) -> npt.NDArray[np.float64]:
 def _of(layer: str, key: str) -> bool:
     """Whether a weight by its name in torch is this layer's."""
     return key.split(".")[0] == layer
+
+
+MOST, BLOCK = 1 << 20, 1 << 13
+"""Where the search for a common threshold ends, and how many are tried at once."""
+
+
+def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:
+    """The lowest T and the multiples m with ``m (s - 1) < T <= m s`` for each threshold s.
+
+    Raises:
+        ValueError: a threshold is not positive, or there is no T below `MOST`.
+    """
+    whole = np.asarray(thresholds, np.int64)
+    if (whole < 1).any():
+        raise ValueError(f"thresholds {list(thresholds)}: must be positive whole numbers")
+    for start in range(int(whole.max(initial=1)), MOST, BLOCK):
+        tried = np.arange(start, start + BLOCK, dtype=np.int64)
+        multiple = -(-tried[:, None] // whole)
+        fits = (multiple * (whole - 1) < tried[:, None]).all(axis=1)
+        if fits.any():
+            at = int(fits.argmax())
+            return int(tried[at]), tuple(int(m) for m in multiple[at])
+    raise ValueError(f"thresholds {list(thresholds)}: no common one below {MOST}")
+
+
+def common_net(fitted: Fitted, found: Quantised) -> nn.Sequential:
+    """The network in whole numbers with one threshold, as `networks.spiking.Engine` takes it.
+
+    Raises:
+        ValueError: as `common_threshold`.
+    """
+    threshold, multiples = common_threshold([found.thresholds[name] for name in SPIKING])
+    net = build(fitted.network, fitted.windows, fitted.seed)
+    set_weights(net, found.times(dict(zip(WEIGHTED, multiples, strict=True))))
+    for name in SPIKING:
+        one = nn.Parameter(torch.tensor(float(threshold)), requires_grad=False)
+        getattr(net, name).spike_threshold = one
+    return net

@@ -11,23 +11,227 @@ same call gives the same bits on any number of threads, and after a stop at any 
 
 from __future__ import annotations
 
+import io
+import math
+import pickle
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.special import log_softmax
 from torch import nn
 
 from sliplab.analysis.metrics import classification as metrics
-from sliplab.analysis.networks.epoch_record import EpochRecord, epoch_record, layer_warnings
-from sliplab.analysis.networks.network import build, set_weights
+from sliplab.analysis.networks.gradients import work_on
+from sliplab.analysis.networks.network import (
+    SPIKING,
+    build,
+    matrices,
+    on_grid,
+    parameters,
+    set_matrices,
+    set_weights,
+    weights,
+)
 from sliplab.analysis.networks.spiking import Engine, Samples
-from sliplab.analysis.networks.training_run import Run
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Training, Windows
+
+
+def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
+    """Of a step in the epoch after `done` epochs.
+
+    Constant, or falling from the full rate to nothing along half a cosine over all steps of all
+    epochs (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a
+    line. The last steps are nearly none: weights come to rest instead of being caught in a jump
+    (docs/decisions/0057).
+
+    Args:
+        step, steps: done in this epoch, and all of an epoch.
+    """
+    rising = training.warm_up * training.epochs * steps
+    rate = training.learning_rate * min(1.0, (done * steps + step + 1) / max(rising, 1.0))
+    if training.schedule == "constant":
+        return rate
+    return rate * 0.5 * (1.0 + math.cos(math.pi * (done + step / steps) / training.epochs))
+
+
+SILENT_RATE = 1e-5
+"""Spikes per neuron and step at or below which a layer counts as silent."""
+
+SATURATED_RATE = 0.9
+"""Spikes per neuron and step at or above which a layer counts as saturated (1 is the most)."""
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """What one pass over the training samples gave.
+
+    Attributes:
+        epoch: 1 for the first.
+        loss: mean cross-entropy of the training samples, each before the step it was used in.
+        train_argmax: their accuracy, likewise, ties shared (`metrics.classification.Accuracy`).
+        val_loss: mean cross-entropy of the validation samples after the epoch.
+        val_argmax, val_strict, val_margin: their accuracies.
+        rates: mean spikes per neuron and step of each spiking layer over the epoch, by name.
+    """
+
+    epoch: int
+    loss: float
+    train_argmax: float
+    val_loss: float
+    val_argmax: float
+    val_strict: float
+    val_margin: float
+    rates: dict[str, float]
+
+    @property
+    def merit(self) -> tuple[float, float, float]:
+        """What epochs are compared by, the larger the better: see `fit`."""
+        return (self.val_strict, self.val_argmax, -self.val_loss)
+
+
+def epoch_record(
+    epoch: int,
+    loss: float,
+    train_counts: metrics.IntArray,
+    train_y: metrics.IntArray,
+    val_counts: metrics.IntArray,
+    val_y: metrics.IntArray,
+    rates: dict[str, float],
+    gain: float,
+    margin: float,
+) -> EpochRecord:
+    """The record of an epoch from the output spikes (n, 3) and classes of both parts."""
+    val = metrics.accuracy(val_counts, val_y, margin)
+    train = metrics.accuracy(train_counts, train_y)
+    log_p = log_softmax(gain * val_counts, axis=1)
+    return EpochRecord(
+        epoch=epoch,
+        loss=loss,
+        train_argmax=train.argmax or 0.0,
+        val_loss=-float(log_p[np.arange(len(val_y)), val_y].mean()),
+        val_argmax=val.argmax or 0.0,
+        val_strict=val.strict or 0.0,
+        val_margin=val.margin or 0.0,
+        rates=rates,
+    )
+
+
+def layer_warnings(record: EpochRecord) -> tuple[str, ...]:
+    """Layers that are silent or saturated, by name."""
+    found = []
+    for name, rate in record.rates.items():
+        if rate <= SILENT_RATE:
+            found.append(f"layer {name} is silent: {rate:.2g} spikes per neuron and step")
+        elif rate >= SATURATED_RATE:
+            found.append(f"layer {name} is saturated: {rate:.2g} spikes per neuron and step")
+    return tuple(found)
+
+
+class Run:
+    """A training between two epochs."""
+
+    def __init__(self, network: Network, windows: Windows, training: Training, seed: int) -> None:
+        self.training = training
+        self.fine = build(network, windows, seed)
+        self.trained = build(network, windows, seed)
+        """Has the fine weights at their points of the grid, between epochs."""
+        self.parameters = parameters(self.fine)
+        self.optimizer = torch.optim.Adam(
+            self.parameters.values(), training.learning_rate, fused=True
+        )
+        self.work = work_on(training.device, self.trained, windows.cells, training.gain)
+        self.history: list[EpochRecord] = []
+        self.seconds: list[float] = []
+        self.best = 0
+        self.to_grid()
+        self.settle()
+        self.kept = weights(self.trained)
+
+    def to_grid(self) -> None:
+        """Let the spikes be those of the fine weights as they are now."""
+        self.work.take(on_grid(matrices(self.fine)))
+
+    def settle(self) -> None:
+        """Let `trained` have the weights that the spikes are of."""
+        set_matrices(self.trained, on_grid(matrices(self.fine)))
+
+    @property
+    def ended(self) -> bool:
+        """Whether all epochs were run, or none of late was better."""
+        done = len(self.history)
+        return done >= self.training.epochs or (
+            self.best > 0 and done - self.best >= self.training.patience
+        )
+
+    def one_epoch(
+        self, x: SparseWindows, y: metrics.IntArray, order: metrics.IntArray, pool: Executor
+    ) -> tuple[float, metrics.IntArray, dict[str, float]]:
+        """Mean loss, output spikes (n, 3) in the order of `x`, and the layers' mean rates."""
+        batch = self.training.batch
+        steps = math.ceil(len(x) / batch)
+        loss = 0.0
+        counts = np.zeros((len(x), len(metrics.CLASSES)), np.int64)
+        fired = dict.fromkeys(SPIKING, 0.0)
+        for start in range(0, len(x), batch):
+            chosen = order[start : start + batch]
+            found = self.work.batch(x, y, chosen, pool)
+            loss += found.loss
+            counts[chosen] = found.counts
+            for name, rate in found.fired.items():
+                fired[name] += rate
+            for name, parameter in self.parameters.items():
+                parameter.grad = found.gradients[name] / len(chosen)
+            for group in self.optimizer.param_groups:
+                group["lr"] = learning_rate(self.training, len(self.history), start // batch, steps)
+            self.optimizer.step()
+            self.to_grid()
+        self.settle()
+        return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
+
+    def keep(self, record: EpochRecord) -> None:
+        """An epoch is over; its weights are kept if it is the best yet."""
+        self.history.append(record)
+        if self.best == 0 or record.merit > self.history[self.best - 1].merit:
+            self.best, self.kept = record.epoch, weights(self.trained)
+
+    def state(self) -> bytes:
+        """Everything that the epochs to come depend on."""
+        buffer = io.BytesIO()
+        content = {
+            "fine": weights(self.fine),
+            "optimizer": self.optimizer.state_dict(),
+            "kept": self.kept,
+            "best": self.best,
+            "history": [asdict(record) for record in self.history],
+            "seconds": self.seconds,
+        }
+        torch.save(content, buffer)
+        return buffer.getvalue()
+
+    def go_on(self, state: bytes) -> None:
+        """Take up what `state` gave.
+
+        Raises:
+            ValueError: it is damaged, or of another network.
+        """
+        try:
+            content = torch.load(io.BytesIO(state), map_location="cpu", weights_only=True)
+            set_weights(self.fine, content["fine"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.kept, self.best = content["kept"], content["best"]
+            self.history = [EpochRecord(**record) for record in content["history"]]
+            self.seconds = content["seconds"]
+        except (KeyError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+            raise ValueError(f"not a state of this training: {error}") from error
+        self.to_grid()
+        self.settle()
+
 
 VERSION = 8
 """Raised when the same samples, settings and seed give other weights."""

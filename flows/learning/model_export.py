@@ -29,8 +29,7 @@ from sliplab.analysis.networks.quantised import (
     quantise,
     quantised_net,
 )
-from sliplab.analysis.networks.speck import speck_fit
-from sliplab.analysis.networks.speck_page import speck_markdown
+from sliplab.analysis.networks.speck import speck_fit, speck_markdown
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels

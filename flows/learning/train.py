@@ -14,8 +14,8 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
-from sliplab.analysis.networks import model_file, training, training_device
-from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.networks import gradients, model_file, training
+from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.report.figures.windows import training_curves
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
@@ -244,7 +244,7 @@ def train(
 
 
 def _check_device(item: Collected) -> None:
-    device, there = item.settings.training.device, training_device.devices()
+    device, there = item.settings.training.device, gradients.devices()
     if device not in there:
         raise InputError(
             item.campaign.protocol_file,

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
-from sliplab.analysis.networks.baseline_trees import ROUNDS, boosted
-from sliplab.analysis.networks.baselines import RIDGE, logistic_cells
+from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores

@@ -20,12 +20,10 @@ from torch import nn
 
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.epoch_record import EpochRecord
-from sliplab.analysis.networks.quantised import quantise
-from sliplab.analysis.networks.quantised_engine import common_net
+from sliplab.analysis.networks.quantised import common_net, quantise
 from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.synaptic import count_net_work
-from sliplab.analysis.networks.training import Fitted, restore
+from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.samples import strided_windows

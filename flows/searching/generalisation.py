@@ -21,7 +21,7 @@ from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
-from sliplab.analysis.networks.epoch_record import EpochRecord
+from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.flows.collecting.collect import collect

@@ -245,9 +245,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
 ) -> None:
     store = store_of(ran)
     monkeypatch.setattr("sliplab.flows.learning.train.Model.fresh", False)
-    monkeypatch.setattr(
-        "sliplab.analysis.networks.training_device.devices", lambda: ["cuda", "cuda:0"]
-    )
+    monkeypatch.setattr("sliplab.analysis.networks.gradients.devices", lambda: ["cuda", "cuda:0"])
     with pytest.raises(
         InputError,
         match=r"analysis\.training\.device = cpu: there is none here; must be one of cuda, cuda:0",

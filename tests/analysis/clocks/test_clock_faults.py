@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock
-from sliplab.analysis.clocks.pulse_runs import stray_stretch
+from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock, stray_stretch
 from tests.analysis.clocks.test_clocks import TICK_NS, code
 
 Ints = NDArray[np.int64]

@@ -6,7 +6,7 @@ import torch
 
 from sliplab.analysis.metrics.classification import accuracy
 from sliplab.analysis.networks.baseline_nets import KINDS, multiply_adds, trained_net
-from sliplab.analysis.networks.baseline_trees import boosted
+from sliplab.analysis.networks.baselines import boosted
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.analysis.windows.sparse import SparseWindows
 

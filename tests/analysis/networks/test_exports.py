@@ -15,7 +15,6 @@ from sinabs.utils import validate_memory_mapping_speck
 from torch import nn
 
 from sliplab.analysis.networks.activity import activity
-from sliplab.analysis.networks.epoch_record import EpochRecord
 from sliplab.analysis.networks.model_card import SplitResult, card_markdown, model_card
 from sliplab.analysis.networks.network import (
     BIASED,
@@ -30,7 +29,7 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.onnx_file import OnnxDiffers, check_onnx, onnx_counts, to_onnx
 from sliplab.analysis.networks.quantised import LOWEST, chip_run, compare, quantise, quantised_net
 from sliplab.analysis.networks.speck import CORES, KI, speck_fit
-from sliplab.analysis.networks.training import Fitted, restore
+from sliplab.analysis.networks.training import EpochRecord, Fitted, restore
 from sliplab.protocols.settings import Network, Training, Windows
 from tests.analysis.networks.test_spiking import FULL, SMALL, TINY, biased, sparse
 

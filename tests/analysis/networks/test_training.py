@@ -1,7 +1,10 @@
 """Training learns, repeats to the bit, says what is wrong, and its files survive."""
 
+from __future__ import annotations
+
 import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +25,10 @@ from sliplab.analysis.networks.network import (
 from sliplab.analysis.networks.training import (
     EpochRecord,
     Fitted,
+    epoch_record,
     fit,
+    layer_warnings,
+    learning_rate,
     predict_counts,
     restore,
 )
@@ -169,7 +175,7 @@ def test_small_batches_at_once_add_up_to_the_batch(monkeypatch: pytest.MonkeyPat
     """One step on a batch of 150, whole and in parts of 8 (the last is 6)."""
     one_step = {"epochs": 1, "batch": 150}
     parts = run(**one_step)
-    monkeypatch.setattr("sliplab.analysis.networks.training_work.MICRO_BATCH", 150)
+    monkeypatch.setattr("sliplab.analysis.networks.gradients.MICRO_BATCH", 150)
     whole = run(**one_step)
     assert parts.history[0].loss == pytest.approx(whole.history[0].loss, rel=1e-6)
     start = weights(build(NETWORK, WINDOWS, 0))
@@ -362,3 +368,62 @@ def test_samples_may_be_read_only() -> None:
     x = TRAIN[0].copy()
     x.flags.writeable = False
     assert fit(x, TRAIN[1], *VAL, NETWORK, WINDOWS, Training(epochs=1), 0).chosen_epoch == 1
+
+
+def test_the_rate_falls_along_half_a_cosine() -> None:
+    falling = Training(epochs=10, learning_rate=1e-2, schedule="cosine")
+    rates = [learning_rate(falling, done) for done in range(10)]
+    assert rates[0] == 1e-2
+    assert rates[5] == pytest.approx(5e-3)
+    assert 0 < rates[-1] < 3e-4
+    assert rates == sorted(rates, reverse=True)
+    at = np.array([learning_rate(falling, k // 7, k % 7, 7) for k in range(70)])
+    ramp = np.minimum(1.0, np.arange(1, 71) / (falling.warm_up * 70))
+    np.testing.assert_allclose(at, 1e-2 * ramp * np.cos(np.pi * np.arange(70) / 140) ** 2)
+    flat = Training(epochs=6, learning_rate=1e-2, schedule="constant")
+    assert {learning_rate(flat, done) for done in range(5)} == {flat.learning_rate}
+
+
+def test_the_rate_rises_in_a_line_first() -> None:
+    rising = Training(epochs=10, learning_rate=1e-2, schedule="constant", warm_up=0.15)
+    rates = [learning_rate(rising, k // 100, k % 100, 100) for k in range(1000)]
+    np.testing.assert_allclose(rates[:150], 1e-2 * np.arange(1, 151) / 150, rtol=1e-12)
+    assert set(rates[150:]) == {1e-2}
+    flat = rising.model_copy(update={"warm_up": 0.0})
+    assert learning_rate(flat, 0, 0, 100) == 1e-2
+
+
+RATES = {"iaf1": 0.1, "iaf2": 0.2, "iaf3": 0.1, "iaf4": 0.1}
+RECORD = EpochRecord(1, 0.5, 0.9, 0.25, 0.9, 0.8, 0.7, RATES)
+
+
+def test_a_record_of_counts() -> None:
+    train = np.array([[3, 0, 0], [0, 3, 3]])
+    val = np.array([[4, 0, 0], [0, 4, 0], [2, 2, 2], [0, 0, 1]])
+    found = epoch_record(
+        2, 0.5, train, np.array([0, 0]), val, np.array([0, 1, 2, 0]), RATES, 0.5, 2.0
+    )
+    assert (found.epoch, found.loss, found.rates) == (2, 0.5, RATES)
+    assert found.train_argmax == 0.5
+    assert found.val_strict == 0.5
+    assert found.val_argmax == pytest.approx((2 + 1 / 3) / 4)
+    right, wrong = np.log1p(2 * np.exp(-2.0)), np.log(2 + np.exp(0.5))
+    assert found.val_loss == pytest.approx((2 * right + np.log(3) + wrong) / 4)
+
+
+def test_strict_accuracy_decides_then_argmax_then_loss() -> None:
+    better = [
+        replace(RECORD, val_strict=0.81, val_argmax=0.1, val_loss=9.0),
+        replace(RECORD, val_argmax=0.91, val_loss=9.0),
+        replace(RECORD, val_loss=0.2),
+    ]
+    assert all(other.merit > RECORD.merit for other in better)
+
+
+def test_saturated_and_silent_layers_are_named() -> None:
+    assert layer_warnings(RECORD) == ()
+    found = layer_warnings(replace(RECORD, rates={**RATES, "iaf2": 0.95, "iaf4": 0.0}))
+    assert [w.split(":")[0] for w in found] == [
+        "layer iaf2 is saturated",
+        "layer iaf4 is silent",
+    ]

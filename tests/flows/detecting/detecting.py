@@ -11,9 +11,8 @@ import numpy.typing as npt
 
 from sliplab.analysis.detectors.live import Counting
 from sliplab.analysis.networks import model_file
-from sliplab.analysis.networks.epoch_record import EpochRecord
 from sliplab.analysis.networks.network import SPIKING, build, weights
-from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.networks.training import EpochRecord, Fitted
 from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.rigs.build import build_rig

@@ -6,8 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.analysis.networks.network import SPIKING, build, weights
-from sliplab.analysis.networks.quantised import chip_run, quantise, quantised_net
-from sliplab.analysis.networks.quantised_engine import common_net, common_threshold
+from sliplab.analysis.networks.quantised import (
+    chip_run,
+    common_net,
+    common_threshold,
+    quantise,
+    quantised_net,
+)
 from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.training import Fitted
 from sliplab.protocols.settings import Network, Training, Windows

@@ -14,13 +14,19 @@ import torch
 from torch import nn
 
 from sliplab.analysis.metrics.classification import IntArray
-from sliplab.analysis.networks.compiled_neuron import ExactConvolution, exact_net
+from sliplab.analysis.networks.gradients import (
+    Batch,
+    EventDriven,
+    ExactConvolution,
+    OnDevice,
+    devices,
+    exact_net,
+    on_device,
+    work_on,
+)
 from sliplab.analysis.networks.network import build, by_parameter, matrices, on_grid, set_weights
 from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.training import Fitted, fit
-from sliplab.analysis.networks.training_batch import Batch
-from sliplab.analysis.networks.training_device import OnDevice, devices, on_device
-from sliplab.analysis.networks.training_work import EventDriven, work_on
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Training, Windows
 
@@ -104,7 +110,7 @@ def test_a_training_on_a_device_goes_the_same_way(
 
     ours = trained()
     monkeypatch.setattr(
-        "sliplab.analysis.networks.training_run.work_on",
+        "sliplab.analysis.networks.training.work_on",
         lambda _device, net, _cells, gain: OnDevice(net, gain, *way),
     )
     theirs = trained()
@@ -139,9 +145,7 @@ def test_where_nothing_compiles_sinabs_computes_and_it_is_said(
     def broken(*_: object) -> None:
         raise RuntimeError("Cannot find a working triton installation.\nmore")
 
-    monkeypatch.setattr(
-        "sliplab.analysis.networks.compiled_neuron._compiled", lambda: (broken, broken)
-    )
+    monkeypatch.setattr("sliplab.analysis.networks.gradients._compiled", lambda: (broken, broken))
     net = build(NETWORK, WINDOWS, 0)
     with pytest.warns(UserWarning, match="for cpu, Sinabs' layers compute: Cannot find a working"):
         work = on_device(net, GAIN, "cpu")
