@@ -1,4 +1,4 @@
-"""What is to be done: protocol files, read, checked and expanded into plans."""
+"""Protocol files, read, checked and expanded into plans."""
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol

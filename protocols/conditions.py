@@ -1,4 +1,4 @@
-"""What is recorded of a trial, what it may not exceed, when it is good, how a rig is kept fit."""
+"""Recording, limits, quality gates and maintenance of a protocol."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Region(StrictModel):
 
 
 class Recording(StrictModel):
-    """What is kept of each trial, from the end of settling to the end of the motion."""
+    """Streams kept of each trial, from the end of settling to the end of the motion."""
 
     region: Region
     sync_rate: Annotated[Literal[100], Field()] = 100
@@ -65,7 +65,7 @@ class Workspace(StrictModel):
 
 
 class Limits(StrictModel):
-    """What no trial of this protocol may exceed, checked before anything moves."""
+    """Limits that no trial of this protocol may exceed, checked before anything moves."""
 
     depth: PositiveMillimetres
     speed: PositiveSpeed
@@ -75,7 +75,7 @@ class Limits(StrictModel):
 
 
 class ReferenceGate(StrictModel):
-    """How far reference trials may drift from the campaign's first one before it stops."""
+    """Largest drift of reference trials from the campaign's first one before it stops."""
 
     event_rate: PositivePercent
     """Of the events a second while the arm holds still in contact."""
@@ -92,15 +92,15 @@ class Gates(StrictModel):
     event_burst: Annotated[int, Field(ge=1, le=1_000_000_000)] = 50_000
     """Most events in any 10 ms: more is flicker, not skin."""
     path_deviation: PositiveMillimetres = Decimal("0.1")
-    """How far the tool may be from the way that it was told to take; depth steps are 0.2 mm."""
+    """Largest distance of the tool from the commanded path; depth steps are 0.2 mm."""
     speed_deviation: PositivePercent = Decimal(10)
-    """How far the speed may be from the one asked for, anywhere along the way."""
+    """Largest deviation of the speed from the commanded one, anywhere along the path."""
     hold_slip: PositivePixels | None = None
-    """How far a papilla's marker may move in the recorded hold, on a plate that slides relative to
+    """Largest motion of a papilla's marker in the recorded hold, on a plate that slides relative to
     the plate; looked at where the rig hands over tracks. Videos are only tracked by `label`, which
     doubts the trial by `analysis.labelling.hold_slip_px`. Left out, it is not looked at."""
     retakes: Annotated[int, Field(ge=0, le=10)] = 2
-    """How often a trial is taken again before it is set aside."""
+    """Retakes of a trial before it is quarantined for good."""
     reference: ReferenceGate | None = None
     """Left out, reference trials are taken and not compared while collecting."""
 
@@ -127,7 +127,7 @@ class Rezero(StrictModel):
     every: Annotated[int, Field(ge=1, le=MAX_TRIALS)]
     speed: PositiveSpeed
     search: PositiveMillimetres
-    """How far beyond the taught plane the touch may be looked for; a hard limit."""
+    """Largest search distance beyond the taught plane for the touch; a hard limit."""
 
 
 class Cleaning(StrictModel):
@@ -138,7 +138,7 @@ class Cleaning(StrictModel):
 
 
 class Maintenance(StrictModel):
-    """What keeps a long campaign comparable from its first trial to its last."""
+    """Maintenance that keeps a long campaign comparable from its first trial to its last."""
 
     warm_up: WarmUp | None = None
     rezero: Rezero | None = None

@@ -1,4 +1,4 @@
-"""What a protocol file may say: the frozen models of its `collection:` section.
+"""Frozen models of a protocol file's `collection:` section.
 
 Everything that decides what is measured stands here, and nothing that decides what it is made to
 mean (that is `protocols.settings`). Quantities are decimals in the canonical unit of their kind
@@ -37,7 +37,7 @@ class Collection(StrictModel):
     factors: dict[str, Factor] = Field(
         json_schema_extra={"minProperties": 1, "propertyNames": {"pattern": f"^{_NAME.pattern}$"}}
     )
-    """What is varied; every combination of their levels is a condition."""
+    """Factors that are varied; every combination of their levels is a condition."""
     repetitions: Annotated[int, Field(ge=1, le=100_000)]
     order: Literal["shuffled", "listed"] = "shuffled"
     references: References | None = None

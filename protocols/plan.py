@@ -61,7 +61,7 @@ class Task:
     prompt: str
     expected: str
     slot: int
-    """Which occurrence it is; with the rig's seed it decides a simulated rezero."""
+    """Number of the occurrence; with the rig's seed it decides a simulated rezero."""
 
 
 def condition_columns(condition: Mapping[str, str]) -> dict[str, float | str]:
@@ -154,7 +154,7 @@ class Plan:
         return float(dict(trial.condition)[level.factor] if hasattr(level, "factor") else level)
 
     def tasks_before(self, trial: Trial) -> tuple[Task, ...]:
-        """What the protocol wants done before `trial`, in order, in an undisturbed campaign."""
+        """List the tasks before `trial`, in order, in an undisturbed campaign."""
         before = self.trials[trial.index - 1] if trial.index else None
         tasks = list(self.changeovers(before, trial))
         upkeep = self.protocol.collection.maintenance
@@ -175,7 +175,7 @@ class Plan:
         return Task("rezero", False, "touch off to find depth zero", "", slot)
 
     def changeovers(self, before: Trial | None, trial: Trial) -> tuple[Task, ...]:
-        """What a person must change between two trials (or before the first)."""
+        """List the changes that a person must make between two trials (or before the first)."""
         past = dict(before.condition) if before is not None else {}
         tasks = []
         for name, level in trial.condition:
@@ -193,7 +193,7 @@ class Plan:
         return list(zip(starts, ends, strict=True))
 
     def warnings(self) -> list[str]:
-        """What is allowed and probably not meant."""
+        """List settings that are allowed but probably not meant."""
         windows, samples = self.protocol.analysis.windows, self.protocol.analysis.samples
         need = windows.length_ms * samples.per_class / 1000
         preset = self.protocol.analysis.preset is not None

@@ -25,7 +25,7 @@ class Labelling(StrictModel):
     """Ground truth from the outside video."""
 
     rule: Literal["paper", "change_point"] = "paper"
-    """Which onsets rule downstream; both are kept (docs/labels.md)."""
+    """Onset rule that later steps use; both are kept (docs/labels.md)."""
     threshold_px: float = Field(default=2.0, gt=0, le=100)
     """A marker slips when its displacement exceeds this, pixels."""
     reference: Literal["hold_start", "hold_end"] = "hold_start"
@@ -73,13 +73,13 @@ class Windows(StrictModel):
 
 
 class Samples(StrictModel):
-    """How many windows a trial gives to each class."""
+    """Windows per class and trial."""
 
     per_class: int = Field(default=50, ge=1, le=10_000)
 
 
 class Split(StrictModel):
-    """Which trials train, which choose the model, which test it.
+    """Trials that train, choose the model, and test it.
 
     ``ranked``: repetitions ranked by a hash inside each condition, conditions spread evenly
     inside the strata (docs/decisions/0006). ``leave_conditions_out``: whole levels are held out.
@@ -136,7 +136,7 @@ _DEVICES = "cpu, or a GPU as cuda or cuda:1"
 
 
 class Training(StrictModel):
-    """How the network is fitted."""
+    """Settings by which the network is fitted."""
 
     epochs: int = Field(default=12, ge=1, le=10_000)
     batch: int = Field(default=32, ge=1, le=4096)
@@ -147,7 +147,7 @@ class Training(StrictModel):
     """Share of all steps over which the learning rate rises from nothing: a neuron that a first
     large step puts far below its threshold never learns again."""
     gain: float = Field(default=0.0625, gt=0, le=10)
-    """What a spike counts in the cross-entropy. Less of it asks for counts further apart. By
+    """Gain of a spike count in the cross-entropy. A smaller one asks for counts further apart. By
     default a quarter over ``network.outputs_per_class``."""
     mirror: bool = True
     """Each epoch shows each training window as it is, or mirrored along one side or both, drawn
@@ -159,7 +159,7 @@ class Training(StrictModel):
         default="cpu",
         json_schema_extra={"pattern": _DEVICE, "patternErrorMessage": f"must be {_DEVICES}"},
     )
-    """What computes it: the processor by the event-driven kernels, or a GPU (``cuda``, ``cuda:1``)
+    """Device: the processor by the event-driven kernels, or a GPU (``cuda``, ``cuda:1``)
     by compiled layers. Last bits differ between devices."""
 
     @field_validator("device")
@@ -212,11 +212,11 @@ class Detection(StrictModel):
     """From one window's begin to the next one's; by default a window's length, so that they
     follow each other. Shorter ones overlap, and `smoothing` of them then span less time."""
     choose: Literal["protocol", "validation", "test"] = "protocol"
-    """Where smoothing and margin come from: this file; the grid below, by validation trials; or
+    """Source of smoothing and margin: this file; the grid below, by validation trials; or
     by the test trials themselves, as in the paper, which flatters the result."""
     smoothing_grid: tuple[Annotated[int, Field(le=1000)], ...] = (1, 2, 3, 4, 6, 8)
     margin_grid: tuple[Spikes, ...] = (2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
-    """What `choose` tries: every smoothing with every margin. By default from a half to eight
+    """Grid of `choose`: every smoothing with every margin. By default from a half to eight
     for each of a class's output neurons."""
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)
     """Share of trials that a choice may leave false early, and as many missed."""
@@ -262,7 +262,7 @@ class AnalysisSettings(StrictModel):
 
     @model_validator(mode="after")
     def _spikes(self) -> AnalysisSettings:
-        """What is counted in spikes goes with how many neurons give them."""
+        """Margins in spikes scale with the number of output neurons per class."""
         factor = self.network.outputs_per_class / Network().outputs_per_class
         usual, rule = Training(), Detection()
         changes: tuple[tuple[str, StrictModel, dict[str, Any]], ...] = (

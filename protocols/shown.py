@@ -34,7 +34,7 @@ _LOOKED_AT = 1000
 
 
 def is_secret(name: str) -> bool:
-    """Whether a key or a variable of this name holds a secret, also if it is misspelt."""
+    """Return whether a key or a variable of this name holds a secret, also if it is misspelt."""
     for word in _WORDS.findall(name[:_LOOKED_AT]):
         word = word.lower()
         if word in _WHOLE or word.endswith(_ENDS) or any(part in word for part in _PARTS):
@@ -45,7 +45,7 @@ def is_secret(name: str) -> bool:
 
 
 def holds_secret(key: str) -> bool:
-    """Whether a part of a key's path (``devices.arm.password``) is a secret's name."""
+    """Return whether a part of a key's path (``devices.arm.password``) is a secret's name."""
     return any(is_secret(name) for name in re.findall(r"[^.\[\]]+", key))
 
 

@@ -1,4 +1,4 @@
-"""Which trials train, choose and test: a function of a trial's own condition and nothing else.
+"""Split trials into training, validation and test: a function of a trial's own condition only.
 
 A split that is cut from a ranking of all trials moves when a level is added. Here a trial's place
 in [0, 1) is (rank of its repetition in its condition + u) / repetitions, where u is a point of a

@@ -1,4 +1,4 @@
-"""How a rig's devices are timed: which signal reaches which, and how good their clocks are.
+"""Timing of a rig's devices: which signal reaches which, and how good their clocks are.
 
 A rig file states it, every trial's record keeps it, and synchronising stored data reads it there.
 A grade is a name for how a device's time is known; every grade has its own uncertainty and its own
@@ -16,7 +16,7 @@ from sliplab.protocols.quantity import PositiveSeconds
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
 
 Code = Literal["lfsr", "irregular", "regular"]
-"""What the box sends: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""
+"""Pulses of the box: 32-bit LFSR, irregular intervals, or a regular train with a start marker."""
 FrameGrade = Literal["hardware trigger", "exposure line", "device time stamps", "host arrival"]
 ArmGrade = Literal["digital input", "host time"]
 WIRED: tuple[str, ...] = ("hardware trigger", "exposure line", "digital input", "trigger input")
@@ -38,11 +38,11 @@ class DeviceClock(StrictModel):
     resolution_us: float = Field(default=1.0, ge=0, le=20_000)
     """The unit to which its stamps are cut."""
     rounding: Literal["down", "up", "nearest"] = "down"
-    """Which way; an input that is looked at now and then stamps `up`."""
+    """Direction of rounding; a polled input stamps `up`."""
 
 
 class Delay(StrictModel):
-    """How long a message takes from its device to the host, whatever happens."""
+    """Delay of a message from its device to the host."""
 
     shortest_us: float = Field(ge=0, le=10_000_000)
     longest_us: float = Field(gt=0, le=10_000_000)
@@ -79,7 +79,7 @@ class Timing(StrictModel):
 
     @property
     def reads_clocks(self) -> bool:
-        """Whether the host has to read clocks, for some device has no wire."""
+        """True if the host has to read clocks, because some device has no wire."""
         return self.frames not in WIRED or self.arm not in WIRED
 
 

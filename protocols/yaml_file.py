@@ -225,7 +225,7 @@ def _problem(error: yaml.MarkedYAMLError, text: str) -> str:
 
 
 def _is_rest(key_node: Any, value_node: Any, before: Any) -> bool:
-    """Whether a key is what follows a decimal comma: ``{speed: 2,5 mm/s}``."""
+    """Return whether a key is what follows a decimal comma: ``{speed: 2,5 mm/s}``."""
     return (
         before is not None
         and isinstance(key_node, yaml.ScalarNode)

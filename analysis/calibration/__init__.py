@@ -1,1 +1,1 @@
-"""What is measured of a rig before it is used: lens and scale, the skin's crop, the tool's tip."""
+"""Measurements of a rig before it is used: lens and scale, the skin's crop, the tool's tip."""

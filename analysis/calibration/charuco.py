@@ -82,7 +82,7 @@ class Corners:
 
 @dataclass(frozen=True)
 class LensFit:
-    """What the pictures told.
+    """Result of the calibration pictures.
 
     Attributes:
         matrix: pinhole, (3, 3), px.

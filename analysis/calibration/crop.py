@@ -1,4 +1,4 @@
-"""Where the skin is in the event camera's picture: the circle round all that fires when it moves.
+"""Locate the skin in the event camera's picture: the circle round all that fires when it moves.
 
 Every marker fires along its rim while the skin is moved about, so where events are is the layout
 smeared by the motion. The smallest circle round it does not mind that some papillae bear more than

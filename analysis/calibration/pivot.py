@@ -26,7 +26,7 @@ class PivotError(ValueError):
 
 @dataclass(frozen=True)
 class Pivot:
-    """What pivoting found.
+    """Result of pivoting.
 
     Attributes:
         tip_mm: from the flange, in its axes, (3,).

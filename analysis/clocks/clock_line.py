@@ -64,7 +64,7 @@ at 100 ticks a second."""
 _DRAWS = 2048
 _SLOPES = 81
 _UNITS = 0.6
-"""How many units stamps may lie from a line that their unit explains: half of one, and jitter."""
+"""Largest distance of stamps from a line that their unit explains, in units: half, and jitter."""
 
 
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float]:
@@ -372,7 +372,7 @@ def _held(matrix: Floats) -> Floats:
 
 
 def _is_chance(residuals: Floats, parameters: int, sigma: float, slack: float) -> bool:
-    """Whether the means of stretches of the train are as small as chance makes them."""
+    """Check that the means of stretches of the train are as small as chance makes them."""
     blocks = min(max(8, 4 * (parameters - 1)), residuals.size // _BLOCK_PULSES)
     if blocks <= parameters:
         return True
@@ -453,7 +453,7 @@ def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Fl
 
 
 def _locked(residuals: Floats, resolution: float) -> float:
-    """What stamps cut to a unit hide where nothing shakes them, ns.
+    """Error, ns, that stamps cut to a unit hide where no jitter shakes them.
 
     Jitter spreads stamps over units, and their mean finds the middle; what is left falls as
     exp(-2 pi^2 sigma^2 / unit^2) (Widrow and Kollar 2008), and is half a unit without any jitter.

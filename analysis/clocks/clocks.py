@@ -45,7 +45,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 CHANCE = 1e-5
-"""How often a train whose bad pulses lie anywhere is taken for one whose clock jumped."""
+"""Probability that a train whose bad pulses lie anywhere is taken for one whose clock jumped."""
 BURST = 9
 """Pulses in a row that may be bad at once for another reason, as when a device is busy."""
 BURST_AT_END = 2
@@ -118,7 +118,7 @@ def stray_stretch(
 
 
 def _left_out(on_line: Ints, size: int) -> Ints:
-    """How many pulses lie before the first, between two, and after the last that is on the line."""
+    """Count pulses before the first, between two, and after the last that is on the line."""
     return np.diff(np.concatenate([[-1], on_line, [size]])) - 1
 
 
@@ -170,7 +170,7 @@ Rounding = Literal["down", "up", "nearest"]
 MIN_MATCHED = 0.7
 """Share of pulses that must find a partner; a wrong lag on the same tick grid gives 0.5."""
 MIN_LOSSY, MIN_LIFT = 100, 1.5
-"""Where both trains lost many pulses a smaller share will do: of so many pulses and so many times
+"""A smaller share will do where both trains lost many pulses: of so many pulses and so many times
 what a wrong lag gives. In such a train a clock that jumps by whole ticks, after which half of the
 pulses meet others, stands out only where there are many."""
 MOST_STAGGERED = 8
@@ -511,7 +511,7 @@ def _gate_line(line: ClockLine, jitter_ns: float, max_drift_ppm: float) -> None:
 
 
 def _fell_back(name: str, back_ns: int, jitter_ns: float) -> ClockRefused:
-    """What to say of stamps that do not rise."""
+    """Return the message about stamps that do not rise."""
     return ClockRefused(
         "residuals",
         f"stamps of the {name} fall back by {back_ns / 1e9:g} s (at most {jitter_ns / 1e9:g} s is "

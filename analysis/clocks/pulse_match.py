@@ -1,4 +1,4 @@
-"""Which pulse of one train is which of another: the place where the trains fit, and the pairs.
+"""Pair the pulses of two trains: find the place where the trains fit, then the pairs.
 
 A short piece of the device's train is laid on the reference wherever it may belong (a
 cross-correlation by FFT, under several drifts); the best place must be the only one. From there the
@@ -26,7 +26,7 @@ MAX_PEAK_RATIO = 0.9
 """Second correlation peak over the first: about 0.6 to 0.75 for the code, near 1 when regular."""
 
 WIRED = "check the cable of the sync line, and that the recording is long enough"
-"""What to do where pulses are too few."""
+"""Advice where pulses are too few."""
 
 _PIECE_TICKS = 400
 _PIECES = 5
@@ -58,7 +58,7 @@ class Match:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a piece of the device's train fits: y = x + lag + drift (x - centre) near centre."""
+    """Fit of a piece of the device's train: y = x + lag + drift (x - centre) near centre."""
 
     lag: float
     drift: float
@@ -117,7 +117,7 @@ def _refuse_ambiguous(ratio: float) -> None:
 
 
 def _coarse(x: Floats, y: Floats, tick: float, max_drift: float) -> tuple[list[_Place], float]:
-    """Where a piece of the train `x` fits into `y`, and the second correlation peak over the first.
+    """Fit a piece of the train `x` into `y`; also the second correlation peak over the first.
 
     There is more than one place only where a handful fit equally well.
     """
@@ -219,7 +219,7 @@ def _correlate(
 
 
 def _by_marker(x: Floats, y: Floats, tick: float, silence: float) -> _Place:
-    """Where the only pulse with the marker's silence after it, and as long a one before, is."""
+    """Find the only pulse with the marker's silence after it, and one as long before it."""
     found = []
     for name, train in (("device", x), ("reference", y)):
         # a second report of a pulse is none of its own

@@ -55,7 +55,7 @@ class ClockReadings:
 
 @dataclass(frozen=True)
 class SyncStreams:
-    """What a trial holds of clocks, raw, ns; empty where there is nothing.
+    """Raw clock data of a trial, ns; empty where there are none.
 
     Attributes:
         sync_pulses: pulses on the box's clock; event_pulses, arm_pulses: on the devices'.
@@ -149,7 +149,7 @@ class TrialSync:
 
 
 def streams_of(reader: StreamReader, mid_exposure_ns: int | None) -> SyncStreams:
-    """What a trial's file holds of clocks."""
+    """Read the clock data of a trial's file."""
 
     def column(name: str) -> I64:
         return reader.column(name) if reader.has(name) else np.empty(0, np.int64)
@@ -266,7 +266,7 @@ class _Pulses:
 
 
 def _limits(clock: DeviceClock, timing: Timing) -> dict[str, Any]:
-    """What a fit is told of a device's clock."""
+    """Properties of a device's clock that a fit needs."""
     return {
         "jitter_ns": clock.jitter_us * 1e3,
         "max_drift_ppm": clock.drift_ppm + timing.sync_box.drift_ppm,

@@ -33,7 +33,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Detections(Found):
-    """What the paper's rule said about one trial, and what it saw.
+    """Result of the paper's rule on one trial, and what it saw.
 
     Attributes:
         smoothed: float64 (n, 3), trailing mean counts. The first ``smoothing - 1`` rows are means
@@ -93,7 +93,7 @@ def detect(
 def lead_of(
     counts: npt.NDArray[np.integer], smoothing: int, wanted: int
 ) -> npt.NDArray[np.float64]:
-    """How far the mean count of a class leads every other, float64 (n,); negative where it trails.
+    """Lead of a class's mean count over every other, float64 (n,); negative where it trails.
 
     -inf where the sliding window is not full. `detect` finds a class where this is above 0 and at
     least the margin.

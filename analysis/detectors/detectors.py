@@ -62,7 +62,7 @@ class Chain:
 
     @property
     def states(self) -> int:
-        """How many states there are."""
+        """Number of states."""
         return len(self.leave) + 1
 
 
@@ -196,7 +196,7 @@ def cusum(log_ratio: FloatArray) -> FloatArray:
 
 
 class Likelihood(Protocol):
-    """What a window says about the state."""
+    """Likelihood of a window in each state."""
 
     def log(self, features: Array) -> FloatArray:
         """Log likelihoods float64 (n, classes) of features (n, k), up to a constant a window."""
@@ -358,7 +358,7 @@ class Labelled:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a detector makes of one trial; no value depends on a later window.
+    """Output of a detector for one trial; no value depends on a later window.
 
     Attributes:
         end_ns: int64 (n,), end of each window.
@@ -400,7 +400,7 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a window's likelihoods are read from.
+    """Features from which a window's likelihoods are read.
 
     Attributes:
         likelihood: fitted on training trials.
@@ -453,7 +453,7 @@ class Cusum:
 
 @dataclass(frozen=True)
 class Levels:
-    """What the evidence must EXCEED."""
+    """Threshold that the evidence must EXCEED."""
 
     incipient: float
     gross: float
@@ -490,7 +490,7 @@ def features(predictions: Predictions, events: bool) -> FloatArray:
 
 @dataclass(frozen=True)
 class Learned:
-    """What training trials taught, for windows of any stride.
+    """A detector fitted on training trials, for windows of any stride.
 
     Attributes:
         chain: how often states are left, by consecutive windows.

@@ -227,7 +227,7 @@ class LiveDetector:
 
     @property
     def open_windows(self) -> int:
-        """How many windows are open: what the detector keeps does not grow with time."""
+        """Number of open windows: the detector's memory does not grow with time."""
         return len(self._open)
 
     def push(self, chunk: EventChunk) -> list[Decision]:
@@ -388,7 +388,7 @@ _NO_EVENTS = EventChunk(
 
 
 SPAN_NS = 5_000_000_000
-"""How long an arrival counts at least; twice that at most. 100 ppm of drift are 1 ms then."""
+"""Least time for which an arrival counts; twice that at most. 100 ppm of drift are 1 ms then."""
 
 
 class FreshestArrival:
@@ -413,7 +413,7 @@ class FreshestArrival:
             self._here = ahead_ns
 
     def camera_us(self, host_ns: int) -> int | None:
-        """What the camera's clock has come to, at the least; None before the first arrival."""
+        """Lower bound of the camera's clock now; None before the first arrival."""
         ahead_ns = self._ahead_ns
         return None if ahead_ns is None else (host_ns + ahead_ns) // 1000
 

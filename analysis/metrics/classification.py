@@ -1,4 +1,4 @@
-"""What a set of spike counts is worth, in numbers that a silent network cannot flatter.
+"""Accuracy and confusion of spike counts, by measures that a silent network cannot flatter.
 
 The class of a sample is the one whose output neurons spike most. A network that never fires gives
 (0, 0, 0) everywhere; an ordinary argmax calls that class 0 and looks good on a quiet recording.
@@ -131,7 +131,7 @@ def accuracy(counts: Counts, labels: Labels, margin: float = 0.0) -> Accuracy:
 
 
 def confusion(counts: Counts, labels: Labels) -> IntArray:
-    """How often each true class (row) was called what (column), int64 (3, 4).
+    """Confusion matrix: true class by row, called class by column, int64 (3, 4).
 
     The fourth column is 'undecided': no unique winner. Rows add up to the samples of the class.
     """

@@ -43,7 +43,7 @@ STATISTICS: Mapping[str, Callable[..., Any]] = {
     "median": np.nanmedian,
     "p95": lambda values, axis: np.nanpercentile(values, 95, axis=axis),
 }
-"""What can be asked for, by name; each over an axis, trials without a value left out."""
+"""Statistics by name; each over an axis, trials without a value left out."""
 
 
 def interval(values: Values, statistic: str = "mean") -> Span | None:

@@ -1,4 +1,4 @@
-"""Whether two settings differ by more than their seeds do.
+"""Test whether two settings differ by more than their seeds do.
 
 Each seed gives both settings the same first draw and order of samples, so what they differ by is
 taken seed by seed and its spread is that of the difference. It says nothing of other trials: all

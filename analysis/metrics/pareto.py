@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 
 def front(costs: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Which rows are on the front.
+    """Return which rows are on the Pareto front.
 
     A row is off it if another is nowhere higher and somewhere lower. Equal rows stand or fall
     together. Infinity is a cost like any other: the highest.

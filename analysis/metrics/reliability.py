@@ -1,4 +1,4 @@
-"""Whether a lead of so many spikes means what it says: shares right, and a probability from them.
+"""Calibration of the spike lead: the share right at each lead, and a probability from it.
 
 A detection trusts a class that leads by eight spikes. How often is that right, and by how many
 spikes does the network have to lead to be right in 99 of 100 windows? Spike counts are no

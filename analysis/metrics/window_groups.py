@@ -30,7 +30,7 @@ TENTHS = 10
 
 
 def credit(scores: Counts, labels: Labels) -> FloatArray:
-    """What each window counts for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
+    """Score of each window for argmax accuracy: 1, 1/k where k classes tie, or 0; (n,)."""
     scores, labels = check(scores, labels)
     top = scores == scores.max(axis=1, keepdims=True) if len(scores) else np.zeros((0, 3), bool)
     return np.asarray(top[np.arange(len(labels)), labels] / np.maximum(top.sum(axis=1), 1))

@@ -1,4 +1,4 @@
-"""What a window costs in spikes: rates by layer, and synaptic operations against multiply-adds.
+"""The cost of a window in spikes: rates by layer, and synaptic operations against multiply-adds.
 
 A chip of spikes works only where a spike arrives, so its cost is counted in synaptic operations:
 for each input spike (or event), the synapses that it reaches.

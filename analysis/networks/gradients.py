@@ -43,7 +43,7 @@ from sliplab.analysis.windows.sparse import SparseWindows
 
 @dataclass(frozen=True)
 class Batch:
-    """What the windows of a batch come to.
+    """Loss, spikes and gradients of a batch.
 
     Attributes:
         loss: summed over windows.
@@ -234,7 +234,7 @@ def compiled_net(net: nn.Sequential) -> nn.Sequential:
 
 
 def why_not(device: str, steps: int) -> str | None:
-    """Why neurons cannot be compiled for a device, in words; None where they can.
+    """Return the reason why neurons cannot be compiled for a device; None where they can.
 
     Compiling asks for Triton on a GPU and for a C++ compiler on a processor. It takes most of a
     minute, once.
@@ -252,7 +252,7 @@ CPU = "cpu"
 
 
 def devices() -> list[str]:
-    """What `training.device` may be on this machine."""
+    """List the values of `training.device` that this machine has."""
     found = torch.cuda.device_count()
     return [CPU, *(["cuda"] if found else []), *(f"cuda:{k}" for k in range(found))]
 

@@ -1,4 +1,4 @@
-"""What a model is, was made of and is worth, on one page: for whoever meets the file without us."""
+"""The model card: what a model is, what it was made of and how well it does, on one page."""
 
 from __future__ import annotations
 

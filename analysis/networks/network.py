@@ -34,7 +34,7 @@ FIRST_BIAS = (-0.5, 0.5)
 themselves, so that events can also silence."""
 
 FIRST_DRIVE = 0.3
-"""What every output gets in a step of a window without events, before training, in thresholds. One
+"""Current of every output in a step of a window without events, before training, in thresholds. One
 that began far below its threshold would never be reached (docs/decisions/0056)."""
 
 SPIKING = ("iaf1", "iaf2", "iaf3", "iaf4")
@@ -205,7 +205,7 @@ def spike_counts(net: nn.Sequential, x: Array, batch: int = 64) -> Counts:
 
 
 GRID = (2.0**-11, 2.0**-14, 2.0**-14, 2.0**-14)
-"""What the weights of each layer of `WEIGHTED` are multiples of, once trained; see `on_grid`."""
+"""Grid step of each layer of `WEIGHTED`; trained weights are multiples of it, see `on_grid`."""
 
 EXACT = 2**24
 """Whole multiples of a grid below it are exact in float32, and so are their sums."""
@@ -263,7 +263,7 @@ def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float3
 
 
 def exact(values: list[npt.NDArray[np.float32]], most: int = 255) -> bool:
-    """Whether weights are on the grid and no current can leave what float32 holds exactly.
+    """Check that weights are on the grid and that float32 holds every current exactly.
 
     Args:
         most: events of a cell and step at the most.

@@ -38,7 +38,7 @@ from sliplab.analysis.networks.training import Fitted
 
 LOWEST = np.float32(-(1 << STATE_BITS - 1))
 HIGHEST = np.float32((1 << STATE_BITS - 1) - 1)
-"""What a potential of the chip holds; it stays there when it would go beyond."""
+"""Range of a potential of the chip; it saturates there."""
 
 I8 = npt.NDArray[np.int8]
 Counts = npt.NDArray[np.int64]
@@ -117,7 +117,7 @@ def quantised_net(fitted: Fitted, found: Quantised) -> nn.Sequential:
 
 @dataclass(frozen=True)
 class ChipRun:
-    """What the chip's arithmetic gives for some windows.
+    """Result of the chip's arithmetic for some windows.
 
     Attributes:
         counts: output spikes, int64 (n, 3).
@@ -192,7 +192,7 @@ def _fire(current: Any, threshold: Any, lowest: Any, highest: Any, ends: Any) ->
 
 
 def compare(real: Counts, whole: Counts, margin: float) -> dict[str, Any]:
-    """What changed from spike counts `real` to `whole`, both int64 (n, 3).
+    """Compare spike counts `real` with `whole`, both int64 (n, 3).
 
     Returns:
         shares of windows with equal counts, with the same class (unique winner or none) and with
@@ -219,12 +219,12 @@ def _numbers(net: nn.Sequential, layer: str) -> npt.NDArray[np.float64]:
 
 
 def _of(layer: str, key: str) -> bool:
-    """Whether a weight by its name in torch is this layer's."""
+    """Return whether a weight, by its name in torch, is this layer's."""
     return key.split(".")[0] == layer
 
 
 MOST, BLOCK = 1 << 20, 1 << 13
-"""Where the search for a common threshold ends, and how many are tried at once."""
+"""Limit of the search for a common threshold, and candidates tried at once."""
 
 
 def common_threshold(thresholds: Sequence[int]) -> tuple[int, tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""Whether the network fits a Speck (DynapCNN) chip, layer by layer, without the chip.
+"""Check whether the network fits a Speck (DynapCNN) chip, layer by layer, without the chip.
 
 The vendor's compiler lives in a package that this program never imports (docs/decisions/0009), so
 the rules stand here as a table with their sources:
@@ -82,7 +82,7 @@ class SpeckLayer:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What no core of the chip can do."""
+        """Reasons for which no core of the chip can take the layer."""
         found = []
         for what, value, most in (
             ("kernel", self.kernel, MOST_KERNEL),
@@ -104,7 +104,7 @@ class SpeckLayer:
         return tuple(found)
 
     def fits(self, core: Core) -> bool:
-        """Whether its memories are enough."""
+        """True if the core's memories are enough."""
         return self.kernel_words <= core.kernel_words and self.neuron_words <= core.neuron_words
 
 
@@ -123,7 +123,7 @@ class SpeckFit:
 
     @property
     def fits(self) -> bool:
-        """Whether the whole network goes onto one chip."""
+        """True if the whole network goes onto one chip."""
         return not self.problems
 
     def as_json(self) -> dict[str, Any]:
@@ -235,7 +235,7 @@ NOT_SHOWN = (
 
 
 def speck_markdown(found: Mapping[str, Any]) -> str:
-    """What `flows.learning.model_export` puts into ``*.speck.json``, as a page."""
+    """Write the content of ``*.speck.json`` as a page."""
     fit, whole = found["fit"], found["quantisation"]
     said = " (simulated)" if found["simulated"] else ""
     text = [f"# {found['model']['file']} on a Speck", ""]

@@ -155,7 +155,7 @@ def _spread(taps: Any, pixels: Any, rows: int, stride: Any, g: Any) -> None:
 def _gather(
     sources: Any, counts: Any, begin: Any, end: Any, reach: Any, du: Any, shape: Any, grad: Any
 ) -> None:
-    """What a source adds to currents, the gradient by its weights gets from them."""
+    """Collect the gradient by a source's weights from the currents it reaches."""
     stride_w, stride, runs, length = shape
     for e in range(begin, end):
         at, w = np.uint64(reach[sources[e], 0]), np.uint64(reach[sources[e], 1])

@@ -1,4 +1,4 @@
-"""Where weights and neurons lie for the event-driven kernels; and back to torch's shapes.
+"""Memory layout of weights and neurons for the event-driven kernels, and back to torch's shapes.
 
 The kernels know nothing of convolutions: a layer is a table of what each source reaches
 (`analysis.networks.spiking_kernels`). This file makes the four tables of the network and packs its
@@ -86,7 +86,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Table:
-    """What the sources of a layer reach, and where its weights are packed.
+    """Connections of a layer: what each source reaches, and where its weights are packed.
 
     Attributes:
         reach: uint32 (sources, 2), see `analysis.networks.spiking_kernels`.
@@ -110,7 +110,7 @@ class Table:
 
     @property
     def shape(self) -> tuple[np.uint64, ...]:
-        """What `analysis.networks.spiking_kernels` calls the shape of a layer."""
+        """The layer's shape as `networks.spiking_kernels` takes it."""
         return tuple(map(np.uint64, (self.stride_w, self.stride, self.runs, self.length)))
 
     def pack(self, weight: F32) -> F32:
@@ -119,7 +119,7 @@ class Table:
         return np.ascontiguousarray(flat[self.order])
 
     def unpack(self, packed: F32, shape: tuple[int, ...]) -> F32:
-        """What was summed up by packed weight, in the matrix's shape."""
+        """Return sums by packed weight in the matrix's shape."""
         return packed[self.back].reshape(shape)
 
     @cached_property
@@ -254,7 +254,7 @@ class Layout:
         self.neurons = tuple(plane.side * plane.side * plane.channels for plane in planes)
 
     def layers(self, weights: list[F32]) -> tuple[Any, ...]:
-        """What the kernels take for a network's matrices."""
+        """Pack a network's matrices for the kernels."""
         return (
             tuple(table.reach for table in self.tables),
             tuple(table.pack(w) for table, w in zip(self.tables, weights, strict=True)),
@@ -263,7 +263,7 @@ class Layout:
         )
 
     def back(self, weights: list[F32]) -> tuple[Any, ...]:
-        """What `analysis.networks.spiking_gradients.backward` takes for them."""
+        """Return the arguments of `networks.spiking_gradients.backward`."""
         kernel = self.shapes[1][2]
         one, two, three, four = (table.target for table in self.tables)
         of2 = weights[1].transpose(0, 2, 3, 1)

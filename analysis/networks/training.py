@@ -69,7 +69,7 @@ SATURATED_RATE = 0.9
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """What one pass over the training samples gave.
+    """Results of one pass over the training samples.
 
     Attributes:
         epoch: 1 for the first.
@@ -91,7 +91,7 @@ class EpochRecord:
 
     @property
     def merit(self) -> tuple[float, float, float]:
-        """What epochs are compared by, the larger the better: see `fit`."""
+        """The key by which epochs are compared, the larger the better: see `fit`."""
         return (self.val_strict, self.val_argmax, -self.val_loss)
 
 
@@ -163,7 +163,7 @@ class Run:
 
     @property
     def ended(self) -> bool:
-        """Whether all epochs were run, or none of late was better."""
+        """True once all epochs were run, or none of the last `patience` was better."""
         done = len(self.history)
         return done >= self.training.epochs or (
             self.best > 0 and done - self.best >= self.training.patience
@@ -355,7 +355,7 @@ def restore(fitted: Fitted) -> nn.Sequential:
 
 
 def engine(fitted: Fitted) -> Engine:
-    """What counts spikes of the trained network fast."""
+    """Return the event-driven engine of the trained network."""
     return Engine(restore(fitted), fitted.windows.cells)
 
 

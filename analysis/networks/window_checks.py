@@ -87,7 +87,7 @@ def check_permutations(
 
 @dataclass(frozen=True)
 class Chance:
-    """What came of shuffled labels.
+    """Result of training on shuffled labels.
 
     Attributes:
         shuffled: test accuracy (argmax, ties shared) after each training on shuffled labels.

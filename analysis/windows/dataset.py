@@ -87,7 +87,7 @@ class SampleSet:
 
     @staticmethod
     def load(path: Path) -> SampleSet:
-        """What `save` wrote; pages are read when they are used.
+        """Open the file that `save` wrote; pages are read when they are used.
 
         Raises:
             OSError: there is none, or it cannot be read.
@@ -117,7 +117,7 @@ def cut_windows(
 
 
 def crop_centre_px(recording: Recording) -> tuple[float, float] | None:
-    """Where the event camera saw the skin's centre, column and row; None where nobody looked."""
+    """Column and row at which the event camera saw the skin's centre; None where not calibrated."""
     return recording.record.geometry.event_centre_px
 
 

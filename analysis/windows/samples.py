@@ -1,4 +1,4 @@
-"""Which windows of a trial become samples of which class.
+"""Choose the windows of a trial that become samples, and their classes.
 
 The paper takes 50 windows a class from every trial, and how they are placed decides what the
 network can learn: no slip just before the first slip, where it is hardest; gross slip just after

@@ -161,7 +161,7 @@ def _times(values: NDArray[Any], name: str) -> NDArray[np.int64]:
 
 
 def first_pixel(size: int, crop: int, centre: float | None) -> int:
-    """Where a crop of `crop` pixels begins along a side of `size` pixels."""
+    """First pixel of a crop of `crop` pixels along a side of `size` pixels."""
     if centre is None:
         return (size - crop) // 2
     return min(max(round(centre - (crop - 1) / 2), 0), size - crop)
