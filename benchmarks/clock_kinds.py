@@ -29,7 +29,7 @@ from scipy import special
 from benchmarks.clocks import DRIFT_PPM, Train, make_train
 from benchmarks.measure import SEED, Figures
 from sliplab.analysis.clocks.clocks import ClockRefused, fit_clock
-from sliplab.rigs.pulse_code import U8, code_bits
+from sliplab.rigs.core.pulse_code import U8, code_bits
 from sliplab.storage.streams import F64
 
 FAR = 3.0

@@ -29,7 +29,7 @@ from scipy import fft, optimize
 
 from benchmarks.measure import SEED, Figures, spread
 from sliplab.analysis.clocks.clocks import ClockFit, ClockRefused, fit_clock
-from sliplab.rigs.pulse_code import SEEDS, U8, code_bits
+from sliplab.rigs.core.pulse_code import SEEDS, U8, code_bits
 from sliplab.storage.streams import F64, I64
 
 DAY_NS = 86_400 * 10**9

@@ -23,7 +23,7 @@ from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Step
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.rig import Rig
+from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 
 ROOT = Path(__file__).parents[1]

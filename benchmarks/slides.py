@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from benchmarks.measure import SEED
-from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import F64, I64, EventChunk

@@ -5,21 +5,32 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from sliplab.rigs.arms.settings import ArmSettings, PlaneSettings
-from sliplab.rigs.capabilities import FrameCamera, Operator, Plate, Pose, RigError, Simulation
-from sliplab.rigs.devices import DeviceSettings
-from sliplab.rigs.host_clock import HostClock
+from sliplab.rigs.core.arm_settings import PlaneSettings
+from sliplab.rigs.core.capabilities import (
+    Arm,
+    EventCamera,
+    FrameCamera,
+    Operator,
+    Plate,
+    Pose,
+    RigError,
+    Simulation,
+)
+from sliplab.rigs.core.host_clock import HostClock
+from sliplab.rigs.core.operators import ConsoleOperator
+from sliplab.rigs.core.people import PersonAtPlate
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.rig import Rig
+from sliplab.rigs.devices.basler.settings import BaslerSettings
+from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
+from sliplab.rigs.devices.settings import ArmSettings, DeviceSettings
+from sliplab.rigs.discovery import need_libraries
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.operator import ConsoleOperator
-from sliplab.rigs.people import PersonAtPlate
-from sliplab.rigs.plate_frame import PlateFrame
-from sliplab.rigs.reach import need_libraries
-from sliplab.rigs.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.streams import Sink
 
 if TYPE_CHECKING:
-    from sliplab.rigs.wire.loopback import Loopback
+    from sliplab.rigs.loopback.client import Loopback
 
 
 DRIVEN_TAIL_S = 0.3
@@ -118,7 +129,7 @@ def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
     """Real drivers; stand-ins in a process of their own show the simulated scene."""
-    from sliplab.rigs.wire.loopback import Loopback
+    from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
         stage = Loopback(file.scene, file.timing, devices.arm)
@@ -138,7 +149,7 @@ def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
     Raises:
         RigError: a stand-in is not there.
     """
-    from sliplab.rigs.wire.live_basler import LiveBasler
+    from sliplab.rigs.devices.basler.fake_live import LiveBasler
 
     assert file.devices is not None
     exposure_ns = file.scene.frame_camera.exposure_us * 1000
@@ -161,9 +172,7 @@ def _driven_rig(
         camera: the device behind the frame camera's driver, None to search for it.
         ending: called when the rig is closed, last.
     """
-    from sliplab.rigs.arms import build_arm
-    from sliplab.rigs.cameras import build_event_camera, build_frame_camera
-    from sliplab.rigs.sync_box import SerialSyncBox
+    from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
 
     assert devices.sync_box is not None
     scale = {"px_per_mm": file.frame_camera.scale_px_per_mm}
@@ -208,3 +217,39 @@ def _check_grade(file: RigFile, frames: FrameCamera) -> None:
             f"says timing.frames: {file.timing.frames}; wire and set it so, or write "
             f"timing.frames: {stamping.grade}",
         )
+
+
+def build_arm(settings: ArmSettings) -> Arm:
+    """The arm that `settings` describe, not connected yet.
+
+    A driver is imported here only, with its maker's library.
+    """
+    if settings.driver == "ur":
+        from sliplab.rigs.devices.ur.driver import UrArm
+
+        return UrArm(settings)
+    if settings.driver == "abb":
+        from sliplab.rigs.devices.abb.driver import AbbArm
+
+        return AbbArm(settings)
+    from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
+
+    return AbbSocketArm(settings)
+
+
+def build_frame_camera(settings: BaslerSettings, device: Any = None) -> FrameCamera:
+    """The frame camera that `settings` describe, open and not grabbing yet. Raises RigError.
+
+    Args:
+        device: pylon's camera behind the driver; searched for where None.
+    """
+    from sliplab.rigs.devices.basler.driver import BaslerCamera
+
+    return BaslerCamera(settings, device)
+
+
+def build_event_camera(settings: DvxplorerSettings) -> EventCamera:
+    """The event camera that `settings` describe, open and not streaming yet. Raises RigError."""
+    from sliplab.rigs.devices.dvxplorer.driver import DvxplorerCamera
+
+    return DvxplorerCamera(settings)

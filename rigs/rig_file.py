@@ -25,9 +25,9 @@ from sliplab.protocols.yaml_file import (
     validate,
     without_secrets,
 )
-from sliplab.rigs.arms.settings import check_units
-from sliplab.rigs.calibration import Calibration, without_taught
-from sliplab.rigs.devices import DeviceSettings
+from sliplab.rigs.core.arm_settings import check_units
+from sliplab.rigs.core.calibration import Calibration, without_taught
+from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.mock.promises import check_promises
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.rig_inheritance import read_rig, rig_path

@@ -16,9 +16,9 @@ import numpy.typing as npt
 from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, px
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.rigs.capabilities import RigError
-from sliplab.rigs.rig import StopRequested
-from sliplab.rigs.teaching import look, stir
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.rig import StopRequested
+from sliplab.rigs.core.teaching import look, stir
 
 MOST_LENS_PX = 0.5
 MOST_CROP_PX = 5.0

@@ -15,13 +15,13 @@ from sliplab.flows.running import console, stopping
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
 from sliplab.rigs import build
-from sliplab.rigs.plate_frame import PlateFrame
-from sliplab.rigs.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.rig import RETRACT_SPEED_MM_S, Rig, StopRequested
+from sliplab.rigs.core.teaching import APPROACH_MM_S
 from sliplab.rigs.rig_edit import writable_target, write_entries
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path
 from sliplab.rigs.rig_lock import held
-from sliplab.rigs.teaching import APPROACH_MM_S
 
 WAY = (
     f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "

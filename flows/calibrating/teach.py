@@ -16,10 +16,10 @@ from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Pla
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
-from sliplab.rigs.capabilities import Pose, RigError
-from sliplab.rigs.plate_frame import PlateFrame
+from sliplab.rigs.core.capabilities import Pose, RigError
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.teaching import ASLANT, Creep, MarkerFinder, Touch, jogged, touch
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.teaching import ASLANT, Creep, MarkerFinder, Touch, jogged, touch
 from sliplab.storage.streams import FrameChunk
 
 F64 = npt.NDArray[np.float64]

@@ -14,8 +14,8 @@ from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
     from sliplab.flows.calibrating.measuring import CalibrationSession, Finding
+    from sliplab.rigs.core.teaching import Creep
     from sliplab.rigs.rig_file import RigFile
-    from sliplab.rigs.teaching import Creep
 
 app = typer.Typer()
 _SETTINGS = {"no_args_is_help": True, "context_settings": {"help_option_names": ["-h", "--help"]}}
@@ -104,8 +104,8 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
 
 def _ask(file: RigFile) -> dict[str, str | None]:
     """Return by device why it does not answer, None if it does; a rig in use is not disturbed."""
-    from sliplab.rigs.capabilities import RigError
-    from sliplab.rigs.reach import reach
+    from sliplab.rigs.core.capabilities import RigError
+    from sliplab.rigs.discovery import reach
     from sliplab.rigs.rig_lock import held
     from sliplab.storage.trials.lock import Locked
 
@@ -330,13 +330,13 @@ def calibrate_board(
 
 
 def _creep(speed: float, search: float, clearance: float) -> Creep:
-    from sliplab.rigs.teaching import Creep
+    from sliplab.rigs.core.teaching import Creep
 
     return Creep(speed, search, clearance)
 
 
 def _tool(text: str) -> Any:
-    from sliplab.rigs.capabilities import Pose
+    from sliplab.rigs.core.capabilities import Pose
 
     try:
         numbers = [float(part) for part in text.split(",")]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliplab.rigs.rig import Way
+from sliplab.rigs.core.rig import Way
 from sliplab.storage.streams import F64, I64
 
 WINDOW_S = 0.5

@@ -20,7 +20,7 @@ from sliplab.flows.collecting.path_check import path_deviation_mm, speed_deviati
 from sliplab.protocols.conditions import Gates
 from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
-from sliplab.rigs.rig import TrialRun
+from sliplab.rigs.core.rig import TrialRun
 from sliplab.storage.schema.trial import Clocks, Counts, Gate
 from sliplab.storage.streams import I64, StepTimes
 from sliplab.storage.trials.columns import TRACKS

@@ -17,7 +17,7 @@ from sliplab.flows.planning.run_request import RunRequest, describe_campaign, pe
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import sweep_temporary

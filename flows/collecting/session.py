@@ -23,8 +23,8 @@ from sliplab.flows.collecting.trial_gate import TrialGate
 from sliplab.flows.running import stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
-from sliplab.rigs.capabilities import RigError
-from sliplab.rigs.rig import Rig, StopRequested, TrialRun
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.rig import Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.schema.trial import (

@@ -22,9 +22,9 @@ from sliplab.flows.running import stopping
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_integer
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.capabilities import RigError
-from sliplab.rigs.reacting import Reaction, run_watched
-from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.reacting import Reaction, run_watched
+from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors

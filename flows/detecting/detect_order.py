@@ -11,8 +11,8 @@ from sliplab.analysis.networks.training import Fitted
 from sliplab.protocols import InputError, Plan, Trial, load_plan
 from sliplab.protocols.program import Move, Program
 from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.rigs.core.reacting import ACTING, Reflex
 from sliplab.rigs.levels import with_level
-from sliplab.rigs.reacting import ACTING, Reflex
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.storage.files import sha256
 

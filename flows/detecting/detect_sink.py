@@ -17,8 +17,8 @@ import numpy as np
 
 from sliplab.analysis.detectors.live import Decision, FreshestArrival, LiveDetector
 from sliplab.analysis.metrics.classification import CLASSES, INCIPIENT
-from sliplab.rigs.capabilities import Clock
-from sliplab.rigs.reacting import SlipSeen
+from sliplab.rigs.core.capabilities import Clock
+from sliplab.rigs.core.reacting import SlipSeen
 from sliplab.storage.streams import EventChunk, PulseChunk, Unheeded
 
 PATIENCE_US = 200_000
@@ -78,7 +78,7 @@ def state_name(valid_class: int) -> str:
 
 
 class DetectSink(Unheeded):
-    """A `rigs.reacting.Watcher` that feeds a detector.
+    """A `rigs.core.reacting.Watcher` that feeds a detector.
 
     Args:
         clock: the rig's, by which arrivals are dated.

@@ -7,12 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from sliplab.rigs.capabilities import ArmFault, DeviceHealth, RigError
+from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.storage.trials.lock import Locked
 
 if TYPE_CHECKING:
     from sliplab.flows.planning.run_request import RunRequest
-    from sliplab.rigs.rig import Rig
+    from sliplab.rigs.core.rig import Rig
 
 LISTEN_S = 3.0
 """How long the pulses are listened to, s."""
@@ -75,7 +75,7 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
     """Devices of a real rig that cannot be reached at all, each by name."""
     if run_request.rig.simulated or run_request.rig.devices is None:
         return []
-    from sliplab.rigs.reach import reach
+    from sliplab.rigs.discovery import reach
 
     return [
         Check(name, False, why)

@@ -17,7 +17,7 @@ from sliplab.flows.planning.run_request import (
 )
 from sliplab.flows.running.console import size
 from sliplab.protocols import InputError
-from sliplab.rigs.calibration import COMMANDS, find_faults, measured_on
+from sliplab.rigs.core.calibration import COMMANDS, find_faults, measured_on
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 from sliplab.storage.trials.store import Store
 

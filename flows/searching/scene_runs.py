@@ -20,10 +20,10 @@ from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.program import Move
 from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
 from sliplab.rigs.mock.settings import Clocks
 from sliplab.rigs.mock.skins import skin_of
-from sliplab.rigs.rig import Rig, TrialRun
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
 from sliplab.storage.streams import (

@@ -22,7 +22,7 @@ from sliplab.flows.serving.serve_watch import ask_on
 from sliplab.flows.serving.serve_windows import window_end
 from sliplab.flows.serving.service import Service, service
 from sliplab.protocols import InputError
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.errors import disk_error
 from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import StoreError

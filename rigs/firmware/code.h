@@ -1,4 +1,4 @@
-/* The codes on the sync line, bit by bit; rigs/pulse_code.py defines them. */
+/* The codes on the sync line, bit by bit; rigs/core/pulse_code.py defines them. */
 #ifndef CODE_H
 #define CODE_H
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, Progress, Segment
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Progress, Segment
 from sliplab.rigs.mock.clocks import FaultyClock, Lateness, Noise, undisturbed
 from sliplab.rigs.mock.path import TOOL, Leg
 from sliplab.rigs.mock.sync import MockSyncBox, SyncInput

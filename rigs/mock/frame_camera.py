@@ -15,7 +15,7 @@ import numpy.typing as npt
 from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.clock_reads import ClockReader
 from sliplab.rigs.mock.clocks import Jitter, Lateness
 from sliplab.rigs.mock.frame_faults import FrameFaults

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.capabilities import Pose
+from sliplab.rigs.core.capabilities import Pose
 from sliplab.rigs.mock.settings import Contact
 
 F64 = npt.NDArray[np.float64]

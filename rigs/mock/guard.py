@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.rigs.mock.fault_settings import Device, DeviceGone, DiskFull
 from sliplab.rigs.mock.world import World
 from sliplab.storage.streams import Sink

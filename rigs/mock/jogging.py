@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.mock.geometry import matrix, rotvec_deg
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.board import VIEWS

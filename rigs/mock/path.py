@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.mock.deviation import Deviation
 from sliplab.rigs.mock.geometry import ContactPlane
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import get_args
 
 from sliplab.protocols.program import PlateAction
-from sliplab.rigs.capabilities import ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmState, RigError
+from sliplab.rigs.core.people import mass_of
 from sliplab.rigs.mock.jogging import hold_board, jog
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.people import mass_of
 
 _TRACELESS = {"clean", "warm_up", "rezero"}
 _LONGEST_S = 3600.0

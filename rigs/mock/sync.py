@@ -6,14 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.timing import Code
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
 from sliplab.rigs.mock.clock_reads import ClockReader
 from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
 from sliplab.rigs.mock.fault_settings import PulseDevice, PulsesDuplicated, PulsesLate, PulsesLost
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.free_run import ExposureLine
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import ClockReads, PulseChunk
 

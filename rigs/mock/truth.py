@@ -10,7 +10,7 @@ import numpy.typing as npt
 from numba import njit
 
 from sliplab.protocols.timing import FrameGrade
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.world import World
 from sliplab.storage.clockmap import IDENTITY, ClockMap

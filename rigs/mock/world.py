@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.program import PlateAction
-from sliplab.rigs.capabilities import ArmFault, ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
 from sliplab.rigs.mock.deviation import Deviation
 from sliplab.rigs.mock.fault_settings import PlateStuck

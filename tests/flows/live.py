@@ -19,12 +19,12 @@ from sliplab.flows.planning.run_request import (
     pending_trials,
 )
 from sliplab.rigs.build import loopback_rig
+from sliplab.rigs.loopback.client import Loopback
 from sliplab.rigs.rig_file import RigFile
-from sliplab.rigs.wire.loopback import Loopback
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT, SMALL
 from tests.flows.conftest import write
-from tests.rigs.loopback import own_address
+from tests.rigs.waiting import own_address
 
 
 def quick(

@@ -17,7 +17,7 @@ from sliplab.rigs.rig_edit import edited, writable_target, write_entries
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_inheritance import shipped_rigs
 from tests.conftest import ROOT
-from tests.rigs.test_calibration import WHOLE
+from tests.rigs.core.test_calibration import WHOLE
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 DAY = date(2026, 12, 1)

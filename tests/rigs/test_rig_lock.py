@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held, lock_names
 from sliplab.storage.trials.lock import Locked

@@ -22,11 +22,11 @@ from sliplab.flows.running import console, stopping
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Position
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.capabilities import ArmState, Pose, RigError
-from sliplab.rigs.plate_frame import PlateFrame
-from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.core.capabilities import ArmState, Pose, RigError
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.rig import Rig, StopRequested
+from sliplab.rigs.core.teaching import Creep
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.rigs.teaching import Creep
 from tests.command_line import sliplab
 from tests.conftest import ROOT
 

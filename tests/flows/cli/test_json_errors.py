@@ -14,7 +14,7 @@ import typer
 from sliplab.flows.cli.app import app
 from sliplab.flows.running import stopping
 from sliplab.flows.running.cluster import ClusterError
-from sliplab.rigs.capabilities import ArmFault
+from sliplab.rigs.core.capabilities import ArmFault
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Store
 from tests.command_line import SECRET, here

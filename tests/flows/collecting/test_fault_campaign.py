@@ -14,9 +14,9 @@ from typing import Any
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
 from sliplab.protocols.settings import Labelling
-from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.mock.fault_settings import KINDS
-from sliplab.rigs.rig import Rig
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sliplab.flows.collecting.session import Session
-from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.storage.files import disk_full, write_json
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials.store import Campaign, Store, StoreError

@@ -11,8 +11,8 @@ import pytest
 from sliplab.analysis.labels.labelling import label_recording
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.planning.run_request import describe_campaign
-from sliplab.rigs.arms.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.build import build_rig
+from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -26,7 +26,7 @@ from tests.flows.live import (
     stage_of,
     take_all,
 )
-from tests.rigs.loopback import own_address
+from tests.rigs.waiting import own_address
 
 pytestmark = pytest.mark.realtime
 

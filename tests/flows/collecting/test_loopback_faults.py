@@ -18,17 +18,17 @@ import pytest
 
 from sliplab.flows.collecting.session import Session
 from sliplab.flows.planning.run_request import RunRequest, pending_trials
-from sliplab.rigs.arms.ur import SILENCE_S, UrArm
-from sliplab.rigs.arms.ur_control import WATCHDOG_HZ
 from sliplab.rigs.build import calibrated_arm
-from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
-from sliplab.rigs.wire.loopback import Loopback
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.devices.ur.control import WATCHDOG_HZ
+from sliplab.rigs.devices.ur.driver import SILENCE_S, UrArm
+from sliplab.rigs.loopback.client import Loopback
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import checksums
 from tests.flows.live import at_work, quick, request_in, rig_yaml, stage_of
-from tests.rigs.loopback import until
+from tests.rigs.waiting import until
 
 pytestmark = pytest.mark.realtime
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sliplab.flows.collecting.path_check import path_deviation_mm, speed_deviation_percent
-from sliplab.rigs.rig import Way
+from sliplab.rigs.core.rig import Way
 from sliplab.storage.streams import F64, I64
 
 LIMIT_PERCENT = 10.0

@@ -18,7 +18,7 @@ from sliplab.flows.planning.run_request import (
 )
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.capabilities import ArmFault, RigError
+from sliplab.rigs.core.capabilities import ArmFault, RigError
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.conftest import ROOT

@@ -16,7 +16,7 @@ from sliplab.analysis.networks.training import EpochRecord, Fitted
 from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.rig import Rig
+from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.conftest import ROOT
 from tests.flows.live import quick

@@ -22,8 +22,8 @@ from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
 from sliplab.rigs.build import build_rig
-from sliplab.rigs.capabilities import RigError
-from sliplab.rigs.rig import Rig
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

@@ -15,8 +15,8 @@ from rich.console import Console
 from sliplab.flows.detecting.detect import detect
 from sliplab.flows.detecting.detect_order import choose_trial, make_detect_order
 from sliplab.protocols import InputError, load_plan
-from sliplab.rigs.capabilities import RigError
-from sliplab.rigs.rig import Rig, StopRequested
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.rig import Rig, StopRequested
 from sliplab.rigs.rig_file import RigFile
 from tests.command_line import here
 from tests.conftest import ROOT

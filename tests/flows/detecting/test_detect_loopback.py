@@ -9,7 +9,7 @@ import pytest
 from sliplab.flows.detecting.detect import detect
 from sliplab.flows.detecting.detect_order import make_detect_order
 from sliplab.rigs.build import loopback_rig
-from sliplab.rigs.rig import Rig
+from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
 from tests.flows.detecting.detecting import model_in, short_slide, slip_when_busy

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import FrameCamera as FrameSettings
 from sliplab.rigs.mock.settings import MockSettings

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.rigs.capabilities import ArmFault, ArmState, RigError, Segment
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError, Segment
 from sliplab.rigs.mock.devices import build_mock
 from tests.rigs.mock.driving import SMALL
 

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.protocols import InputError
 from sliplab.protocols.yaml_file import parse_yaml, validate
-from sliplab.rigs.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.fault_settings import KINDS
 from sliplab.rigs.rig_file import RigFile

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import MockSettings
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.labels.plate import track_video
-from sliplab.rigs.capabilities import Segment
+from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import FrameCamera, MockSettings
 from sliplab.rigs.scene.frames import FrameOptics, PlateView

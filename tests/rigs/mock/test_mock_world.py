@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from sliplab.rigs.capabilities import Arm, Clock, EventCamera, FrameCamera, Operator, Plate, SyncBox
+from sliplab.rigs.core.capabilities import (
+    Arm,
+    Clock,
+    EventCamera,
+    FrameCamera,
+    Operator,
+    Plate,
+    SyncBox,
+)
+from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.mock.devices import MockDevices, build_mock
-from sliplab.rigs.pulse_code import code_bits
 from sliplab.storage.clockmap import ClockMap
 from tests.rigs.mock.driving import CODE, SMALL, Trial, same, slide
 

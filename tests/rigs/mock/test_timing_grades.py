@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sliplab.protocols.timing import FrameGrade
+from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.settings import Clocks
-from sliplab.rigs.pulse_code import code_bits
 from tests.rigs.mock.standing import CODE, on_box, record, rig, same
 
 EXPOSURE_NS = 2_000_000

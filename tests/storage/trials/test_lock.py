@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.rigs.capabilities import RigError
+from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held
 from sliplab.storage.errors import StoreError

@@ -1,0 +1,121 @@
+"""Settings that all real arms share, as a rig file gives them; cheap to import.
+
+Units stand in the names: a rig file's numbers for one make of arm are the maker's own, and
+belong to the rig, not to the protocol.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+from sliplab.rigs.core.address import Host
+
+Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
+Positive = Annotated[float, Field(gt=0, le=1e6)]
+Triple = tuple[Finite, Finite, Finite]
+Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+class PlaneSettings(StrictModel):
+    """The plate as three touched points in the arm's base frame, for limits that follow it."""
+
+    centre_mm: Triple
+    right_mm: Triple
+    above_mm: Triple
+
+
+class Limits(StrictModel):
+    """What the arm may do, checked before every move, whatever a protocol says."""
+
+    low_mm: Triple
+    high_mm: Triple
+    """Corners of the box that the tool centre point may not leave."""
+    frame: Literal["base", "plate"] = "base"
+    """Whose axes the box is in: the arm's base, or the plate (right, up, into the plate)."""
+    plate: PlaneSettings | None = None
+    """Left out, the contact plane that the rig was taught."""
+    speed_mm_s: Positive = 50.0
+    depth_mm: Finite | None = None
+    """How far beyond the taught plane the tool centre point may go; needs `plate`."""
+    tilt_deg: Annotated[float, Field(gt=0, le=180)] = 180.0
+    """How far a move may turn the tool."""
+    singular_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
+    """How close wrist 2 (UR) or joint 5 (ABB) may be to where two axes fall together."""
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Limits:
+        for axis, low, high in zip("xyz", self.low_mm, self.high_mm, strict=True):
+            if low >= high:
+                raise KeyedError(
+                    "devices.arm.limits.low_mm", list(self.low_mm), f"{axis} is not below high_mm"
+                )
+        return self
+
+
+class ToolSettings(StrictModel):
+    """What is mounted on the flange."""
+
+    tcp_mm: Triple = (0.0, 0.0, 0.0)
+    tcp_rotvec_deg: Triple = (0.0, 0.0, 0.0)
+    """Tool centre point in the flange's frame."""
+    mass_kg: Annotated[float, Field(ge=0, le=50)] = 0.0
+    centre_of_mass_mm: Triple = (0.0, 0.0, 0.0)
+
+
+class BaseArmSettings(StrictModel):
+    """What every arm has, whatever its make."""
+
+    host: Host
+    tool: ToolSettings = ToolSettings()
+    limits: Limits
+
+
+_SHORTEST_MM = 1.0
+"""A tool or a plate in metres is shorter, and no real one in millimetres is."""
+_SMALLEST_MM = 2.0
+"""Side of a box of limits; of one in metres all are shorter."""
+_RADIANS = 1e-3
+
+
+def check_units(arm: BaseArmSettings) -> None:
+    """Look for lengths that were written in metres and turns that were written in radians.
+
+    Raises:
+        KeyedError: a value that no arm can have in the unit of its key.
+    """
+    tool, limits, key = arm.tool, arm.limits, "devices.arm"
+    for name, vector in (
+        ("tcp_mm", tool.tcp_mm),
+        ("centre_of_mass_mm", tool.centre_of_mass_mm),
+    ):
+        if 0 < math.hypot(*vector) < _SHORTEST_MM:
+            raise _in_metres(f"{key}.tool.{name}", vector, "is less than a millimetre long")
+    turn = math.hypot(*tool.tcp_rotvec_deg)
+    if any(abs(turn - part * math.pi) < _RADIANS for part in (0.5, 1.0)):
+        raise KeyedError(
+            f"{key}.tool.tcp_rotvec_deg",
+            tool.tcp_rotvec_deg,
+            f"is a turn in radians: write degrees, such as {_row(tool.tcp_rotvec_deg, 57.29578)}",
+        )
+    sides = [high - low for low, high in zip(limits.low_mm, limits.high_mm, strict=True)]
+    if max(sides) < _SMALLEST_MM:
+        text = f"to high_mm is a box of {' x '.join(f'{side:g}' for side in sides)} mm"
+        raise _in_metres(f"{key}.limits.low_mm", limits.low_mm, text)
+    if limits.plate is not None:
+        for name in ("right_mm", "above_mm"):
+            point = getattr(limits.plate, name)
+            if math.dist(limits.plate.centre_mm, point) < _SHORTEST_MM:
+                text = "is less than a millimetre from centre_mm"
+                raise _in_metres(f"{key}.limits.plate.{name}", point, text)
+
+
+def _in_metres(key: str, vector: Triple, text: str) -> KeyedError:
+    return KeyedError(key, vector, f"{text}: write millimetres, such as {_row(vector, 1000)}")
+
+
+def _row(vector: Triple, factor: float) -> str:
+    return f"[{', '.join(f'{value * factor:g}' for value in vector)}]"

@@ -1,0 +1,273 @@
+"""What a device must be able to do to be part of a rig: capabilities, not base classes.
+
+A driver, a stand-in on the wire and a simulated device are all the same to the rig if they can
+do what is written here. Every call returns within a bounded time or raises a `RigError`; nothing
+here waits for a motion to end. Time passes only in `Clock.wait`, so a simulated rig runs as fast
+as it can while the code around it stays the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol, runtime_checkable
+
+from sliplab.protocols.program import PlateAction
+from sliplab.protocols.timing import Code
+from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
+
+UNKNOWN = "unknown"
+"""What a device does not say of itself, in `DeviceHealth`."""
+
+
+class RigError(RuntimeError):
+    """Something the rig could not do. `device` names the part; the text says what to do."""
+
+    def __init__(self, device: str, message: str) -> None:
+        super().__init__(f"{device}: {message}")
+        self.device = device
+
+
+class ArmFault(RigError):
+    """The arm is not able to move: protective or emergency stop, or no connection."""
+
+
+class ArmState(Enum):
+    """What an arm says of itself."""
+
+    READY = "ready"
+    MOVING = "moving"
+    PROTECTIVE_STOP = "protective stop"
+    EMERGENCY_STOP = "emergency stop"
+    DISCONNECTED = "disconnected"
+    REMOTE_CONTROL_OFF = "remote control off"
+    NOT_RUNNING = "not running"
+    """Switched off, or the program that listens for moves has ended."""
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the arm may be asked to move."""
+        return self in {ArmState.READY, ArmState.MOVING}
+
+    @property
+    def advice(self) -> str:
+        """What a person must do about it; no rig unlocks or restarts anything by itself."""
+        return {
+            ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
+            ArmState.EMERGENCY_STOP: (
+                "release the emergency stop and restart the arm at the pendant"
+            ),
+            ArmState.DISCONNECTED: "check power and network of the arm's controller",
+            ArmState.REMOTE_CONTROL_OFF: "switch the pendant to remote control",
+            ArmState.NOT_RUNNING: "switch the arm on at the pendant, then connect again",
+        }.get(self, "look at the arm")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Tool centre point in the arm's base frame: mm, and a rotation vector in degrees."""
+
+    xyz_mm: tuple[float, float, float]
+    rotvec_deg: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One straight move of the tool centre point at constant speed."""
+
+    to: Pose
+    speed_mm_s: float
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a started path has come: (start, end) controller times of finished segments, ns."""
+
+    state: ArmState
+    finished: tuple[tuple[int, int], ...]
+    done: bool
+
+
+@dataclass(frozen=True)
+class DeviceHealth:
+    """What a device says of itself, read without starting it; `unknown` where it does not say."""
+
+    device: str
+    """Its part in the rig, as `RigError` names it."""
+    model: str
+    serial: str
+    firmware: str
+    temperature_c: float | None
+    """Degrees Celsius; None where it has no thermometer that can be read."""
+    clock: str
+    """What stamps the times of its data."""
+    notes: tuple[str, ...] = ()
+    """What else a person may want to see: region, buffers, speed of the link."""
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """The host's monotonic clock; the simulated one is virtual."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since an arbitrary origin."""
+
+    def wait(self, seconds: float) -> None:
+        """Let `seconds` pass."""
+
+
+@runtime_checkable
+class Arm(Protocol):
+    """A six-axis arm with a controller clock, and perhaps a digital input on the sync line."""
+
+    def connect(self) -> None:
+        """Open the connection; bounded. Raises ArmFault."""
+
+    def state(self) -> ArmState:
+        """The arm's state now."""
+
+    def pose(self) -> Pose:
+        """Where the tool centre point is now."""
+
+    def now_ns(self) -> int:
+        """The controller's clock now."""
+
+    def start(self, path: Sequence[Segment]) -> None:
+        """Begin to follow `path` and return at once. Raises ArmFault, or RigError if moving."""
+
+    def progress(self) -> Progress:
+        """How far the path begun last has come."""
+
+    def read_poses(self) -> PoseChunk:
+        """Poses since the last call."""
+
+    def read_pulses(self) -> PulseChunk:
+        """Sync pulses seen by the digital input since the last call, controller clock.
+
+        Empty where the input is not wired.
+        """
+
+    def stop(self) -> None:
+        """Stop now; safe to call at any time and more than once; never unlocks anything."""
+
+    def close(self) -> None:
+        """Give the connection back."""
+
+
+@runtime_checkable
+class EventCamera(Protocol):
+    """An event camera with an input for sync pulses."""
+
+    width: int
+    height: int
+
+    def start(self) -> None:
+        """Begin to stream; what came before is dropped."""
+
+    def read(self) -> EventChunk:
+        """Events since the last call."""
+
+    def read_pulses(self) -> PulseChunk:
+        """Sync pulses since the last call, camera clock in ns."""
+
+    def stop(self) -> None:
+        """Stop streaming."""
+
+    def close(self) -> None:
+        """Give the device back."""
+
+
+@runtime_checkable
+class FrameCamera(Protocol):
+    """The camera that looks through the plate."""
+
+    px_per_mm: float
+    mid_exposure_ns: int
+    """From the start of the exposure to its middle, which is what a frame's time says."""
+
+    def set_region(self, width_px: int, height_px: int) -> None:
+        """Read out a centred region only."""
+
+    def start(self) -> None:
+        """Begin to grab, on the sync box's ticks or freely; the frame counter restarts at 0."""
+
+    def read(self) -> FrameChunk:
+        """Frames since the last call."""
+
+    def read_clock(self) -> ClockReads:
+        """Read the camera's clock once: one row. Only asked of a camera that has one to read."""
+
+    def stop(self) -> None:
+        """Stop grabbing."""
+
+    def close(self) -> None:
+        """Give the device back."""
+
+
+@runtime_checkable
+class SyncBox(Protocol):
+    """Ticks at a fixed rate: triggers frames, and sends a pulse on each tick with a code bit 1."""
+
+    def connect(self) -> None:
+        """See that a box answers; anew after a fault. Raises RigError."""
+
+    def start(self, rate_hz: float, seed: int, code: Code) -> None:
+        """Begin ticks and a code of `rigs.core.pulse_code` from `seed`, which has 32 bits."""
+
+    def read_pulses(self) -> PulseChunk:
+        """Pulses sent since the last call; the box's clock starts at 0 with `start`."""
+
+    def read_exposures(self) -> PulseChunk:
+        """Starts of the frame camera's exposures since the last call, box clock.
+
+        Exposures are seen from `start` to `close`, also those whose frame is lost later; none
+        where the camera's output is not wired.
+        """
+
+    def read_clock(self) -> ClockReads:
+        """Read the box's clock once: one row."""
+
+    def stop(self) -> None:
+        """Stop the ticks; the clock goes on."""
+
+    def close(self) -> None:
+        """Give the device back."""
+
+
+@runtime_checkable
+class Plate(Protocol):
+    """The plate on its vertical slider (gravity and disturbance trials)."""
+
+    def act(self, action: PlateAction, seconds: float) -> None:
+        """Raise and hold, release over `seconds`, or catch; returns at once."""
+
+    def mass_kg(self) -> float:
+        """Mass mounted now, as far as the rig can tell (a scale, or a person's word)."""
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """The person at the rig."""
+
+    def ask(self, task: str, prompt: str, expected: str) -> bool:
+        """Ask for something to be done (`task`: changeover, clean, ...); True once confirmed."""
+
+
+@runtime_checkable
+class Simulation(Protocol):
+    """The world behind a simulated rig; a real rig has none."""
+
+    def begin_trial(self, seed: int) -> None:
+        """Draw everything that varies by trial from `seed`, forgetting what ran before."""
+
+    def sink(self, sink: Sink) -> Sink:
+        """`sink` as this world lets it be written: its disk may be full."""
+
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+        """What really happened in the trial that just ran (JSON), times in ns of the sync box.
+
+        Args:
+            reference_arm_ns: arm controller time from which displacements are counted.
+            hold_arm_ns: when the recorded hold began, where they are wanted from there too.
+        """

@@ -1,0 +1,220 @@
+"""Where a stand-in's tool centre point is: straight lines at constant speed, with real ramps.
+
+A stand-in asks a `Motion` and nothing else, so a simulated scene can take the place of this one
+and see the same moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from threading import Lock
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.pose import angle_deg, between, distance_mm, way
+
+F64 = npt.NDArray[np.float64]
+_OFF_LINE_MM = 0.01
+
+
+class Motion(Protocol):
+    """A tool centre point that can be sent along straight lines, on a clock in seconds."""
+
+    def pose(self, t_s: float) -> Pose:
+        """Where it is at a time that is not before the last call's."""
+
+    def moving(self, t_s: float) -> bool:
+        """Whether it is on its way."""
+
+    def move(self, to: Pose, speed_mm_s: float, acceleration_mm_s2: float, t_s: float) -> None:
+        """Leave for `to` in a straight line, from rest."""
+
+    def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
+        """Come to rest on the line."""
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Speed up, go steadily, slow down: distance over time along one line, mm and s."""
+
+    length: float
+    speed: float
+    acceleration: float
+
+    @property
+    def peak(self) -> float:
+        """The highest speed reached: short ways never come to `speed`."""
+        return min(self.speed, math.sqrt(self.length * self.acceleration))
+
+    @property
+    def seconds(self) -> float:
+        """How long the whole way takes."""
+        if self.length == 0:
+            return 0.0
+        return self.length / self.peak + self.peak / self.acceleration
+
+    def at(self, t: float) -> tuple[float, float]:
+        """Distance gone and speed at `t` after the start."""
+        if t <= 0 or self.length == 0:
+            return 0.0, 0.0
+        if t >= self.seconds:
+            return self.length, 0.0
+        up = self.peak / self.acceleration
+        left = self.seconds - t
+        if t < up:
+            return self.acceleration * t * t / 2, self.acceleration * t
+        if left < up:
+            return self.length - self.acceleration * left * left / 2, self.acceleration * left
+        return self.peak * (t - up / 2), self.peak
+
+    def shares(self, t: F64) -> F64:
+        """Shares of the way gone at times after the start, (n,)."""
+        if self.length == 0:
+            return np.ones(len(t))
+        up = self.peak / self.acceleration
+        t = np.clip(t, 0.0, self.seconds)
+        left = self.seconds - t
+        gone = self.peak * (t - up / 2)
+        gone = np.where(left < up, self.length - self.acceleration * left * left / 2, gone)
+        gone = np.where(t < up, self.acceleration * t * t / 2, gone)
+        result: F64 = np.where(left == 0.0, 1.0, gone / self.length)
+        return result
+
+
+STILL = Ramp(0.0, 1.0, 1.0)
+"""No way at all."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One straight way from a time on, s."""
+
+    begin: Pose
+    end: Pose
+    ramp: Ramp
+    start_s: float
+
+    def pose(self, t_s: float) -> Pose:
+        """Where the tool centre point is."""
+        gone, _ = self.ramp.at(t_s - self.start_s)
+        if self.ramp.length == 0 or gone >= self.ramp.length:
+            return self.end
+        return self._way(gone / self.ramp.length)
+
+    @cached_property
+    def _way(self) -> Callable[[float], Pose]:
+        return way(self.begin, self.end)
+
+
+class StraightMotion:
+    """The `Motion` of a stand-in by itself. May be asked from any thread.
+
+    Args:
+        on_line: told of every new way and since when it holds, s; in the thread that moves.
+    """
+
+    def __init__(
+        self, at: Pose, on_line: Callable[[Line, float], None] = lambda line, t_s: None
+    ) -> None:
+        self._lock, self._on_line = Lock(), on_line
+        self._line = Line(at, at, STILL, 0.0)
+        self._rest_s = 0.0
+
+    def pose(self, t_s: float) -> Pose:
+        """Where the tool centre point is."""
+        with self._lock:
+            return self._line.pose(t_s)
+
+    def moving(self, t_s: float) -> bool:
+        """Whether it is on its way."""
+        with self._lock:
+            return t_s < self._rest_s
+
+    def move(self, to: Pose, speed_mm_s: float, acceleration_mm_s2: float, t_s: float) -> None:
+        """Leave for `to`; a turn on the spot counts its degrees as mm."""
+        with self._lock:
+            begin = self._line.pose(t_s)
+            length = distance_mm(begin, to) or angle_deg(begin, to)
+            self._follow(Line(begin, to, Ramp(length, speed_mm_s, acceleration_mm_s2), t_s), t_s)
+
+    def extend(self, to: Pose, speed_mm_s: float, t_s: float) -> bool:
+        """Run on to `to` without a rest, if the way there goes on straight at the same speed.
+
+        Returns:
+            Whether it does; if not, nothing has changed.
+        """
+        with self._lock:
+            line = self._line
+            if t_s >= self._rest_s or line.ramp.peak != speed_mm_s:
+                return False
+            ramp = replace(line.ramp, length=distance_mm(line.begin, to))
+            on_line = between(line.begin, to, line.ramp.length / ramp.length if ramp.length else 0)
+            braking = speed_mm_s / ramp.acceleration
+            if distance_mm(on_line, line.end) > _OFF_LINE_MM or t_s > self._rest_s - braking:
+                return False
+            self._follow(replace(line, end=to, ramp=ramp), t_s)
+            return True
+
+    def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
+        """Come to rest on the line, at its end at the latest."""
+        with self._lock:
+            if t_s >= self._rest_s:
+                return
+            line = self._line
+            gone, speed = line.ramp.at(t_s - line.start_s)
+            way = min(speed * speed / (2 * deceleration_mm_s2), line.ramp.length - gone)
+            share = (gone + way) / line.ramp.length
+            target = between(line.begin, line.end, share)
+            if way <= 0 or speed <= 0:
+                here = line.pose(t_s)
+                self._follow(Line(here, here, STILL, t_s), t_s)
+                return
+            # A ramp down is the second half of a short way twice as long that began in the past.
+            brake = speed * speed / (2 * way)
+            past = _backwards(line, gone, way)
+            ramp = Ramp(2 * way, speed, brake)
+            self._follow(Line(past, target, ramp, t_s - ramp.seconds / 2), t_s)
+
+    def _follow(self, line: Line, t_s: float) -> None:
+        self._line, self._rest_s = line, line.start_s + line.ramp.seconds
+        self._on_line(line, t_s)
+
+
+def _backwards(line: Line, gone: float, way: float) -> Pose:
+    """The pose `way` behind where the line is, beyond its begin if need be."""
+    return between(line.begin, line.end, (gone - way) / line.ramp.length)
+
+
+class CycleClock(Protocol):
+    """What a stand-in's controller counts its cycles by."""
+
+    @property
+    def rate(self) -> float:
+        """Controller seconds a host second."""
+
+    def now_s(self) -> float:
+        """The controller's time, s."""
+
+
+class ControllerClock:
+    """A controller's own seconds since it was switched on.
+
+    Args:
+        host_s: the host's monotonic clock, s.
+        rate: controller seconds a host second. More than 1 makes slow slides quick to test.
+        offset_s: what it shows at the beginning.
+    """
+
+    def __init__(self, host_s: Callable[[], float], rate: float, offset_s: float = 1000.0) -> None:
+        self._host_s, self.rate = host_s, rate
+        self._began, self._offset = host_s(), offset_s
+
+    def now_s(self) -> float:
+        """The controller's time, s."""
+        return self._offset + (self._host_s() - self._began) * self.rate

@@ -1,0 +1,492 @@
+"""One rig: runs one trial's motion while its streams flow, and owns the ordered safe stop.
+
+The same code drives a simulated and a real rig: it knows only capabilities. On any failure the
+arm is stopped before anything else; it retracts only if it is healthy; nothing here unlocks a
+protective stop.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+
+from sliplab.protocols.program import Move, PlateStep, Position, Program, Step, step_seconds
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.core.capabilities import (
+    Arm,
+    ArmFault,
+    ArmState,
+    Clock,
+    DeviceHealth,
+    EventCamera,
+    FrameCamera,
+    Operator,
+    Plate,
+    RigError,
+    Segment,
+    Simulation,
+    SyncBox,
+)
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.pulse_code import SEEDS
+from sliplab.rigs.core.touching import LOOK_S, QUIET_S, RateTouch, count_central
+from sliplab.storage.streams import Json, Sink, StepTimes
+
+RETRACT_SPEED_MM_S = 10.0
+TAIL_S = 0.1
+"""How long cameras are read after the last pulse, unless a rig says otherwise."""
+_MOVE_GRACE_S = 10.0
+_INTERRUPTIONS = 10
+"""How often a stop that was interrupted is begun again."""
+
+
+class StopRequested(Exception):
+    """A person asked the rig to stop; the arm has been stopped."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A straight way that the arm was told to take in one recorded step, or a place to stay at."""
+
+    start_ns: int
+    end_ns: int
+    """On the arm's clock."""
+    begin_mm: tuple[float, float, float]
+    end_mm: tuple[float, float, float]
+    """Tool centre point in the arm's base frame."""
+    speed_mm_s: float = 0.0
+    """Along the way; 0 for a place to stay at."""
+
+
+@dataclass(frozen=True)
+class TrialRun:
+    """What the rig can say of a trial besides its streams."""
+
+    steps: tuple[tuple[StepTimes, bool], ...]
+    """Each step with its times, and whether it was recorded."""
+    zero_mm: float
+    truth: Json | None
+    ways: tuple[Way, ...] = ()
+    """What the arm was told to do in the recorded steps."""
+
+    @property
+    def recorded_ns(self) -> tuple[int, int]:
+        """Start and end of the recorded steps on the arm's clock."""
+        recorded = [step for step, kept in self.steps if kept]
+        return recorded[0].start_ns, recorded[-1].end_ns
+
+
+@dataclass
+class Rig:
+    """Arm, cameras, sync box and what else a trial needs.
+
+    Attributes:
+        poll_s: how often streams are read and stop requests looked at.
+        timing: which signal reaches which device, and so what else has to be read.
+        touch_mm: how deep the centre papilla is when touching off notices it.
+        centre_px: where the event camera sees that papilla; by default in its picture's centre.
+        tail_s: how long cameras are read after the last pulse: they send in blocks, and a busy
+            host is late to read them.
+        simulation: the world behind a simulated rig, None on a real one.
+        ending: called last when the rig is closed.
+    """
+
+    name: str
+    clock: Clock
+    arm: Arm
+    events: EventCamera
+    frames: FrameCamera
+    sync: SyncBox
+    operator: Operator
+    frame: PlateFrame
+    poll_s: float
+    timing: Timing = field(default_factory=Timing)
+    touch_mm: float = 0.0
+    centre_px: tuple[float, float] | None = None
+    tail_s: float = TAIL_S
+    plate: Plate | None = None
+    simulation: Simulation | None = None
+    should_stop: Callable[[], bool] = field(default=lambda: False)
+    ending: tuple[Callable[[], None], ...] = ()
+    _reported: str = field(default="", init=False)
+    """Why the arm could not be stopped, as somebody has been told already."""
+    _hangs: bool = field(default=False, init=False)
+    """The plate was let go and not caught: it hangs on the sensor, or falls."""
+
+    def connect(self) -> None:
+        """Connect sync box and arm; cameras connect when they are built. Raises RigError."""
+        self.sync.connect()
+        self.arm.connect()
+
+    def close(self) -> None:
+        """Give every device back, the arm stopped first; safe to call more than once.
+
+        A device that does not answer has nothing to give back, and must not keep the others.
+
+        Raises:
+            ArmFault: everything was given back, but the arm could not be seen to stand still.
+                Not raised again where `safely` has said the same.
+        """
+        fault: RigError | None = None
+        try:
+            fault = self._stop_arm()
+        finally:
+            for device in (self.arm, self.events, self.frames, self.sync):
+                with suppress(Exception):
+                    device.close()
+            for end in self.ending:
+                end()
+        before = sys.exception()
+        if fault is not None and str(fault) not in {self._reported, str(before)}:
+            text = f" (before that: {before})" if isinstance(before, RigError) else ""
+            raise ArmFault("arm", f"{_text(fault)}{text}")
+
+    def health(self) -> list[DeviceHealth]:
+        """What the connected devices say of themselves; simulated ones have nothing to say.
+
+        Raises:
+            RigError: one does not answer.
+        """
+        devices = (self.arm, self.events, self.frames, self.sync)
+        return [device.health() for device in devices if hasattr(device, "health")]
+
+    def describe(self) -> dict[str, Json]:
+        """What drivers tell of the trial that just ran, by device: settings, counts, losses."""
+        told = {}
+        cameras = ("event_camera", self.events), ("frame_camera", self.frames)
+        for name, device in (("arm", self.arm), *cameras):
+            if hasattr(device, "describe"):
+                told[name] = device.describe()
+        losses = getattr(self.sync, "losses", None)
+        if losses is not None:
+            told["sync_box"] = {"losses": vars(losses)}
+        return told
+
+    def run_trial(
+        self,
+        program: Program,
+        sink: Sink,
+        seed: int,
+        frame_px: tuple[int, int] | None,
+        rate_hz: int,
+    ) -> TrialRun:
+        """Run one trial; its recorded steps flow into `sink`.
+
+        Raises:
+            StopRequested: `should_stop` became true; the arm is stopped and clear.
+            RigError: anything failed; the arm is stopped.
+        """
+        with self.safely(program.home):
+            if frame_px is not None:
+                self.frames.set_region(*frame_px)
+            self.begin_trial(program.home, seed)
+            if self.simulation is not None:
+                sink = self.simulation.sink(sink)
+            steps, ways = [], []
+            at, recording, reference = program.home, False, 0
+            for index, step in enumerate(program.steps):
+                if step.recorded and not recording:
+                    self.start_streams(seed, rate_hz, frame_px is not None)
+                    recording = True
+                if recording and not step.recorded:
+                    self.stop_streams(sink, frame_px is not None)
+                    recording = False
+                if step.phase in {"slide", "retract"}:
+                    reference = self.arm.now_ns()
+                times = self.take_step(index, step, at, sink if recording else None)
+                steps.append((times, step.recorded))
+                began, at = at, step_seconds(step, at)[1]
+                if step.recorded:
+                    speed = step.speed_mm_s if isinstance(step, Move) else 0.0
+                    ways.append(self._way(times, began, at, speed))
+            truth = None
+            if self.simulation is not None:
+                hold = next(times.start_ns for times, kept in steps if kept)
+                truth = self.simulation.truth(reference, hold)
+            return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(ways))
+
+    def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
+        """Warm the skin up: press at the plate's centre and let go, `times` times."""
+        home = Position(0.0, 0.0, -clearance_mm)
+        with self.safely(home):
+            self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
+            for _ in range(times):
+                deep = Position(0.0, 0.0, depth_mm)
+                self.move(Move("warm up", deep, speed_mm_s), home, None)
+                self.move(Move("warm up", home, RETRACT_SPEED_MM_S), deep, None)
+
+    def touch_off(self, speed_mm_s: float, search_mm: float, seed: int) -> float:
+        """Find depth zero: creep in until the event rate says that the centre papilla touches.
+
+        See `rigs.core.touching.RateTouch`. A skin is noticed only some way in: `touch_mm` of the
+        rig's calibration.
+
+        Args:
+            search_mm: hard limit beyond the taught plane.
+
+        Returns:
+            The new depth zero in the taught frame, mm; the frame uses it from now on.
+
+        Raises:
+            RigError: nothing was touched within `search_mm`.
+        """
+        self.frame = self.frame.with_zero(0.0)
+        start = Position(0.0, 0.0, -search_mm)
+        with self.safely(start):
+            self.begin_trial(start, seed)
+            self.events.start()
+            self.wait(QUIET_S)
+            zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
+            self.events.stop()
+            self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
+        self.frame = self.frame.with_zero(zero)
+        return zero
+
+    def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
+        """Let events, poses and pulses flow into `sink` without moving anything."""
+        if self.simulation is not None:
+            self.simulation.begin_trial(0)
+        with ExitStack() as stopping:
+            stopping.callback(self.events.stop)
+            stopping.callback(self.sync.stop)
+            self.start_streams(0, rate_hz, False)
+            self.wait(seconds, sink)
+            self.stop_streams(sink, False)
+
+    def _creep(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
+        target = Position(0.0, 0.0, search_mm)
+        self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])
+        while not self.arm.progress().done:
+            self.wait(LOOK_S)
+            depth = self.frame.position(self.arm.pose().xyz_mm).depth_mm
+            if rate.touched(self.central_events()):
+                self.arm.stop()
+                return depth - speed_mm_s * rate.LATE_S - self.touch_mm
+        state = self.arm.state()
+        if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
+            raise arm_fault(state, "touching off")
+        raise RigError(
+            "arm",
+            f"touching off met nothing within {search_mm:g} mm of the taught plane; "
+            "teach the contact plane again",
+        )
+
+    def central_events(self) -> int:
+        """New events where the event camera sees the centre papilla."""
+        size = self.events.width, self.events.height
+        return count_central(self.events.read(), size, self.centre_px)
+
+    def take_step(self, index: int, step: Step, at: Position, sink: Sink | None) -> StepTimes:
+        """Carry out one step of a program from `at`, where the arm stands; inside `safely`.
+
+        Raises:
+            StopRequested, ArmFault: as `move`.
+            RigError: the step moves a plate that this rig does not have.
+        """
+        start = self.arm.now_ns()
+        if isinstance(step, Move):
+            start, end = self.move(step, at, sink)
+            return StepTimes(index, step.phase, start, end)
+        if isinstance(step, PlateStep):
+            if self.plate is None:
+                raise RigError("plate", f"this rig has no sliding plate to {step.action}")
+            self._hangs = step.action == "release" or self._hangs
+            self.plate.act(step.action, step.seconds)
+            self._hangs = step.action == "release"
+        self.wait(step.seconds, sink)
+        return StepTimes(index, step.phase, start, self.arm.now_ns())
+
+    def move(self, step: Move, at: Position, sink: Sink | None = None) -> tuple[int, int]:
+        """Move from `at`, where the arm stands, and wait for the end; controller times, ns.
+
+        Raises:
+            StopRequested: as `wait`; the arm still moves then, and `safely` stops it.
+            ArmFault: it stopped, or did not come to an end in time.
+        """
+        start = self.arm.now_ns()
+        seconds = at.distance_mm(step.to) / step.speed_mm_s
+        if seconds == 0:
+            return start, start
+        self.arm.start([Segment(self.frame.pose(step.to), step.speed_mm_s)])
+        deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
+        while not (progress := self.arm.progress()).done:
+            if not progress.state.healthy:
+                raise arm_fault(progress.state, step.phase)
+            if self.clock.now_ns() > deadline:
+                raise ArmFault("arm", f"did not end the phase '{step.phase}' in time")
+            left = seconds - (self.arm.now_ns() - start) / 1e9
+            self.wait(min(self.poll_s, max(left, 1e-3)), sink)
+        if not progress.state.healthy:
+            raise arm_fault(progress.state, step.phase)
+        if not progress.finished:
+            raise ArmFault("arm", f"was stopped from outside in the phase '{step.phase}'")
+        return progress.finished[-1]
+
+    def wait(self, seconds: float, sink: Sink | None = None) -> None:
+        """Let time pass in polls; streams are read and stop requests looked at in each.
+
+        Raises:
+            StopRequested: `should_stop` became true.
+        """
+        end = self.clock.now_ns() + round(seconds * 1e9)
+        while (left := end - self.clock.now_ns()) > 0:
+            self.clock.wait(min(self.poll_s, left / 1e9))
+            if sink is not None:
+                self._drain(sink)
+            if self.should_stop():
+                raise StopRequested
+
+    def start_streams(self, seed: int, rate_hz: int, with_frames: bool) -> None:
+        """Begin to stream; what came before is dropped. Raises RigError."""
+        self.arm.read_poses()
+        self.arm.read_pulses()
+        self.events.start()
+        by_itself = with_frames and self.timing.frames == "exposure line"
+        if with_frames and not by_itself:
+            self.frames.start()
+        self.sync.start(rate_hz, seed % SEEDS + 1, self.timing.code)
+        if by_itself:
+            # the box must stamp every exposure, the first one too
+            self.frames.start()
+
+    def stop_streams(self, sink: Sink, with_frames: bool) -> None:
+        """Stop the pulses, and read what the cameras still hold before and after they stop.
+
+        Events that come later than `tail_s` after the motion tell nothing; a pulse or a frame does.
+        """
+        if with_frames and self.timing.frames == "exposure line":
+            self.frames.stop()
+        self.sync.stop()
+        self.wait(self.tail_s, sink)
+        self.events.stop()
+        sink.add_event_pulses(self.events.read_pulses())
+        if with_frames:
+            self.frames.stop()
+            sink.add_frames(self.frames.read())
+
+    def _drain(self, sink: Sink) -> None:
+        sink.add_events(self.events.read())
+        sink.add_event_pulses(self.events.read_pulses())
+        sink.add_poses(self.arm.read_poses())
+        sink.add_arm_pulses(self.arm.read_pulses())
+        sink.add_sync_pulses(self.sync.read_pulses())
+        sink.add_frames(self.frames.read())
+        if self.timing.frames == "exposure line":
+            sink.add_exposures(self.sync.read_exposures())
+        if self.timing.reads_clocks:
+            sink.add_box_reads(self.sync.read_clock())
+        if self.timing.frames == "device time stamps":
+            sink.add_frame_camera_reads(self.frames.read_clock())
+
+    def begin_trial(self, home: Position, seed: int) -> None:
+        """To where a motion begins; only then is a simulated trial's randomness drawn."""
+        self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
+        if self.simulation is not None:
+            self.simulation.begin_trial(seed)
+
+    def _way(self, times: StepTimes, begin: Position, end: Position, speed: float) -> Way:
+        places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
+        return Way(times.start_ns, times.end_ns, *places, speed)
+
+    def position(self) -> Position:
+        """Where the tool centre point is now, in plate coordinates."""
+        return self.frame.position(self.arm.pose().xyz_mm)
+
+    @contextmanager
+    def safely(self, clear: Position) -> Iterator[None]:
+        """Whatever goes wrong inside, stop: arm first, then retract if healthy, then cameras.
+
+        A device that fails while it is stopped does not keep the others from being stopped. Then
+        what went wrong first is raised; but an arm that could not be stopped or moved clear, and a
+        plate that nobody has caught, are always told of.
+        """
+        try:
+            yield
+        except BaseException as error:
+            fault: RigError | None = None
+            try:
+                fault = self._stop_arm() or self._retract(clear)
+            finally:
+                for device in (self.events, self.frames, self.sync):
+                    with suppress(Exception):
+                        device.stop()
+            self._reported = str(fault or "")
+            if fault is not None and str(fault) != str(error):
+                if isinstance(error, RigError) and error.device == "arm":
+                    fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
+                raise self._plate_noted(fault) from error
+            if self._hangs and isinstance(error, RigError):
+                raise self._plate_noted(error) from error
+            raise
+
+    def _plate_noted(self, error: RigError) -> RigError:
+        """The same error, with a word on a plate that nobody has caught."""
+        if not self._hangs:
+            return error
+        text = f"{_text(error)}. The plate was let go and nobody has caught it: catch it first"
+        return ArmFault("arm", text) if error.device == "arm" else RigError(error.device, text)
+
+    def _stop_arm(self) -> RigError | None:
+        """Stop the arm; why that could not be done or seen, None if it stands still.
+
+        Whoever asks again meanwhile, with another Ctrl-C, must not keep it from being stopped.
+        """
+        for _ in range(_INTERRUPTIONS):
+            try:
+                self.arm.stop()
+            except KeyboardInterrupt:
+                continue
+            except RigError as fault:
+                return fault
+            except Exception as error:
+                return ArmFault("arm", f"could not be stopped: {error!r}; look at the arm")
+            return None
+        return ArmFault("arm", "was not seen to stand still: its stop was interrupted")
+
+    def _retract(self, clear: Position) -> RigError | None:
+        """Straight out along the plate's normal, only with a healthy arm, bounded in time.
+
+        Returns:
+            Why a healthy arm did not come clear; it has been stopped then.
+        """
+        try:
+            if not self.arm.state().healthy:
+                return None
+            at = self.position()
+            out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
+            if at.distance_mm(out) == 0:
+                return None
+            self.arm.start([Segment(self.frame.pose(out), RETRACT_SPEED_MM_S)])
+            polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
+            for _ in range(polls):
+                if (progress := self.arm.progress()).done:
+                    if progress.finished:
+                        return None
+                    raise ArmFault(
+                        "arm", f"did not come clear of the plate: {progress.state.value}"
+                    )
+                self.clock.wait(self.poll_s)
+            raise ArmFault("arm", "did not come clear of the plate in time")
+        except RigError as fault:
+            return self._stop_arm() or fault
+        except BaseException:
+            self._stop_arm()
+            raise
+
+
+def arm_fault(state: ArmState, phase: str) -> ArmFault:
+    """What happened, and what a person must do about it; nothing is unlocked from here."""
+    lost = state is ArmState.DISCONNECTED
+    where = "the arm may still move" if lost else "the arm stays where it is"
+    return ArmFault(
+        "arm",
+        f"{state.value} in the phase '{phase}'; {where}: {state.advice}, move "
+        "it clear of the plate, then run the same command to go on",
+    )
+
+
+def _text(error: RigError) -> str:
+    """What it says, without the device's name."""
+    return str(error).removeprefix(f"{error.device}: ")

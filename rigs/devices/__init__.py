@@ -1,0 +1,1 @@
+"""Drivers of real devices, a folder each: settings, driver, and the fake that speaks its wire."""

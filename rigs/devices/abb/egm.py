@@ -1,0 +1,186 @@
+"""Poses from ABB's Externally Guided Motion: UDP packets that the controller sends by itself.
+
+abb-motion-program-exec's RAPID module starts the stream with every motion program. The time of a
+pose is the controller's (`feedBack.time`, s and us); its planned pose is the commanded one and has
+no noise, so a segment's start and end are read from it where it is sent. UDP carries no proof of
+its sender, order or completeness: address, sequence number and time of every packet are checked.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from abb_robot_client.egm import EGM
+from google.protobuf.message import DecodeError
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.pose import from_quaternion
+
+_BUFFER_BYTES = 1 << 20
+_SO_TIMESTAMPNS = 35
+"""Linux's option, and the type of its message: when the kernel took a packet, by the wall clock."""
+_TIMESPEC = struct.Struct("@ll")
+_OLDEST_NS = 10_000_000_000
+"""A packet said to be older than this was stamped before the wall clock was set."""
+LATE_NS = 1_000_000_000
+"""A packet this much older than the last one was not delayed: the controller's clock went back."""
+_FURTHEST_MM = 1e5
+_UNIT_TOLERANCE = 0.01
+"""How far a rotation's quaternion may be from length 1; the controller sends doubles."""
+
+
+class EgmFault(RuntimeError):
+    """The stream cannot be used: no times, or times that run backwards; the text says which."""
+
+
+@dataclass(frozen=True)
+class EgmPose:
+    """One packet."""
+
+    t_ns: int
+    host_ns: int
+    """When it arrived at this computer, as well as its kernel knows, on the monotonic clock."""
+    measured: Pose
+    planned: Pose
+    """Commanded; the measured one where the controller does not send it."""
+
+
+@dataclass
+class EgmCounts:
+    """Packets that gave no pose, since the port was opened."""
+
+    lost: int = 0
+    """Numbers missing in the sequence."""
+    late: int = 0
+    """Came after a newer one, or twice."""
+    malformed: int = 0
+    """From the controller's address, and no whole packet with a finite pose."""
+    foreign: int = 0
+    """From any other address."""
+
+
+class _StampedSocket(socket.socket):
+    """A UDP socket that knows when the packet read last arrived, not only when it was read."""
+
+    arrived_ns = 0
+
+    def stamp(self) -> None:
+        """Ask the kernel for arrival times, where it is Linux."""
+        if sys.platform == "linux":
+            with suppress(OSError):
+                self.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+    def recvfrom(self, size: int, flags: int = 0) -> tuple[bytes, Any]:
+        """The next packet and its sender."""
+        data, notes, _, sender = self.recvmsg(size, socket.CMSG_SPACE(_TIMESPEC.size), flags)
+        self.arrived_ns = time.monotonic_ns()
+        for level, kind, note in notes:
+            if (level, kind) == (socket.SOL_SOCKET, _SO_TIMESTAMPNS):
+                seconds, ns = _TIMESPEC.unpack(note[: _TIMESPEC.size])
+                age_ns = time.time_ns() - (seconds * 1_000_000_000 + ns)
+                self.arrived_ns -= age_ns if 0 <= age_ns < _OLDEST_NS else 0
+        return data, sender
+
+
+class EgmReceiver:
+    """Listens on one UDP port for the packets of one controller.
+
+    Args:
+        bind: address of the network card that the controller sends to.
+        port: UDP port that the controller sends to.
+        sender: address or name of the controller; packets of others are counted and dropped.
+
+    Attributes:
+        counts: packets that gave no pose.
+
+    Raises:
+        OSError: the port is taken, or the sender's name is not known.
+    """
+
+    def __init__(self, bind: str, port: int, sender: str) -> None:
+        self.counts = EgmCounts()
+        self._sender = socket.gethostbyname(sender)
+        self._last: tuple[int, int] | None = None  # sequence number, time in ns
+        self._egm = EGM(port=0)
+        self._egm.socket.close()
+        link = _StampedSocket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            link.stamp()
+            link.bind((bind, port))
+        except OSError:
+            link.close()
+            raise
+        self._egm.socket = self._link = link
+
+    def read(self, within_s: float) -> EgmPose | None:
+        """The next packet's pose; None after `within_s`, or for a packet that gives none.
+
+        Raises:
+            EgmFault: packets without times, or a clock that went back.
+        """
+        self._egm.egm_addr = None
+        try:
+            came, state = self._egm.receive_from_robot(within_s)
+        except DecodeError:
+            came, state = True, None
+        if not came or self._egm.egm_addr is None:
+            return None
+        if self._egm.egm_addr[0] != self._sender:
+            self.counts.foreign += 1
+            return None
+        if state is None or state.cartesian is None:
+            self.counts.malformed += 1
+            return None
+        measured = _pose(state.cartesian)
+        planned = measured if state.cartesian_planned is None else _pose(state.cartesian_planned)
+        if measured is None or planned is None:
+            self.counts.malformed += 1
+            return None
+        message = state.robot_message
+        if not message.feedBack.HasField("time"):
+            raise EgmFault(
+                "its EGM packets carry no time, so poses would have none: RobotWare 6.07 or "
+                "newer is needed"
+            )
+        clock = message.feedBack.time
+        t_ns = clock.sec * 1_000_000_000 + clock.usec * 1_000
+        if not self._is_next(message.header.seqno, t_ns):
+            return None
+        return EgmPose(t_ns, self._link.arrived_ns, measured, planned)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._egm.close()
+
+    def _is_next(self, number: int, t_ns: int) -> bool:
+        """Whether a packet is newer than the last one; counts those missing between the two."""
+        if self._last is not None:
+            last, last_ns = self._last
+            back_ns = last_ns - t_ns
+            if back_ns > LATE_NS or (back_ns > 0 and number > last):
+                raise EgmFault(f"the controller's clock went back by {back_ns / 1e9:.3f} s")
+            if back_ns >= 0:
+                self.counts.late += 1
+                return False
+            if number > last:  # else the controller began to count anew, as with each program
+                self.counts.lost += number - last - 1
+        self._last = number, t_ns
+        return True
+
+
+def _pose(cartesian: tuple[Any, Any]) -> Pose | None:
+    """The pose of a place in mm and a quaternion; None if they are not one."""
+    xyz_mm, wxyz = cartesian[0].tolist(), cartesian[1].tolist()
+    if not all(math.isfinite(value) and abs(value) < _FURTHEST_MM for value in (*xyz_mm, *wxyz)):
+        return None
+    if abs(math.hypot(*wxyz) - 1) > _UNIT_TOLERANCE:
+        return None
+    return from_quaternion(xyz_mm, wxyz)

@@ -1,0 +1,440 @@
+"""A stand-in for an ABB IRC5 controller: Robot Web Services, motion programs, poses by EGM.
+
+HTTP with digest authentication and JSON on one port, as abb-robot-client 0.4.0 and
+abb-motion-program-exec 0.7.4 ask for it; EGM packets are sent to a UDP port from the first motion
+program on, as the RAPID module on the controller does it. There is one mechanical unit, ROB_1.
+The module `docs/rapid/sliplab_watchdog.mod` is loaded, unless it is left out. What is not simulated
+is refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+from urllib.parse import parse_qsl
+
+from abb_robot_client._egm_protobuf import egm_pb2
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.fake_faults import CLOCK_BACK_S, PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.core.fake_loop import START_S
+from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
+from sliplab.rigs.core.pose import compose, inverse, quaternion
+from sliplab.rigs.devices.abb.fake_http import HttpServer, Reply
+from sliplab.rigs.devices.abb.fake_program import MoveL, ProgramError, Wait, read_program
+from sliplab.rigs.devices.abb.watchdog import BEAT, ECHO, LIMIT
+
+HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
+JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
+ACCELERATION_MM_S2 = 500.0
+STOP_MM_S2 = 2000.0
+_ORIGIN = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+_TICK_S = 0.002
+LATE_S = 0.005
+"""A packet that would leave later than this is lost: a controller is never late, the network may
+lose."""
+WATCH_S = 0.02
+"""Cycle of the watchdog module, s."""
+_SIGNALS = "rw/iosystem/signals/Local/DRV_1/"
+_NO_AXIS = "9E+09"
+"""What RAPID says of an external axis that is not there."""
+
+
+class AbbStandIn:
+    """One stand-in controller; `start` opens its port, `close` gives it back.
+
+    Args:
+        host: loopback address of its own.
+        port: of its web services.
+        egm: address and UDP port that it sends its poses to.
+        motion: where the tool centre point is.
+        rate: controller seconds a host second.
+        cycle_hz: EGM packets a controller second; 250 from the real one.
+        egm_point: what EGM tells: the tool centre point, or the flange.
+        faults: what will go wrong.
+        clock: the controller's; one of its own, at `rate`, if left out.
+        watchdog: whether the watchdog module is loaded. It counts the host's seconds, whatever
+            the rate: it watches the host.
+        answer_s: how long each answer takes.
+        egm_time: whether its packets tell the time, as from RobotWare 6.07 on.
+
+    Attributes:
+        speed_percent: the pendant's speed ratio, for moves that begin from now on.
+        egm_on: whether it sends poses.
+        web_on: whether its web services answer.
+        entry: where its task begins.
+        pointer: module in which its program stands.
+        mute_after_start: whether they do so no more once the next program has started.
+        watchdog_stops: how often the watchdog module has stopped the arm.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        egm: tuple[str, int],
+        motion: Motion | None = None,
+        rate: float = 1.0,
+        cycle_hz: int = 250,
+        egm_point: str = "tool",
+        faults: Sequence[Fault] = (),
+        joints_deg: Sequence[float] = JOINTS_DEG,
+        clock: CycleClock | None = None,
+        watchdog: bool = True,
+        answer_s: float = 0.0,
+        egm_time: bool = True,
+    ) -> None:
+        self.host, self.port, self._egm = host, port, egm
+        self.motion = motion or StraightMotion(HOME)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        self.faults = list(faults)
+        self.controller, self.mode = "motoron", "AUTO"
+        self.running = False
+        self.speed_percent = 100.0
+        self.egm_on = self.web_on = True
+        self.mute_after_start = False
+        self.entry, self.pointer = "motion_program_main", "motion_program_exec"
+        self._egm_time, self._answer_s = egm_time, answer_s
+        self.watchdog_stops = 0
+        self._signals = dict.fromkeys((BEAT, ECHO, LIMIT), 0.0) if watchdog else {}
+        self._beat_s = 0.0
+        self._number = self._to_lose = 0
+        self._egm_back_s = 0.0
+        self.tool, self.tool_mass_kg = _ORIGIN, 0.0
+        self._egm_point, self._joints_deg = egm_point, list(joints_deg)
+        self._cycle_hz, self._cycle = cycle_hz, int(self.clock.now_s() * cycle_hz)
+        self._files: dict[str, bytes] = {}
+        self._todo: list[MoveL | Wait] = []
+        self._wait_until_s = 0.0
+        self._left_from: Pose | None = None
+        self._streaming = False
+        self._silent = False
+        self._log = 1
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._http: HttpServer | None = None
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._unplugging: threading.Thread | None = None
+
+    def __enter__(self) -> AbbStandIn:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Open the port and run. Raises OSError if it is taken."""
+        self._udp.bind((self.host, 0))
+        self._http = HttpServer(self.host, self.port, self._answer)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Cut every connection and give the port back."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(START_S)
+        self._unplug()
+        if self._unplugging is not None:
+            self._unplugging.join(START_S)
+        self._udp.close()
+
+    def happen(self, kind: Kind) -> None:
+        """Make something go wrong now."""
+        with self._lock:
+            self._happen(kind)
+
+    def drop_connections(self) -> None:
+        """Cut the connections there are; new ones are taken."""
+        if self._http is not None:
+            self._http.cut()
+
+    def restore(self) -> None:
+        """A person has put everything right: link, motors, mode."""
+        self._unplug()
+        if self._unplugging is not None:
+            self._unplugging.join(START_S)
+        with self._lock:
+            self._silent = False
+            self.controller, self.mode = "motoron", "AUTO"
+        self._http = HttpServer(self.host, self.port, self._answer)
+
+    @property
+    def sessions(self) -> int:
+        """How many clients are logged in."""
+        return 0 if self._http is None else self._http.sessions
+
+    def pose(self) -> Pose:
+        """Where the tool centre point is now."""
+        return self.motion.pose(self.clock.now_s())
+
+    def moving(self) -> bool:
+        """Whether it is on its way now."""
+        return self.motion.moving(self.clock.now_s())
+
+    def _unplug(self) -> None:
+        """Cut the connections from a thread of its own: a handler cannot wait for itself to end."""
+        http, self._http = self._http, None
+        if http is not None:
+            self._unplugging = threading.Thread(target=http.close, daemon=True)
+            self._unplugging.start()
+
+    def _happen(self, kind: Kind) -> None:
+        if kind in {Kind.LINK_CUT, Kind.SILENCE}:
+            self._silent = True
+            if kind is Kind.LINK_CUT:
+                self._unplug()
+            return
+        if kind is Kind.CLOCK_BACK:
+            self._egm_back_s += CLOCK_BACK_S
+            return
+        if kind is Kind.PACKETS_LOST:
+            self._to_lose = PACKETS_LOST
+            return
+        states = {
+            Kind.PROTECTIVE_STOP: ("guardstop", self.mode),
+            Kind.SAFEGUARD_STOP: ("guardstop", self.mode),
+            Kind.EMERGENCY_STOP: ("emergencystop", self.mode),
+            Kind.REMOTE_OFF: ("motoroff", "MANR"),
+            Kind.POWER_OFF: ("motoroff", self.mode),
+            Kind.PROGRAM_PAUSED: (self.controller, self.mode),  # a stopped program may go on
+            Kind.PROGRAM_END: (self.controller, self.mode),
+        }
+        if kind not in states:
+            raise ValueError(f"{kind.value} is not simulated on this controller")
+        self._halt()
+        self.controller, self.mode = states[kind]
+
+    def _reach(self, stage: Stage) -> None:
+        for fault in [fault for fault in self.faults if fault.stage is stage]:
+            self.faults.remove(fault)
+            self._happen(fault.kind)
+
+    def _halt(self) -> None:
+        self.running = False
+        self._todo.clear()
+        self.motion.stop(STOP_MM_S2, self.clock.now_s())
+
+    def _work(self) -> None:
+        while not self._closing.wait(_TICK_S):
+            with self._lock:
+                self._watch(time.monotonic())
+            due = int(self.clock.now_s() * self._cycle_hz)
+            while self._cycle < due:
+                self._cycle += 1
+                with self._lock:
+                    self._step(self._cycle / self._cycle_hz)
+
+    def _watch(self, now_s: float) -> None:
+        """The watchdog module's loop."""
+        signals = self._signals
+        if not signals:
+            return
+        if signals[BEAT] != signals[ECHO] or signals[LIMIT] <= 0:
+            signals[ECHO] = signals[BEAT]
+            self._beat_s = now_s
+        elif now_s - self._beat_s > signals[LIMIT] + WATCH_S:
+            signals[LIMIT] = 0.0
+            self.watchdog_stops += 1
+            self._halt()
+
+    def _step(self, t_s: float) -> None:
+        moving = self.motion.moving(t_s)
+        if moving and self._left_from is not None:
+            gone = abs(_gone(self._left_from, self.motion.pose(t_s)))
+            for fault in [f for f in self.faults if f.stage is Stage.MOVING and gone >= f.after_mm]:
+                self.faults.remove(fault)
+                self._happen(fault.kind)
+        elif not moving and not self.running:
+            self._reach(Stage.IDLE)
+        if self.running and not moving and t_s >= self._wait_until_s:
+            self._next(t_s)
+        late = self.clock.now_s() - t_s > LATE_S * self.clock.rate
+        if not self._streaming or not self.egm_on:
+            return
+        self._number += 1
+        if self._to_lose > 0:
+            self._to_lose -= 1
+        elif not self._silent and not late:
+            with contextlib.suppress(OSError):
+                self._udp.sendto(self._packet(t_s), self._egm)
+
+    def _next(self, t_s: float) -> None:
+        if not self._todo:
+            self.running = False
+            return
+        command = self._todo.pop(0)
+        if isinstance(command, Wait):
+            self._wait_until_s = t_s + command.seconds
+            return
+        self._left_from = self.motion.pose(t_s)
+        speed_mm_s = command.speed_mm_s * self.speed_percent / 100
+        self.motion.move(command.to, speed_mm_s, ACCELERATION_MM_S2, t_s)
+
+    def _packet(self, t_s: float) -> bytes:
+        pose = self.motion.pose(t_s)
+        if self._egm_point == "flange":
+            pose = compose(pose, inverse(self.tool))
+        t_s -= self._egm_back_s
+        message = egm_pb2.EgmRobot()
+        message.header.seqno = self._number & 0xFFFFFFFF
+        message.header.tm = int(t_s * 1000) & 0xFFFFFFFF
+        message.header.mtype = egm_pb2.EgmHeader.MSGTYPE_DATA
+        for part in (message.feedBack, message.planned):
+            part.joints.joints.extend(self._joints_deg)
+            part.cartesian.pos.x, part.cartesian.pos.y, part.cartesian.pos.z = pose.xyz_mm
+            orient = part.cartesian.orient
+            orient.u0, orient.u1, orient.u2, orient.u3 = quaternion(pose)
+            if self._egm_time:
+                part.time.sec, part.time.usec = divmod(round(t_s * 1e6), 1_000_000)
+        data: bytes = message.SerializeToString()
+        return data
+
+    def _answer(self, method: str, path: str, query: dict[str, str], body: bytes) -> Reply | None:
+        """The answer to one request; None is none, ever."""
+        if self._answer_s:
+            self._closing.wait(self._answer_s)
+        with self._lock:
+            self._reach(Stage.CONNECTING)
+            if method == "PUT":
+                self._reach(Stage.UPLOADING)
+            if self._silent or not self.web_on:
+                return None
+            if path.startswith("fileservice/"):
+                return self._file(method, path, body)
+            if method == "POST":
+                reply = self._post(path, query, dict(parse_qsl(body.decode())))
+                if self.running and self.mute_after_start:
+                    self.web_on = self.egm_on = False
+                return reply if self.web_on else None
+            states = self._get(path, query)
+            return Reply(404, None) if states is None else Reply(200, states)
+
+    def _file(self, method: str, path: str, body: bytes) -> Reply:
+        name = path.rsplit("/", 1)[1]
+        if method == "PUT":
+            self._files[name] = body
+            return Reply(201, None)
+        return Reply(200 if self._files.pop(name, None) is not None else 404, None)
+
+    def _post(self, path: str, query: dict[str, str], values: dict[str, str]) -> Reply:
+        if path.startswith(_SIGNALS) and query.get("action") == "set":
+            return self._set_signal(path.removeprefix(_SIGNALS), values)
+        if path != "rw/rapid/execution":
+            return Reply(404, None)  # the driver asks for nothing else
+        action = query.get("action")
+        if action == "stop":
+            self._halt()
+            return Reply(204, None)
+        if action not in {"start", "resetpp"}:
+            return Reply(400, None)
+        if self.running or self.controller != "motoron" or self.mode != "AUTO":
+            return Reply(403, None)
+        if action == "start":
+            try:
+                program = read_program(self._files["motion_program.bin"])
+            except (KeyError, ProgramError):
+                return Reply(400, None)
+            self.tool, self.tool_mass_kg = program.tool, program.tool_mass_kg
+            self._todo, self.running, self._streaming = list(program.commands), True, True
+            self._wait_until_s, self._number = 0.0, 0
+        return Reply(204, None)
+
+    def _set_signal(self, name: str, values: dict[str, str]) -> Reply:
+        if name not in self._signals or name == ECHO:
+            return Reply(404 if name not in self._signals else 403, None)
+        self._signals[name] = float(values["lvalue"])
+        return Reply(204, None)
+
+    def _get(self, path: str, query: dict[str, str]) -> list[dict[str, Any]] | None:
+        frame = (query.get("tool"), query.get("wobj"), query.get("coordinate"))
+        if path.endswith("robtarget") and frame != ("tool0", "wobj0", "Base"):
+            return None
+        signal = self._signals.get(path.removeprefix(_SIGNALS))
+        if path.startswith(_SIGNALS):
+            return None if signal is None else [{"_type": "ios-signal", "lvalue": f"{signal:g}"}]
+        flange = compose(self.pose(), inverse(self.tool))
+        states: dict[str, Callable[[], dict[str, Any]]] = {
+            "ctrl/$RAMDISK": lambda: {"_value": "/hd0a/ramdisk"},
+            "rw/rapid/execution": lambda: {
+                "ctrlexecstate": "running" if self.running else "stopped",
+                "cycle": "once",
+            },
+            "rw/panel/ctrlstate": lambda: {"ctrlstate": self.controller},
+            "rw/system": lambda: {"name": "IRB120 stand-in", "rwversion": "6.08.00.01"},
+            "ctrl/identity": lambda: {"ctrl-name": "IRB120 stand-in", "ctrl-id": "120-000000"},
+            "rw/panel/opmode": lambda: {"opmode": self.mode},
+            "rw/panel/speedratio": lambda: {
+                "_type": "pnl-speedratio",
+                "speedratio": f"{self.speed_percent:g}",
+            },
+            "logout": dict,
+            "rw/elog/0/": self._log_entry,
+            "rw/rapid/tasks": lambda: {
+                "name": "T_ROB1",
+                "type": "normal",
+                "taskstate": "linked",
+                "excstate": "ready",
+                "active": "On",
+                "motiontask": "TRUE",
+            },
+            "rw/rapid/tasks/T_ROB1": lambda: {"name": "T_ROB1", "prodentrypt": self.entry},
+            "rw/rapid/tasks/T_ROB1/pcp": lambda: {
+                "_title": "progpointer",
+                "modulemame": self.pointer,
+                "routinename": "main",
+            },
+            "rw/motionsystem/mechunits/ROB_1/robtarget": lambda: {
+                "_type": "ms-robtargets",
+                **dict(zip("xyz", flange.xyz_mm, strict=True)),
+                **dict(zip(("q1", "q2", "q3", "q4"), quaternion(flange), strict=True)),
+                **dict.fromkeys(("cf1", "cf4", "cf6", "cfx"), "0"),
+                **dict.fromkeys((f"eax{name}" for name in "abcdef"), _NO_AXIS),
+            },
+            "rw/motionsystem/mechunits/ROB_1/jointtarget": lambda: {
+                "_type": "ms-jointtarget",
+                **{f"rax_{i + 1}": value for i, value in enumerate(self._joints_deg)},
+                **dict.fromkeys((f"eax_{name}" for name in "abcdef"), _NO_AXIS),
+            },
+        }
+        return [states[path]()] if path in states else None
+
+    def _log_entry(self) -> dict[str, Any]:
+        self._log += 1
+        return {
+            "_title": f"/rw/elog/0/{self._log}",
+            "msgtype": "1",
+            "code": "80003",
+            "tstamp": "2024-01-01 T  12:00:00",
+            "title": "",
+            "desc": "",
+            "conseqs": "",
+            "causes": "",
+            "actions": "",
+            "argc": "0",
+        }
+
+
+def _gone(one: Pose, other: Pose) -> float:
+    return sum((a - b) ** 2 for a, b in zip(one.xyz_mm, other.xyz_mm, strict=True)) ** 0.5
+
+
+def main() -> None:
+    """Run one stand-in until the process is ended."""
+    parser = argparse.ArgumentParser(description="A stand-in for an ABB IRC5 controller.")
+    parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
+    parser.add_argument("--port", type=int, default=8080, help="of its web services")
+    parser.add_argument("--egm", type=int, default=6510, help="UDP port for its poses")
+    arguments = parser.parse_args()
+    with AbbStandIn(arguments.host, arguments.port, ("127.0.0.1", arguments.egm)):
+        threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,202 @@
+"""A stand-in for the small RAPID socket server on an ABB controller (port 5000).
+
+One client at a time; a second one is taken by the network and not answered until the first has
+left. A fly-by move is answered inside its zone, so that the next one can run on from it without a
+rest; a fine-point move is answered at rest. A move that a safety stop ends is never answered. A
+server that lost its client in a move ends that move before it takes the next one. What is not
+simulated is refused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import time
+from collections.abc import Sequence
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
+from sliplab.rigs.core.fake_loop import Connections, LoopThread
+from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, StraightMotion
+from sliplab.rigs.core.pose import distance_mm, from_quaternion, quaternion
+from sliplab.rigs.devices.abb.rapid_socket import ARGUMENTS, Command
+
+HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
+JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
+ACCELERATION_MM_S2 = 500.0
+INFO = b"SlipLab stand-in of a RAPID socket server"
+_POLL_S = 0.001
+_DONE, _REFUSED = b"\x00\x01", b"\x00\x00"
+
+
+class RapidStandIn:
+    """One stand-in; `start` opens its port, `close` gives it back.
+
+    Args:
+        host: loopback address of its own.
+        port: of the server.
+        rate: controller seconds a host second.
+        faults: what will go wrong.
+        motion: where the tool centre point is.
+        clock: the controller's; one of its own, at `rate`, if left out.
+
+    Attributes:
+        speed_percent: the pendant's speed ratio, for moves that begin from now on; the server
+            does not tell it.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int = 5000,
+        rate: float = 1.0,
+        faults: Sequence[Fault] = (),
+        motion: StraightMotion | None = None,
+        clock: CycleClock | None = None,
+    ) -> None:
+        self.host, self.port = host, port
+        self.motion = motion or StraightMotion(HOME)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        self.faults = list(faults)
+        self.tool = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.speed_percent = 100.0
+        self._speed_mm_s = 10.0
+        self._zone_mm = 0.0
+        self._stopped = self._silent = False
+        self._connections = Connections()
+        self._thread: LoopThread | None = None
+        self._turn: asyncio.Lock | None = None
+
+    def __enter__(self) -> RapidStandIn:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Open the port and run. Raises OSError if it is taken."""
+        self._thread = LoopThread(f"stand-in {self.host}")
+        self._thread.call(self._listen)
+
+    def close(self) -> None:
+        """Cut every connection and give the port back."""
+        if self._thread is not None:
+            self._thread.call(self._connections.cut)
+            self._thread.close()
+            self._thread = None
+
+    def happen(self, kind: Kind) -> None:
+        """Make something go wrong now."""
+        assert self._thread is not None
+        self._thread.call(lambda: self._happen(kind))
+
+    def drop_connections(self) -> None:
+        """Cut the connections there are; new ones are taken."""
+        assert self._thread is not None
+        self._thread.call(self._connections.cut)
+        self._thread.call(self._listen)
+
+    def restore(self) -> None:
+        """A person has put everything right: link and safety."""
+        assert self._thread is not None
+        self._thread.call(self._connections.cut)
+        self._stopped = self._silent = False
+        self._thread.call(self._listen)
+
+    def pose(self) -> Pose:
+        """Where the tool centre point is now."""
+        return self.motion.pose(self.clock.now_s())
+
+    def moving(self) -> bool:
+        """Whether it is on its way now."""
+        return self.motion.moving(self.clock.now_s())
+
+    def _listen(self) -> None:
+        self._turn = asyncio.Lock()
+        self._connections.listen(self.host, self.port, self._talk)
+
+    def _happen(self, kind: Kind) -> None:
+        if kind is Kind.LINK_CUT:
+            self._connections.cut()
+        elif kind is Kind.SILENCE:
+            self._silent = True
+        elif kind in {Kind.CLOCK_BACK, Kind.PACKETS_LOST}:
+            raise ValueError(f"{kind.value} is not simulated: this server tells no time")
+        else:
+            self._stopped = True
+            self.motion.stop(ACCELERATION_MM_S2, self.clock.now_s())
+
+    def _reach(self, stage: Stage, gone_mm: float = 0.0) -> None:
+        due = [f for f in self.faults if f.stage is stage and gone_mm >= f.after_mm]
+        for fault in due:
+            self.faults.remove(fault)
+            self._happen(fault.kind)
+
+    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        assert self._turn is not None
+        async with self._turn:
+            while self.moving() or self._stopped:
+                await self._tick()
+            while True:
+                (number,) = struct.unpack(">H", await reader.readexactly(2))
+                if number == Command.CLOSE:
+                    return
+                if number not in list(Command):
+                    writer.write(_REFUSED)
+                    return
+                command = Command(number)
+                layout = struct.Struct(">" + ARGUMENTS[command])
+                values = layout.unpack(await reader.readexactly(layout.size))
+                self._reach(Stage.CONNECTING)
+                reply = await self._do(command, values)
+                if self._silent:
+                    await asyncio.get_running_loop().create_future()
+                writer.write(reply)
+
+    async def _do(self, command: Command, values: tuple[float, ...]) -> bytes:
+        if command is Command.INFO:
+            return _DONE + INFO
+        if command is Command.MOVE_LINEAR and self._speed_mm_s <= 0:
+            return _REFUSED
+        if command is Command.MOVE_LINEAR:
+            await self._move(from_quaternion(values[:3], values[3:]))
+            return _DONE
+        if command is Command.SET_TCP:
+            self.tool = from_quaternion(values[:3], values[3:])
+        elif command is Command.SET_SPEED:
+            self._speed_mm_s = values[0]
+        elif command is Command.SET_ZONE:
+            self._zone_mm = 0.0 if values[0] else values[1]
+        elif command is Command.JOINTS:
+            return _DONE + struct.pack(">6f", *JOINTS_DEG)
+        elif command is Command.POSE:
+            pose = self.pose()
+            return _DONE + struct.pack(">7f", *pose.xyz_mm, *quaternion(pose))
+        elif command is not Command.SET_WORK_OBJECT or values != (0, 0, 0, 1, 0, 0, 0):
+            return _REFUSED  # moves by joints and on circles, other frames: not simulated
+        return _DONE
+
+    async def _move(self, to: Pose) -> None:
+        begin = self.pose()
+        now, speed_mm_s = self.clock.now_s(), self._speed_mm_s * self.speed_percent / 100
+        if not self.motion.extend(to, speed_mm_s, now):
+            self.motion.move(to, speed_mm_s, ACCELERATION_MM_S2, now)
+        zone_mm = min(self._zone_mm, distance_mm(begin, to) / 2)  # RAPID's own rule
+        while self.moving() or self._stopped:
+            here = self.pose()
+            self._reach(Stage.MOVING, distance_mm(begin, here))
+            if not self._stopped and 0 < distance_mm(here, to) < zone_mm:
+                return
+            await self._tick()
+
+    async def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        tick = loop.create_future()
+        loop.call_later(_POLL_S, _end, tick)
+        await tick
+
+
+def _end(tick: asyncio.Future[None]) -> None:
+    if not tick.done():
+        tick.set_result(None)

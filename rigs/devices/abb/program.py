@@ -1,0 +1,56 @@
+"""A path as a motion program of abb-motion-program-exec 0.7.4, which an ABB controller runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from abb_motion_program_exec.abb_motion_program_exec_client import MotionProgram
+from abb_motion_program_exec.commands.rapid_types import (
+    confdata,
+    fine,
+    loaddata,
+    pose,
+    robtarget,
+    speeddata,
+    tooldata,
+)
+
+from sliplab.rigs.core.arm_settings import ToolSettings
+from sliplab.rigs.core.capabilities import Pose, Segment
+from sliplab.rigs.core.pose import quaternion
+
+PAUSE_S = 0.05
+"""Rest after each segment, so that its end can be seen, s."""
+_TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S = 500.0, 5000.0, 1000.0
+_NO_AXES = [0.0] * 6
+
+
+def motion_program(
+    tool: ToolSettings, path: Sequence[Segment] = (), configuration: Sequence[float] = ()
+) -> MotionProgram:
+    """The program that follows `path` from rest to rest; without one it only sets the tool.
+
+    Args:
+        tool: what is on the flange.
+        path: straight segments; the controller plans each at its speed.
+        configuration: RAPID's `confdata` of the arm as it stands (cf1, cf4, cf6, cfx).
+    """
+    program = MotionProgram(tool=_tooldata(tool))
+    for segment in path:
+        place, turn = list(segment.to.xyz_mm), list(quaternion(segment.to))
+        target = robtarget(place, turn, confdata(*configuration), _NO_AXES)
+        speed = speeddata(segment.speed_mm_s, _TURN_DEG_S, _LINEAR_AXIS_MM_S, _TURNING_AXIS_DEG_S)
+        program.MoveL(target, speed, fine)
+        program.WaitTime(PAUSE_S)
+    if not path:
+        program.WaitTime(PAUSE_S)
+    return program
+
+
+def _tooldata(tool: ToolSettings) -> tooldata:
+    frame = Pose(tool.tcp_mm, tool.tcp_rotvec_deg)
+    centre = list(tool.centre_of_mass_mm)
+    if not any(centre):
+        centre = [0.0, 0.0, 0.001]  # RAPID refuses a load whose centre is the origin
+    load = loaddata(max(tool.mass_kg, 0.001), centre, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+    return tooldata(True, pose(list(frame.xyz_mm), list(quaternion(frame))), load)

@@ -1,0 +1,167 @@
+"""The wire of the small RAPID socket server that some labs' ABB arms run (port 5000).
+
+Big-endian. A request is `u16 command` and its float32s; a reply is `u16` 1 (done) or 0 (error) and
+its float32s. One connection at a time; nothing can be asked while a move runs, because a move is
+answered when the RAPID instruction returns; no stop and no time-out exist.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from enum import IntEnum
+
+from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
+
+_WORD = struct.Struct(">H")
+_UNIT_TOLERANCE = 0.01
+"""How far a rotation's quaternion may be from length 1; the server sends single floats."""
+
+
+class Command(IntEnum):
+    """What can be asked."""
+
+    INFO = 0
+    MOVE_JOINTS = 1
+    MOVE_LINEAR = 2
+    MOVE_CIRCULAR = 3
+    SET_TCP = 4
+    SET_WORK_OBJECT = 5
+    SET_SPEED = 6
+    SET_ZONE = 7
+    JOINTS = 8
+    POSE = 9
+    CLOSE = 99
+
+
+ARGUMENTS = {
+    Command.INFO: "",
+    Command.MOVE_JOINTS: "6f",
+    Command.MOVE_LINEAR: "7f",
+    Command.MOVE_CIRCULAR: "14f",
+    Command.SET_TCP: "7f",
+    Command.SET_WORK_OBJECT: "7f",
+    Command.SET_SPEED: "2f",
+    Command.SET_ZONE: "H3f",
+    Command.JOINTS: "",
+    Command.POSE: "",
+    Command.CLOSE: "",
+}
+"""What follows a command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
+degrees/s; fine point, zone in mm, zone for turns in mm and in degrees."""
+RESULTS = {Command.JOINTS: 6, Command.POSE: 7}
+"""How many numbers follow the reply's first word."""
+
+
+class RapidError(RuntimeError):
+    """The server refused, or did not answer in time; the text says which."""
+
+
+class RapidSocket:
+    """One connection.
+
+    Args:
+        host: the controller's address.
+        port: of the server, 5000 by default.
+        within_s: how long connecting may take.
+
+    Raises:
+        RapidError: no connection.
+    """
+
+    def __init__(self, host: str, port: int, within_s: float) -> None:
+        try:
+            self._socket = socket.create_connection((host, port), within_s)
+        except OSError as error:
+            raise RapidError(f"no connection to {host}:{port}: {error}") from None
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def ask(
+        self, command: Command, *arguments: float | Sequence[float], within_s: float
+    ) -> tuple[float, ...]:
+        """The numbers of the reply to one request.
+
+        Raises:
+            RapidError: refused, no whole reply within `within_s` seconds, or a malformed one.
+        """
+        flat = [
+            value
+            for argument in arguments
+            for value in (argument if isinstance(argument, Sequence) else [argument])
+        ]
+        deadline = time.monotonic() + within_s
+        try:
+            self._socket.sendall(_WORD.pack(command) + pack(command, flat))
+            (fine,) = _WORD.unpack(self._receive(_WORD.size, deadline))
+            if fine not in {0, 1}:
+                raise RapidError(f"the answer to {command.name} begins with {fine}, not 0 or 1")
+            if fine == 0:
+                raise RapidError(f"the controller refused {command.name}")
+            if command is Command.INFO:
+                return ()
+            numbers = struct.Struct(f">{RESULTS.get(command, 0)}f")
+            values = numbers.unpack(self._receive(numbers.size, deadline))
+        except OSError as error:
+            raise RapidError(f"no answer to {command.name}: {error}") from None
+        if not all(map(math.isfinite, values)):
+            raise RapidError(f"the answer to {command.name} holds a number that is not finite")
+        if command is Command.POSE and abs(math.hypot(*values[3:]) - 1) > _UNIT_TOLERANCE:
+            raise RapidError("the answer to POSE holds no rotation: its quaternion has no length 1")
+        return values
+
+    def info(self, within_s: float) -> str:
+        """What the server says of itself: text without a length, taken as it comes in one piece.
+
+        Raises:
+            RapidError: as `ask`; another client that holds the one connection looks like that.
+        """
+        self.ask(Command.INFO, within_s=within_s)
+        try:
+            self._socket.settimeout(within_s)
+            return self._socket.recv(4096).decode("ascii", errors="replace").strip()
+        except OSError as error:
+            raise RapidError(f"no answer to INFO: {error}") from None
+
+    def close(self) -> None:
+        """Say goodbye, so that the server takes the next client, and give the socket back."""
+        try:
+            self._socket.sendall(_WORD.pack(Command.CLOSE))
+        except OSError:
+            pass  # it is gone already
+        finally:
+            self._socket.close()
+
+    def _receive(self, size: int, deadline: float) -> bytes:
+        data = b""
+        while len(data) < size:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                raise TimeoutError("timed out")
+            self._socket.settimeout(left)
+            more = self._socket.recv(size - len(data))
+            if not more:
+                raise ConnectionError("the connection was closed")
+            data += more
+        return data
+
+
+def pack(command: Command, values: Sequence[float]) -> bytes:
+    """A request's numbers as they go over the wire."""
+    layout = ARGUMENTS[command]
+    first = [int(values[0]), *values[1:]] if layout.startswith("H") else values
+    return struct.pack(">" + layout, *first)
+
+
+def socket_health(info: str) -> DeviceHealth:
+    """Of the server that some labs run on an ABB controller, by what it says of itself."""
+    return DeviceHealth(
+        device="arm",
+        model=info or UNKNOWN,
+        serial=UNKNOWN,
+        firmware=UNKNOWN,
+        temperature_c=None,
+        clock="the host's: this server tells no time",
+    )

@@ -1,0 +1,327 @@
+"""Driver of ABB arms behind the small RAPID socket server: for labs that have it already.
+
+What that server cannot do shapes this driver. It has no stop, so a way is sent in pieces of at most
+`segment_s` seconds and a stop waits for the one that runs. It answers nothing while a move runs, so
+poses are known only between pieces. It tells no time, so times are the host's. It tells no safety
+state, so a protective stop is a move that is not answered. `rigs.devices.abb.driver` has none of
+these limits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
+
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    ArmState,
+    DeviceHealth,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.rigs.core.guard import Guard
+from sliplab.rigs.core.path_progress import Run
+from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
+from sliplab.rigs.core.pose_stream import PoseStream, Sample
+from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health
+from sliplab.rigs.devices.abb.settings import AbbSocketSettings
+from sliplab.storage.streams import PoseChunk, PulseChunk
+
+T = TypeVar("T")
+ANSWER_S = 2.0
+"""Connecting, and every request but a move, s."""
+OVERTIME_S = 3.0
+"""How much longer than twice its time a move may take before the arm is taken for lost, s."""
+TURN_DEG_S = 20.0
+"""Speed of turns on the way."""
+ZONE = (0, 0.3, 0.3, 0.03)
+"""Pieces of one segment run into each other: a fly-by point of RAPID's z0."""
+FINE = (1, 0.0, 0.0, 0.0)
+"""The last piece of a segment ends at rest."""
+STILL_MM, STILL_S = 0.001, 0.02
+"""An arm that went no further than this in that time stands still, mm and s."""
+ARRIVED_MM = 0.1
+"""A segment that ends further than this from its target was stopped by somebody."""
+
+
+class AbbSocketArm:
+    """An ABB arm by the RAPID socket server; an `Arm` of `rigs.core.capabilities`."""
+
+    def __init__(self, settings: AbbSocketSettings) -> None:
+        self._settings = settings
+        self._guard = Guard(settings.limits)
+        self._stream = PoseStream()
+        self._link: RapidSocket | None = None
+        self._lost: str | None = "not connected"
+        self._info = ""
+        self._run = Run((), done=True)
+        self._one = threading.Lock()
+        self._may_move = False
+        """A path was begun, and nobody has seen the arm at rest since."""
+
+    def connect(self) -> None:
+        """Take the one connection, set the tool, see that it stands. Takes at most 7 `ANSWER_S`.
+
+        Raises:
+            ArmFault: no connection, no answer (perhaps another client has it), or it moves.
+        """
+        if self._lost is None:
+            return
+        tool, settings = self._settings.tool, self._settings
+        frame = Pose(tool.tcp_mm, tool.tcp_rotvec_deg)
+        try:
+            self._link = RapidSocket(settings.host, settings.port, ANSWER_S)
+            self._info = self._link.info(ANSWER_S)
+            self._ask(Command.SET_TCP, frame.xyz_mm, quaternion(frame))
+            self._ask(Command.SET_WORK_OBJECT, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+            self._settle(self._link)
+        except RapidError as error:
+            self._release()
+            raise ArmFault(
+                "arm",
+                f"{error}; the server takes one client: end the other one, or check its power",
+            ) from None
+        self._lost, self._may_move = None, False
+
+    def recover(self) -> None:
+        """Connect again after a person has put right what stopped the arm; unlocks nothing."""
+        with contextlib.suppress(ArmFault):  # connecting finds out, and says so
+            self.close()
+        self.connect()
+
+    def state(self) -> ArmState:
+        """Ready, moving or disconnected: the server tells no more."""
+        if self._lost is not None:
+            return ArmState.DISCONNECTED
+        return ArmState.READY if self._run.done else ArmState.MOVING
+
+    def pose(self) -> Pose:
+        """Where the arm was when it was asked last: now if it stands, else before this piece."""
+        if self._run.done and self._lost is None:
+            with self._one:
+                self._watched(self._look)
+        last = self._stream.last
+        if last is None:
+            raise self._fault("has no pose")
+        return last.pose
+
+    def now_ns(self) -> int:
+        """The host's monotonic clock, which is what this arm's times are told by, ns."""
+        return time.monotonic_ns()
+
+    def health(self) -> DeviceHealth:
+        """What the server said of itself when it was reached."""
+        return socket_health(self._info)
+
+    def start(self, path: Sequence[Segment]) -> None:
+        """Begin to follow `path` in pieces of at most `segment_s` each.
+
+        Takes at most 2 `ANSWER_S`.
+
+        Raises:
+            GuardError: a limit forbids the path; nothing was sent.
+            ArmFault: no connection, or no answer.
+            RigError: it is still moving, or the path is empty.
+        """
+        if not path:
+            raise RigError("arm", "was given an empty path")
+        if not self._run.done:
+            raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+        if self._lost is not None:
+            raise self._fault("cannot move")
+        begin = self.pose()
+        self._guard.check(begin, path)
+        with self._one:
+            self._guard.check_joints(self._watched(lambda: self._ask(Command.JOINTS)))
+        run = Run(path)
+        run.thread = threading.Thread(target=self._follow, args=(run, begin), daemon=True)
+        self._run, self._may_move = run, True
+        run.thread.start()
+
+    def progress(self) -> Progress:
+        """How far the path has come. Raises ArmFault if it was given up."""
+        return self._run.progress(self.state())
+
+    def read_poses(self) -> PoseChunk:
+        """Poses since the last call, on the host's clock: one a piece, and one now if it stands.
+
+        Takes at most `ANSWER_S`. Raises ArmFault: an arm that stands does not answer.
+        """
+        if self._run.done and self._lost is None:
+            with self._one:
+                self._watched(self._look)
+        return self._stream.read()
+
+    def read_pulses(self) -> PulseChunk:
+        """Always empty: the server tells no inputs."""
+        return self._stream.read_pulses()
+
+    def stop(self) -> None:
+        """Send no further piece and wait for the one that runs: there is no stop on this wire.
+
+        Where the connection was lost, a new one is asked whether the arm stands. Takes at most
+        2 `segment_s` + `OVERTIME_S` + 4 `ANSWER_S`.
+
+        Raises:
+            ArmFault: the piece that runs did not end in time, or the arm was not seen at rest.
+        """
+        run = self._run
+        run.cancelled = True
+        if run.thread is not None and run.thread is not threading.current_thread():
+            run.thread.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
+            if not run.done:
+                raise ArmFault("arm", "does not end its move: press its emergency stop")
+        if self._may_move:
+            self._see_rest()
+
+    def close(self) -> None:
+        """Send no further piece, and give the connection to the next client.
+
+        Raises:
+            ArmFault: it was not seen at rest; the connection is given back all the same.
+        """
+        try:
+            self.stop()
+        finally:
+            self._release()
+
+    def _see_rest(self) -> None:
+        """See the arm stand, by a new connection if the one there was is lost.
+
+        Raises:
+            ArmFault: it was not seen to.
+        """
+        settings = self._settings
+        try:
+            with self._one:
+                if self._lost is None:
+                    self._settle(self._link)
+                else:
+                    self._hang_up()  # the server takes one client at a time
+                    link = RapidSocket(settings.host, settings.port, ANSWER_S)
+                    try:
+                        self._settle(link)
+                    finally:
+                        link.close()
+        except RapidError as error:
+            raise ArmFault(
+                "arm",
+                f"was not seen at rest ({error}); a piece of at most {settings.segment_s:g} s may "
+                "have gone on, and no other follows it: look at it, and press its emergency stop "
+                "if it moves",
+            ) from None
+        self._may_move = False
+
+    def _release(self) -> None:
+        """Give the connection back."""
+        self._lost = self._lost or "closed"
+        self._hang_up()
+        self._run.done = True
+
+    def _hang_up(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    def _follow(self, run: Run, begin: Pose) -> None:
+        """A path's thread: piece after piece."""
+        at = begin
+        try:
+            for segment in run.path:
+                start_ns = time.monotonic_ns()
+                make = partial(self._segment, run, at, segment)
+                with self._one:
+                    arrived = self._watched(make)
+                if not arrived:
+                    break
+                run.finished.append((start_ns, time.monotonic_ns()))
+                at = segment.to
+            else:
+                self._may_move = False
+        except Exception as error:  # a thread that dies must not look like a stop from outside
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
+        finally:
+            run.done = True
+            self._stream.wake()
+
+    def _segment(self, run: Run, begin: Pose, segment: Segment) -> bool:
+        """Make one segment; whether its end was reached. Raises RapidError."""
+        seconds = distance_mm(begin, segment.to) / segment.speed_mm_s
+        seconds = max(seconds, angle_deg(begin, segment.to) / TURN_DEG_S)
+        pieces = max(1, math.ceil(seconds / self._settings.segment_s))
+        self._ask(Command.SET_SPEED, segment.speed_mm_s, TURN_DEG_S)
+        self._ask(Command.SET_ZONE, ZONE if pieces > 1 else FINE)
+        for piece in range(1, pieces + 1):
+            if run.cancelled:
+                self._settle(self._link)
+                self._may_move = False
+                return False
+            if piece == pieces > 1:
+                self._ask(Command.SET_ZONE, FINE)
+            target = between(begin, segment.to, piece / pieces)
+            bound_s = self._bound_s(seconds / pieces)
+            self._ask(Command.MOVE_LINEAR, target.xyz_mm, quaternion(target), within_s=bound_s)
+            self._look()
+        last = self._stream.last
+        return last is not None and distance_mm(last.pose, segment.to) <= ARRIVED_MM
+
+    def _settle(self, link: RapidSocket | None) -> None:
+        """Wait until it stands: a fly-by move is answered before its end. Raises RapidError."""
+        deadline, poll = time.monotonic() + ANSWER_S, threading.Event()
+        before = None
+        while time.monotonic() < deadline:
+            self._look(link)
+            here = self._stream.last
+            if before is not None and here and distance_mm(before.pose, here.pose) < STILL_MM:
+                return
+            before = here
+            poll.wait(STILL_S)
+        raise RapidError("the arm does not come to rest")
+
+    def _look(self, link: RapidSocket | None = None) -> None:
+        """Ask for the pose; its time is the middle of the question. Raises RapidError."""
+        asked = time.monotonic_ns()
+        link = self._link if link is None else link
+        if link is None:
+            raise RapidError("there is no connection")
+        values = link.ask(Command.POSE, within_s=ANSWER_S)
+        answered = time.monotonic_ns()
+        pose = from_quaternion(values[:3], values[3:])
+        self._stream.add(Sample((asked + answered) // 2, answered, pose.xyz_mm, pose.rotvec_deg))
+
+    def _ask(
+        self, command: Command, *arguments: float | Sequence[float], within_s: float = ANSWER_S
+    ) -> tuple[float, ...]:
+        if self._link is None:
+            raise RapidError("there is no connection")
+        return self._link.ask(command, *arguments, within_s=within_s)
+
+    def _watched(self, work: Callable[[], T]) -> T:
+        """The result of requests; an arm that does not answer one of them is lost.
+
+        Raises:
+            ArmFault: no answer, or a refusal.
+        """
+        try:
+            return work()
+        except RapidError as error:
+            self._lost = str(error)
+            raise ArmFault(
+                "arm",
+                f"{error}; it may be in a protective or emergency stop, which this server does "
+                "not tell: look at it, then connect again",
+            ) from None
+
+    def _bound_s(self, seconds: float) -> float:
+        return 2 * seconds + OVERTIME_S
+
+    def _fault(self, what: str) -> ArmFault:
+        return ArmFault("arm", f"{what}: disconnected ({self._lost}); {self.state().advice}")

@@ -1,0 +1,326 @@
+"""The camera that looks through the plate: a Basler camera through pylon.
+
+Written for the a2A1920-160ucBAS (USB 3 Vision) and pypylon 26.9, which brings pylon 12.4; a camera
+is asked what it has, so others of the maker may do. Settings are named as in GenICam's SFNC 2.5
+and, where pylon's emulation of an older family differs, by its older name too. What a frame's time
+means stands in `frame_time.py`; what was never tried on a real camera stands in docs/cameras.md.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from sliplab.rigs.core.capabilities import DeviceHealth, RigError
+from sliplab.rigs.devices.basler.frame_time import Abilities, choose
+from sliplab.rigs.devices.basler.grabbing import Grab, GrabCounts, GrabSettings
+from sliplab.rigs.devices.basler.health import basler_health
+from sliplab.rigs.devices.basler.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
+from sliplab.rigs.devices.basler.settings import BaslerSettings
+from sliplab.rigs.devices.basler.setup import check_rate, read_back, write_settings
+from sliplab.storage.streams import ClockReads, FrameChunk, Json
+
+TRIGGER_READY_MS = 1000
+"""How long a software trigger waits for the camera to be ready for it, ms."""
+_LEAST_BUFFERS = 8
+_END_OF_EXPOSURE = "EventExposureEndData"
+
+
+def look_for_camera(serial: str | None, device_class: str | None = None) -> Any:
+    """pylon's description of a camera that is plugged in; nothing is opened.
+
+    Args:
+        device_class: of pylon's, such as `BaslerCamEmu`; any where None.
+
+    Raises:
+        RigError: no camera, none with this serial number, or several to choose from.
+    """
+    from pypylon import pylon
+
+    found = [
+        info
+        for info in pylon.TlFactory.GetInstance().EnumerateDevices()
+        if device_class in (None, info.GetDeviceClass())
+    ]
+    fitting = [info for info in found if serial in (None, info.GetSerialNumber())]
+    if len(fitting) == 1:
+        return fitting[0]
+    there = ", ".join(info.GetSerialNumber() for info in found) or "none"
+    if fitting:
+        raise RigError(DEVICE, f"there are several: {there}; name one by serial")
+    wanted = "no camera" if serial is None else f"no camera with serial number {serial}"
+    raise RigError(DEVICE, f"{wanted}; found: {there}. Look at its cable and its power")
+
+
+def find_camera(serial: str | None, device_class: str | None = None) -> Any:
+    """An `InstantCamera` of pypylon that is not open yet; see `look_for_camera`.
+
+    Raises:
+        RigError: it is not there, not the only one, or another program has it.
+    """
+    from pypylon import genicam, pylon
+
+    info = look_for_camera(serial, device_class)
+    try:
+        return pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateDevice(info))
+    except genicam.GenericException as error:
+        raise RigError(DEVICE, f"{info.GetFriendlyName()}: {error}") from None
+
+
+class BaslerCamera:
+    """A `rigs.core.capabilities.FrameCamera`; it is open from the beginning and grabs from `start`.
+
+    Args:
+        device: an `InstantCamera` that is not open; searched for where None.
+
+    Raises:
+        RigError: no such camera, or one that refuses a setting.
+    """
+
+    def __init__(self, settings: BaslerSettings, device: Any = None) -> None:
+        self.settings, self.px_per_mm = settings, settings.px_per_mm or math.nan
+        self._device = device if device is not None else find_camera(settings.serial)
+        self._grab: Grab | None = None
+        self._running = False
+        self._ends: dict[int, int] = {}
+        self._chunks: set[str] = set()
+        self._listener: Any = None
+        self._shape = (0, 0)
+        from pypylon import genicam
+
+        self._genicam = genicam
+        try:
+            self._device.GrabCameraEvents.Value = True
+            self._device.Open()
+            self._nodes = Nodes(self._device.GetNodeMap())
+            self._configure()
+        except genicam.GenericException as error:
+            self.close()
+            raise RigError(DEVICE, f"it cannot be opened: {error}") from None
+        except RigError:
+            self.close()
+            raise
+
+    def _configure(self) -> None:
+        nodes, settings = self._nodes, self.settings
+        write_settings(nodes, settings)
+        exposure = "ExposureTime" if nodes.has("ExposureTime") else "ExposureTimeAbs"
+        self.mid_exposure_ns = round(float(nodes.get(exposure)) * 500)
+        self.stamping = choose(self._abilities(), settings.trigger)
+        self._shape = (int(nodes.get("Height")), int(nodes.get("Width")))
+        self._in_force = read_back(nodes)
+
+    def _abilities(self) -> Abilities:
+        """What the camera has; what of it is used is switched on."""
+        nodes, settings = self._nodes, self.settings
+        chunk = self._chunk("Timestamp")
+        level = chunk and settings.sync_line is not None and self._chunk("LineStatusAll")
+        result = bool(self._device.IsUsb() or self._device.IsGigE())
+        event = not (chunk or result) and nodes.offers("EventSelector", "ExposureEnd")
+        if event:
+            self._listen()
+        return Abilities(
+            chunk=chunk,
+            result=result,
+            event=event,
+            latch=has_latch(nodes),
+            sync_level=level,
+            exposure_line=settings.exposure_line is not None,
+        )
+
+    def _chunk(self, name: str) -> bool:
+        """Switch a chunk on if the camera has it."""
+        nodes = self._nodes
+        if not nodes.has("ChunkModeActive"):
+            return False
+        nodes.put(True, "ChunkModeActive")
+        if not nodes.offers("ChunkSelector", name):
+            # pylon's emulation has the mode and not one chunk: left on, no grab would begin
+            nodes.put(bool(self._chunks), "ChunkModeActive")
+            return False
+        nodes.put(name, "ChunkSelector")
+        nodes.put(True, "ChunkEnable")
+        self._chunks.add(name)
+        return True
+
+    def _listen(self) -> None:
+        """Take note of every end of an exposure: frame id and time, ns."""
+        from pypylon import pylon
+
+        ends = self._ends
+
+        class Listener(pylon.CameraEventHandler):
+            def OnCameraEvent(self, camera: Any, user: int, node: Any) -> None:
+                ends[int(camera.EventExposureEndFrameID.Value)] = int(
+                    camera.EventExposureEndTimestamp.Value
+                )
+
+        # pylon keeps no reference, and must be told before the listener goes
+        self._listener = Listener()
+        self._device.RegisterCameraEventHandler(
+            self._listener, _END_OF_EXPOSURE, 1, pylon.RegistrationMode_Append,
+            pylon.Cleanup_None, pylon.CameraEventAvailability_Mandatory,
+        )  # fmt: skip
+        self._nodes.put("ExposureEnd", "EventSelector")
+        self._nodes.put("On", "EventNotification")
+
+    @property
+    def counts(self) -> GrabCounts:
+        """What became of the frames of this run, or of the last one."""
+        return self._grab.counts if self._grab is not None else GrabCounts()
+
+    def describe(self) -> Json:
+        """What a trial's record keeps of the camera: device, region, times and losses."""
+        info, stamping = self._device.GetDeviceInfo(), self.stamping
+        height, width = self._shape
+        return {
+            "model": info.GetModelName(),
+            "serial": info.GetSerialNumber(),
+            "region_px": [width, height],
+            "exposure_us": self.mid_exposure_ns / 500,
+            "settings": self.settings.model_dump(mode="json"),
+            "in_force": self._in_force,
+            "time_stamps": stamping.means,
+            "grade": stamping.grade,
+            "counts": vars(self.counts) | {"lost": self.counts.lost},
+        }
+
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, grabbing or not.
+
+        Raises:
+            RigError: the camera is gone.
+        """
+        return basler_health(self._device, self._nodes, self.stamping, self._shape, self._buffers)
+
+    @property
+    def _buffers(self) -> int:
+        """Of pylon; as many frames fit into the queue."""
+        half = math.ceil(self.settings.rate_hz * self.settings.back_pressure_s / 2)
+        return max(half, _LEAST_BUFFERS)
+
+    def set_region(self, width_px: int, height_px: int) -> None:
+        """Read out a centred region only.
+
+        Raises:
+            RigError: while grabbing, or a region that the sensor cannot read out.
+        """
+        if self._running:
+            raise RigError(DEVICE, "the region cannot change while it grabs; stop first")
+        centre_region(self._nodes, width_px, height_px)
+        self._shape = (height_px, width_px)
+
+    def start(self) -> None:
+        """Begin to grab; frames of an earlier run that nobody read are dropped.
+
+        Raises:
+            RigError: it grabs already, it cannot keep the rate, or the camera is gone.
+        """
+        from pypylon import pylon
+
+        if self._running:
+            raise RigError(DEVICE, "it grabs already; stop first")
+        settings = self.settings
+        check_rate(self._nodes, settings)
+        self._ends.clear()
+        try:
+            self._device.MaxNumBuffer.Value = self._buffers
+            self._device.StartGrabbing(pylon.GrabStrategy_OneByOne)
+        except self._genicam.GenericException as error:
+            raise RigError(DEVICE, f"it does not begin to grab: {error}") from None
+        wired = self.stamping.grade == "hardware trigger" and settings.sync_line is not None
+        told = GrabSettings(
+            stamping=self.stamping,
+            mid_exposure_ns=self.mid_exposure_ns,
+            first_id=1 if self._device.IsGigE() else 0,
+            period_ns=0 if settings.trigger == "software" else round(1e9 / settings.rate_hz),
+            late_ns=round(settings.late_s * 1e9),
+            sync_bit=(settings.sync_line or 1) - 1 if wired else None,
+            queue=self._buffers,
+            first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
+            stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
+        )
+        self._grab, self._running = Grab(self._device, told, self._ends), True
+
+    def trigger(self) -> None:
+        """Ask for one frame, where the trigger is `software`.
+
+        Raises:
+            RigError: the camera is not ready for it within `TRIGGER_READY_MS`.
+        """
+        from pypylon import pylon
+
+        try:
+            if self._device.CanWaitForFrameTriggerReady():
+                self._device.WaitForFrameTriggerReady(
+                    TRIGGER_READY_MS, pylon.TimeoutHandling_ThrowException
+                )
+            self._device.ExecuteSoftwareTrigger()
+        except self._genicam.GenericException as error:
+            raise RigError(DEVICE, f"no frame can be asked for: {error}") from None
+
+    def read(self) -> FrameChunk:
+        """Frames since the last call.
+
+        Raises:
+            RigError: the camera is gone or silent, and all that came before was read.
+        """
+        frames = self._grab.take() if self._grab is not None else []
+        if not frames:
+            if self._grab is not None and (fault := self._grab.fault) is not None:
+                raise fault
+            none = np.empty(0, np.int64)
+            return FrameChunk(
+                np.empty((0, *self._shape), np.uint8), none, none, none, np.empty(0, np.uint8)
+            )
+        return FrameChunk(
+            # one frame, as a quick loop finds it, is handed on as it is
+            np.stack([frame.image for frame in frames])
+            if len(frames) > 1
+            else frames[0].image[np.newaxis],
+            np.array([frame.number for frame in frames], np.int64),
+            np.array([frame.t_ns for frame in frames], np.int64),
+            np.array([frame.host_ns for frame in frames], np.int64),
+            np.array([frame.sync for frame in frames], np.uint8),
+        )
+
+    def read_clock(self) -> ClockReads:
+        """Latch the camera's clock and read it: one row.
+
+        Raises:
+            RigError: this camera has no clock that the host can read.
+        """
+        return latch_clock(self._nodes)
+
+    def stop(self) -> None:
+        """Stop grabbing; frames exposed before can still be read. Bounded by `STOP_S`."""
+        if not self._running or self._grab is None:
+            return
+        self._running = False
+        # exposures end first, so that what pylon holds by then can be taken whole
+        with suppress(RigError):
+            self._nodes.execute("AcquisitionStop")
+        try:
+            self._grab.stop()
+        finally:
+            with suppress(self._genicam.GenericException):
+                self._device.StopGrabbing()
+
+    def close(self) -> None:
+        """Give the device back; safe at any time and more than once."""
+        with suppress(RigError):
+            self.stop()
+        if self._listener is not None:
+            with suppress(self._genicam.GenericException):
+                self._device.DeregisterCameraEventHandler(self._listener, _END_OF_EXPOSURE)
+                self._listener = None
+        with suppress(self._genicam.GenericException):
+            self._device.Close()
+
+    @property
+    def device(self) -> Any:
+        """pypylon's `InstantCamera`, for what only a stand-in or a person at a prompt asks."""
+        return self._device

@@ -1,0 +1,342 @@
+"""pylon's emulated camera as the camera of a simulated scene that goes on elsewhere.
+
+Every frame of the scene is one software trigger of the emulated camera, so that it passes through
+pylon's own buffers, threads and results; only the picture, its number and its chunks, which the
+emulation does not have, are the scene's. What pylon loses on the way is lost here too. A setting
+that the scene's pictures do not show is refused, and so is a grab with one in force.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from sliplab.rigs.devices.basler.driver import find_camera
+from sliplab.rigs.devices.basler.fake import EMULATED, emulate
+from sliplab.rigs.devices.basler.fake_nodes import Command, NodeMap, ReadOnly, Selected, Setting
+from sliplab.storage.streams import U8, FrameChunk
+
+TRIES = 3
+MISSED_S = 0.2
+"""A trigger whose picture has not come by then was missed, s."""
+LOOK_S = 0.001
+LOOK_MS = 100
+READY_S = 2.0
+"""The longest that the emulated camera takes to be ready for the next trigger, s."""
+EXPOSURE_US = 100.0
+"""Of the emulated camera; the scene's own is in its pictures."""
+FEED_S = 5.0
+"""The longest that the feeding thread takes to end, s."""
+MOST_HZ = 160.0
+"""Frames a second that the sensor gives at the most."""
+LINES = (1, 2, 3)
+"""Numbers of its inputs: one has the sync line, the ticks may come by any other."""
+
+
+_Frame = tuple[U8, int, int, int]
+"""Picture, number, middle of the exposure in ns, and level of the sync line."""
+
+
+class Scene(Protocol):
+    """Where the frames come from."""
+
+    on_frames: Callable[[FrameChunk], None]
+
+    def grab(self, width_px: int, height_px: int) -> None:
+        """Frames of that size come from now on."""
+
+    def stop_grabbing(self) -> None:
+        """An empty chunk comes after the last frame."""
+
+
+class LiveBasler:
+    """An `InstantCamera` of pypylon whose pictures are those of a scene.
+
+    Whatever is not listed here is the emulated camera's own.
+
+    Args:
+        scene: asked for frames when the camera grabs.
+        mid_exposure_ns: from a frame's start to its middle, which is what the scene's times say.
+        sync_line: number of the input that shows the sync line's level.
+        stored: settings by name that somebody left in the camera, as its user set `UserSet1`.
+
+    Attributes:
+        fed: frames that pylon took since the grab began.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        mid_exposure_ns: int,
+        sync_line: int,
+        stored: Mapping[str, Any] | None = None,
+    ) -> None:
+        emulate(1)
+        # never the real one of this computer
+        self._device = find_camera(None, EMULATED)
+        self._scene, self._mid_exposure_ns, self._bit = scene, mid_exposure_ns, sync_line - 1
+        self._coming: deque[_Frame | None] = deque()
+        self._came = threading.Condition()
+        self._fed: deque[tuple[int, _Frame]] = deque()
+        self._triggers = self._retrieved = 0
+        self._feeder: threading.Thread | None = None
+        self._drop, self._gone = 0, False
+        self.fed = 0
+        self._stored = dict(stored or {})
+        self._nodes: dict[str, Any] = {}
+        scene.on_frames = self._take
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
+
+    # -- faults ----------------------------------------------------------------------------
+
+    def drop_frames(self, count: int) -> None:
+        """Lose the next `count` results."""
+        self._drop += count
+
+    def unplug(self) -> None:
+        """The cable is pulled."""
+        self._gone = True
+
+    # -- as pylon's ------------------------------------------------------------------------
+
+    def GetNodeMap(self) -> Any:
+        """The emulated camera's settings, and those that it lacks or does not obey."""
+        emulated = self._device.GetNodeMap()
+        if not self._nodes:
+            self._nodes = self._lay_over(emulated)
+        return NodeMap(emulated, self._nodes)
+
+    def _lay_over(self, emulated: Any) -> dict[str, Any]:
+        """What the scene shows, by name; open cameras have settings."""
+        exposure_us = self._mid_exposure_ns / 500
+        ticks = tuple(f"Line{number}" for number in LINES if number - 1 != self._bit)
+        plain: dict[str, tuple[Any, tuple[Any, ...]]] = {
+            "PixelFormat": ("Mono8", ()),
+            "ReverseX": (False, ()),
+            "ReverseY": (False, ()),
+            "BinningHorizontal": (1, ()),
+            "BinningVertical": (1, ()),
+            "Gain": (0.0, ()),
+            "GainAuto": ("Off", ()),
+            "BlackLevel": (0.0, ()),
+            "Gamma": (1.0, ()),
+            "DigitalShift": (0, ()),
+            "ExposureAuto": ("Off", ()),
+            "ExposureMode": ("Timed", ()),
+            "AcquisitionMode": ("Continuous", ()),
+            "AcquisitionFrameRateEnable": (False, ()),
+            "TriggerActivation": ("RisingEdge", ()),
+            "LineInverter": (False, ()),
+            "LUTEnable": (False, ()),
+            "TestPattern": ("Off", ()),
+            "BslInputFilterTime": (0.0, ()),
+            "ChunkModeActive": (False, (False, True)),
+            "ChunkSelector": ("Timestamp", ("Timestamp", "LineStatusAll")),
+            "UserSetSelector": ("Default", ("Default", "UserSet1")),
+            # the emulated exposure stays short, so that no trigger comes too soon
+            "ExposureTime": (exposure_us, ()),
+            "ExposureTimeAbs": (exposure_us, ()),
+            "TriggerSource": (ticks[0], ticks),
+        }
+        held = {"ChunkModeActive", "UserSetSelector", "ExposureTime", "ExposureTimeAbs"}
+        held |= {"TriggerSource"}
+        if unknown := set(self._stored) - set(plain):
+            raise ValueError(f"the stand-in has no {', '.join(sorted(unknown))} to store")
+        own: dict[str, Any] = {
+            name: Setting(
+                name,
+                factory,
+                choices,
+                stored=self._stored.get(name),
+                node=None if name in held else emulated.GetNode(name),
+            )
+            for name, (factory, choices) in plain.items()
+        }
+        own["ChunkEnable"] = Selected(own["ChunkSelector"])
+        own["UserSetLoad"] = Command(self._load_user_set)
+        # what was exposed by then is still to be taken by pylon
+        own["AcquisitionStop"] = Command(self._end_frames, emulated.GetNode("AcquisitionStop"))
+        own["BslResultingAcquisitionFrameRate"] = ReadOnly(lambda: min(MOST_HZ, 1e6 / exposure_us))
+        return own
+
+    def _load_user_set(self) -> None:
+        chosen = self._nodes["UserSetSelector"].Value
+        for name, node in self._nodes.items():
+            if isinstance(node, Setting) and name != "UserSetSelector":
+                node.load(stored=chosen != "Default")
+
+    def _chunks(self) -> frozenset[str]:
+        """Chunks that come with every frame."""
+        active = self._nodes and self._nodes["ChunkModeActive"].Value
+        return self._nodes["ChunkEnable"].on if active else frozenset()
+
+    def IsCameraDeviceRemoved(self) -> bool:
+        """Whether it was unplugged."""
+        return self._gone or bool(self._device.IsCameraDeviceRemoved())
+
+    def StartGrabbing(self, strategy: Any) -> None:
+        """Begin: the scene sends frames of the region that was set.
+
+        Raises:
+            genicam.GenericException: a setting is in force that the scene does not show.
+        """
+        from pypylon import genicam
+
+        nodes = self._device.GetNodeMap()
+        for own in self._nodes.values():
+            if isinstance(own, Setting) and not own.simulated:
+                raise genicam.InvalidArgumentException(own.refusal(own.Value))
+        for choice in nodes.GetNode("TriggerSelector").Symbolics:
+            nodes.GetNode("TriggerSelector").Value = choice
+            mode = nodes.GetNode("TriggerMode").Value
+            if mode != ("On" if choice == "FrameStart" else "Off"):
+                raise genicam.InvalidArgumentException(
+                    f"the stand-in simulates a trigger of FrameStart alone, not {choice} {mode}"
+                )
+        nodes.GetNode("TriggerSelector").Value = "FrameStart"
+        nodes.GetNode("TriggerSource").Value = "Software"
+        nodes.GetNode("ExposureTimeAbs").Value = EXPOSURE_US
+        self._coming.clear()
+        self._fed.clear()
+        self._triggers = self._retrieved = self.fed = 0
+        self._device.StartGrabbing(strategy)
+        self._feeder = threading.Thread(target=self._feed, name="scene's frames", daemon=True)
+        self._feeder.start()
+        self._scene.grab(nodes.GetNode("Width").Value, nodes.GetNode("Height").Value)
+
+    def StopGrabbing(self) -> None:
+        """Stop; frames that came before were given to pylon."""
+        try:
+            self._end_frames()
+        finally:
+            self._device.StopGrabbing()
+
+    def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
+        """The next result of pylon's, with the scene's picture in it."""
+        result = self._device.RetrieveResult(timeout_ms, handling)
+        if result is None or not result.IsValid():
+            return result
+        with self._came:
+            # a trigger that pylon's camera missed gave no result
+            while self._fed[0][0] < result.BlockID:
+                self._fed.popleft()
+            frame = self._fed.popleft()[1]
+            self._retrieved += 1
+            self._came.notify()
+        if self._drop:
+            from pypylon import pylon
+
+            self._drop -= 1
+            result.Release()
+            return pylon.GrabResult()
+        return _Result(result, *frame, self._mid_exposure_ns, self._bit, self._chunks())
+
+    # --------------------------------------------------------------------------------------
+
+    def _end_frames(self) -> None:
+        """No frame comes any more, and pylon has been given all that came: at most `FEED_S`."""
+        feeder, self._feeder = self._feeder, None
+        if feeder is None:
+            return
+        try:
+            self._scene.stop_grabbing()
+            feeder.join(FEED_S)
+        finally:
+            with self._came:  # a scene that is gone says nothing
+                self._coming.append(None)
+                self._came.notify()
+
+    def _take(self, frames: FrameChunk) -> None:
+        """In the thread that the scene's frames come by."""
+        rows = zip(
+            frames.images,
+            frames.number.tolist(),
+            frames.t_ns.tolist(),
+            frames.sync.tolist(),
+            strict=True,
+        )
+        with self._came:
+            self._coming.extend(rows if len(frames.number) else (None,))
+            self._came.notify()
+
+    def _feed(self) -> None:
+        from pypylon import genicam
+
+        while True:
+            with self._came:
+                if not self._came.wait_for(lambda: self._coming, READY_S):
+                    continue
+                frame = self._coming.popleft()
+            if frame is None:
+                return
+            try:
+                self._give(frame)
+            except genicam.GenericException:
+                return  # it grabs no more: what comes now is lost, and its number is missing
+
+    def _give(self, frame: _Frame) -> None:
+        """One trigger for one frame; the emulation misses some, which no camera's line would."""
+        for _ in range(TRIES):
+            if self._gone or not self._ready():
+                return
+            with self._came:
+                self._fed.append((self._triggers, frame))
+                self._triggers += 1
+            self._device.ExecuteSoftwareTrigger()
+            end = time.monotonic() + MISSED_S
+            while time.monotonic() < end:
+                with self._came:
+                    if self._retrieved + self._device.NumReadyBuffers.Value > self.fed:
+                        self.fed += 1
+                        return
+                    self._came.wait(LOOK_S)
+
+    def _ready(self) -> bool:
+        """Whether the next trigger may come, after waiting for it."""
+        from pypylon import pylon
+
+        end = time.monotonic() + READY_S
+        while time.monotonic() < end:
+            # right after the start it says no at once
+            if self._device.WaitForFrameTriggerReady(LOOK_MS, pylon.TimeoutHandling_Return):
+                return True
+        return False
+
+
+class _Value:
+    """One of the values that a chunk is read by."""
+
+    def __init__(self, value: int) -> None:
+        self.Value = value
+
+
+class _Result:
+    """A result of pylon's with another picture and with chunks."""
+
+    def __init__(
+        self,
+        result: Any,
+        image: U8,
+        number: int,
+        t_ns: int,
+        sync: int,
+        mid_exposure_ns: int,
+        bit: int,
+        chunks: frozenset[str],
+    ) -> None:
+        self._result = result
+        self.Array, self.BlockID, self.ImageNumber = image, number, number + 1
+        self.NumberOfSkippedImages = 0  # the numbers say it
+        self.TimeStamp = t_ns - mid_exposure_ns
+        if "Timestamp" in chunks:
+            self.ChunkTimestamp = _Value(self.TimeStamp)
+        if "LineStatusAll" in chunks:
+            self.ChunkLineStatusAll = _Value(sync << bit)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)

@@ -1,0 +1,305 @@
+"""The thread that takes frames out of pylon, and never loses one without counting it.
+
+Pylon fills a fixed number of buffers and drops what finds none, so they are emptied by a thread
+that does nothing else. It hands frames on in a queue that is bounded too: when nobody reads, the
+queue fills, then pylon's buffers, and only then are frames lost, which shows as a gap in the
+camera's own frame ids. A time that comes apart from its frame, as an event, is waited for here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, fields
+from typing import Any
+
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.core.stall_timer import Patience
+from sliplab.rigs.devices.basler.frame_time import Stamping
+from sliplab.rigs.devices.basler.nodes import DEVICE
+from sliplab.storage.streams import U8
+
+POLL_MS = 100
+"""The longest that the thread waits in pylon before it looks round, ms."""
+EVENT_WAIT_S = 0.5
+"""A frame whose exposure-end event has not come by then is given up, s."""
+HANG_S = 5.0
+"""Pylon, asked for `POLL_MS`, must have answered by then, s."""
+STOP_S = 3.0
+"""The longest that a grab takes to end, s."""
+_DRAIN_ROUNDS = 2
+"""Empty looks in a row after which a stopped camera has nothing more to say."""
+NO_ID = (1 << 64) - 1
+"""A block id of pylon that says there is none."""
+
+
+@dataclass
+class GrabCounts:
+    """What became of the frames of one run.
+
+    Attributes:
+        grabbed: whole frames in order, handed on or still in the queue.
+        failed: came incomplete.
+        skipped: missing in the camera's ids, or overwritten in pylon.
+        late: arrived later after their time than `late_s` allows; they are handed on.
+        out_of_order: came after a later one or twice; they are not handed on.
+        unstamped: their time never came; they are not handed on.
+    """
+
+    grabbed: int = 0
+    failed: int = 0
+    skipped: int = 0
+    late: int = 0
+    out_of_order: int = 0
+    unstamped: int = 0
+
+    @property
+    def lost(self) -> int:
+        """Frames that were exposed, as far as one can tell, and not handed on."""
+        return self.failed + self.skipped + self.out_of_order + self.unstamped
+
+    def copy(self) -> GrabCounts:
+        """As they are now."""
+        return GrabCounts(*(getattr(self, field.name) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One whole frame. Times in ns, `t_ns` of the middle of its exposure."""
+
+    image: U8
+    number: int
+    t_ns: int
+    host_ns: int
+    sync: int
+
+
+@dataclass
+class _Waiting:
+    image: U8
+    number: int
+    host_ns: int
+    sync: int
+
+
+@dataclass(frozen=True)
+class GrabSettings:
+    """What the thread has to know of the camera.
+
+    Attributes:
+        first_id: block id of a run's first frame: 0 on USB, 1 on GigE.
+        period_ns: between two frames, where the camera runs by itself or is triggered at a rate.
+        sync_bit: of the line status chunk; None where the sync line is not wired.
+        queue: frames that the queue holds.
+        first_ns: silence before the first frame that is a fault; 0 where it may wait for ever.
+        stall_ns: silence after it that is a fault; 0 where the camera need not send by itself.
+    """
+
+    stamping: Stamping
+    mid_exposure_ns: int
+    first_id: int
+    period_ns: int
+    late_ns: int
+    sync_bit: int | None
+    queue: int
+    first_ns: int
+    stall_ns: int
+
+
+class Grab:
+    """One run of a camera, from start to stop.
+
+    Args:
+        device: an `InstantCamera` of pypylon that grabs, or what behaves like one.
+        exposures: exposure ends by block id, ns, filled by the camera's events.
+    """
+
+    def __init__(self, device: Any, settings: GrabSettings, exposures: dict[int, int]) -> None:
+        self._device, self._settings, self._exposures = device, settings, exposures
+        self._ready: deque[Frame] = deque()
+        self._waiting: deque[_Waiting] = deque()
+        self._changed = threading.Condition()
+        self._counts = GrabCounts()
+        self._fault: RigError | None = None
+        self._last = -1
+        self._shortest_ns: int | None = None
+        self._before: tuple[int, int] | None = None
+        self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
+        self._silent_ns = 0
+        self._heard = False
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="frame camera", daemon=True)
+        self._thread.start()
+
+    @property
+    def counts(self) -> GrabCounts:
+        """What became of the frames so far."""
+        with self._changed:
+            return self._counts.copy()
+
+    @property
+    def fault(self) -> RigError | None:
+        """Why no more frames will come, if that is so."""
+        with self._changed:
+            if self._fault is not None or self._stopping.is_set():
+                return self._fault
+            silent_ns = self._silent_ns
+            hung_s = self._patience.waited_s(self._asked_ns)
+            limit = self._settings.stall_ns if self._heard else self._settings.first_ns
+            if hung_s > HANG_S:
+                return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")
+            if limit and silent_ns > limit:
+                what = "no frame" if self._heard else "not one frame since the start,"
+                return RigError(
+                    DEVICE,
+                    f"{what} for {silent_ns / 1e9:.1f} s; look at its cable, its power and "
+                    "its trigger",
+                )
+            return None
+
+    def take(self) -> list[Frame]:
+        """All frames that are ready."""
+        with self._changed:
+            frames = list(self._ready)
+            self._ready.clear()
+            self._changed.notify_all()
+            return frames
+
+    def stop(self) -> None:
+        """End the run; frames that pylon holds are still taken. Returns within `STOP_S`.
+
+        Raises:
+            RigError: the thread does not end.
+        """
+        self._stopping.set()
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join(STOP_S)
+        if self._thread.is_alive():
+            raise RigError(DEVICE, f"grabbing has not ended within {STOP_S:g} s")
+
+    def _run(self) -> None:
+        from pypylon import pylon
+
+        empty, looked_ns, wait = 0, 0, pylon.TimeoutHandling_Return
+        try:
+            while self._waiting or empty < _DRAIN_ROUNDS or not self._stopping.is_set():
+                if not self._room():
+                    continue
+                asked_ns = self._asked_ns = time.monotonic_ns()
+                result = self._device.RetrieveResult(POLL_MS, wait)
+                now_ns = time.monotonic_ns()
+                if result is None or not result.IsValid():
+                    empty += 1
+                    # silence is what was listened to: a computer that stood still heard nothing
+                    self._silent_ns += min(now_ns - asked_ns, POLL_MS * 1_000_000)
+                else:
+                    empty = 0
+                    try:
+                        self._see(result, now_ns)
+                    finally:
+                        result.Release()
+                self._give(now_ns)
+                # not at every frame: each call into pylon gives up the interpreter, and a busy
+                # one is slow to give it back
+                if now_ns - looked_ns > POLL_MS * 1_000_000:
+                    looked_ns = now_ns
+                    self._look()
+        except RigError as error:
+            self._fail(error)
+        except Exception as error:
+            gone = self._device.IsCameraDeviceRemoved()
+            what = "the camera was unplugged" if gone else f"grabbing failed: {error}"
+            self._fail(RigError(DEVICE, what))
+
+    def _room(self) -> bool:
+        """Whether the queue has room, after waiting for it; a run that ends makes its own."""
+        with self._changed:
+            if len(self._ready) < self._settings.queue or self._stopping.is_set():
+                return True
+            self._changed.wait(POLL_MS / 1000)
+            self._asked_ns = time.monotonic_ns()
+            self._look()
+            return len(self._ready) < self._settings.queue
+
+    def _look(self) -> None:
+        if self._device.IsCameraDeviceRemoved():
+            raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
+
+    def _fail(self, error: RigError) -> None:
+        with self._changed:
+            self._fault = error
+
+    def _see(self, result: Any, now_ns: int) -> None:
+        """Account for one grab result, and keep it if it is a frame."""
+        block = int(result.BlockID)
+        counted = block if block != NO_ID else int(result.ImageNumber) - 1
+        number = counted - (self._settings.first_id if block != NO_ID else 0)
+        counts = self._counts
+        with self._changed:
+            self._heard, self._silent_ns = True, 0
+            if number <= self._last:
+                counts.out_of_order += 1
+                return
+            missing = number - self._last - 1
+            overwritten = int(result.NumberOfSkippedImages)
+            # what pylon overwrote is missing in the ids too, where there are ids
+            counts.skipped += max(missing, overwritten)
+            self._last = number
+            if not result.GrabSucceeded():
+                counts.failed += 1
+                return
+        sync = 0
+        if self._settings.sync_bit is not None:
+            sync = int(result.ChunkLineStatusAll.Value) >> self._settings.sync_bit & 1
+        stamp = self._stamp(result, now_ns)
+        if stamp is not None:
+            self._exposures[counted] = stamp
+        self._waiting.append(_Waiting(result.Array, number, now_ns, sync))
+
+    def _stamp(self, result: Any, now_ns: int) -> int | None:
+        """The frame's own stamp, ns; None where it comes as an event."""
+        means = self._settings.stamping.means
+        if means == "exposure end event":
+            return None
+        if means == "host arrival":
+            return now_ns
+        stamp = int(result.ChunkTimestamp.Value if means == "chunk" else result.TimeStamp)
+        if stamp == 0:
+            raise RigError(DEVICE, f"its {means} says no time, though the camera promised one")
+        return stamp
+
+    def _give(self, now_ns: int) -> None:
+        """Hand on, in order, the frames whose times are known."""
+        settings = self._settings
+        while self._waiting:
+            frame = self._waiting[0]
+            stamp = self._exposures.pop(frame.number + settings.first_id, None)
+            if stamp is None and now_ns - frame.host_ns < EVENT_WAIT_S * 1e9:
+                return
+            self._waiting.popleft()
+            with self._changed:
+                if stamp is None:
+                    self._counts.unstamped += 1
+                    continue
+                self._counts.grabbed += 1
+                self._counts.late += self._is_late(frame, stamp)
+                middle = settings.stamping.middle_ns(stamp, settings.mid_exposure_ns)
+                self._ready.append(
+                    Frame(frame.image, frame.number, middle, frame.host_ns, frame.sync)
+                )
+
+    def _is_late(self, frame: _Waiting, stamp_ns: int) -> bool:
+        """Whether it took longer than the fastest one of this run by more than is allowed."""
+        if self._settings.stamping.means == "host arrival":
+            before, self._before = self._before, (frame.number, frame.host_ns)
+            if before is None or not self._settings.period_ns:
+                return False
+            due = before[1] + (frame.number - before[0]) * self._settings.period_ns
+            return frame.host_ns - due > self._settings.late_ns
+        took = frame.host_ns - stamp_ns
+        if self._shortest_ns is None or took < self._shortest_ns:
+            self._shortest_ns = took
+        return took - self._shortest_ns > self._settings.late_ns

@@ -1,0 +1,72 @@
+"""What a rig file says of a Basler camera; the driver asks the device for everything else."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from sliplab.protocols.yaml_file import KeyedError, StrictModel
+
+FrameTrigger = Literal["hardware", "software", "free run"]
+
+
+class BaslerSettings(StrictModel):
+    """The camera that looks through the plate."""
+
+    driver: Literal["basler"] = "basler"
+    serial: str | None = None
+    """Serial number; the only camera where none is given."""
+    px_per_mm: float | None = Field(default=None, gt=0, le=1000)
+    """Pixels for a millimetre of the plate; a rig file says it elsewhere (`scale_px_per_mm`)."""
+    exposure_us: float = Field(default=2000.0, ge=1, le=1_000_000)
+    """Exposure, microseconds; the camera may round it, and what it says then counts."""
+    gain_db: float = Field(default=0.0, ge=0, le=48)
+    """Gain, dB."""
+    user_set: str = "Default"
+    """Set that is loaded from the camera before all else is written; `Default` is the maker's."""
+    rate_hz: float = Field(default=100.0, gt=0, le=1000)
+    """Frames a second: its own rate in free run, else the most that the triggers ask for."""
+    trigger: FrameTrigger = "hardware"
+    """`hardware`: a rising edge on `trigger_line`. `software`: the host asks for each frame."""
+    trigger_line: str = "Line1"
+    """Name of the input that is wired to the sync box's ticks."""
+    sync_line: int | None = Field(default=None, ge=1, le=8)
+    """Number of the input that is wired to the sync box's code; its level comes as a chunk."""
+    exposure_line: str | None = None
+    """Name of the output that tells the sync box of exposures; None where it is not wired."""
+    back_pressure_s: float = Field(default=5.0, ge=0.1, le=60)
+    """Seconds for which nobody need call `read`: half in pylon's buffers, half in a queue."""
+    late_s: float = Field(default=0.1, gt=0, le=10)
+    """A frame that arrives by this much after its time counts as late, seconds."""
+    first_frame_s: float = Field(default=5.0, ge=0.2, le=60)
+    """In free run, no frame for so long after the start is a fault, seconds: a camera and pylon
+    need time to set up buffers. Triggered, it may wait for ever for its first trigger."""
+    stall_s: float = Field(default=1.0, ge=0.2, le=60)
+    """Silence for so long after the first frame is a fault, seconds."""
+
+    @model_validator(mode="after")
+    def _exposure_fits(self) -> BaslerSettings:
+        if self.exposure_us * self.rate_hz > 1e6:
+            raise KeyedError(
+                ".exposure_us",
+                f"{self.exposure_us:g}",
+                f"must be at most {1e6 / self.rate_hz:g}, the period of rate_hz = {self.rate_hz:g}",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lines_differ(self) -> BaslerSettings:
+        inputs = {"sync_line": f"Line{self.sync_line}"}
+        if self.trigger == "hardware":
+            inputs["trigger_line"] = self.trigger_line
+        for key, line in inputs.items():
+            if self.exposure_line == line:
+                raise KeyedError(".exposure_line", line, f"is an input already: {key}")
+        if self.trigger == "hardware" and self.trigger_line == inputs["sync_line"]:
+            raise KeyedError(
+                ".sync_line",
+                self.sync_line,
+                "must be another line than trigger_line: it has a code",
+            )
+        return self

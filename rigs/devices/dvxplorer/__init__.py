@@ -1,0 +1,1 @@
+"""The DVXplorer event camera through dv-processing."""

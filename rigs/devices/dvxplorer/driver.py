@@ -1,0 +1,326 @@
+"""The event camera inside the sensor: a DVXplorer through dv-processing 2.0.4.
+
+The library keeps what it receives only for a while, so a thread takes it out as it comes, from the
+moment the camera is opened; what comes while nothing is wanted is thrown away. What is kept waits
+in memory that is bounded. Times are the camera's, whole microseconds in 64 bits, which the library
+counts on from the camera's own 32: nothing wraps here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sliplab.rigs.core.capabilities import DeviceHealth, RigError
+from sliplab.rigs.core.stall_timer import Patience
+from sliplab.rigs.devices.dvxplorer.process import EventProcess
+from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
+from sliplab.rigs.devices.dvxplorer.source import DEVICE, Look
+from sliplab.storage.streams import I64, EventChunk, Json, PulseChunk
+
+POLL_S = 0.001
+"""The pause after a look that found nothing, s."""
+SETTLE_S = 1.0
+"""The longest that `start` and `stop` wait until all is taken that came before, s."""
+HANG_S = 10.0
+"""The thread must have come back from a look by then, s; longer than `event_process.ANSWER_S`."""
+CLOSE_S = 3.0
+"""The longest that `close` waits for the thread, s."""
+RISING_EDGE, TIMESTAMP_RESET = 1, 0
+"""`EXTERNAL_SIGNAL_RISING_EDGE` and `TIMESTAMP_RESET` of `dv.TriggerType`."""
+_EVENT_BYTES = 13
+_LOOK_NS = 10_000_000
+"""The most that one look which found nothing counts as silence, ns."""
+
+
+@dataclass
+class EventCounts:
+    """What one run received.
+
+    Attributes:
+        events: kept, read or not.
+        pulses: rising edges.
+        gaps: silences of more than `gap_s` between events, on the camera's clock.
+        longest_gap_us: the longest silence between two events.
+        filtered: dropped by the noise filter, if it is on.
+        overflowed: dropped because nobody read; the run ends with an error then.
+        other_triggers: triggers that are no rising edges.
+        before: events thrown away before the run.
+    """
+
+    events: int = 0
+    pulses: int = 0
+    gaps: int = 0
+    longest_gap_us: int = 0
+    filtered: int = 0
+    overflowed: int = 0
+    other_triggers: int = 0
+    before: int = 0
+
+
+class Source(Protocol):
+    """Opened inputs: an `EventSource`, or an `EventProcess` that has one."""
+
+    name: str
+    resolution: tuple[int, int]
+    in_force: Json
+
+    def run(self, on: bool, noise_filter_us: int | None = None) -> None:
+        """Switch events and triggers. Raises RigError."""
+
+    def look(self) -> Look:
+        """Take all that has come."""
+
+    def health(self, settings: DvxplorerSettings) -> DeviceHealth:
+        """What the camera says of itself. Raises RigError."""
+
+    def close(self) -> None:
+        """Give it back; any number of times."""
+
+
+class DvxplorerCamera:
+    """A `rigs.core.capabilities.EventCamera`; it is open from the beginning.
+
+    Args:
+        source: opened inputs; opened as the settings say where None.
+
+    Raises:
+        RigError: nothing there, or nothing that sends events and triggers.
+    """
+
+    def __init__(self, settings: DvxplorerSettings, source: Source | None = None) -> None:
+        self.settings = settings
+        self._source: Source = source if source is not None else EventProcess(settings)
+        self.width, self.height = self._source.resolution
+        self._lock = threading.Lock()
+        self._wanted = self._keep = False
+        self._settled, self._closing = threading.Event(), threading.Event()
+        self._closed = False
+        self._forget()
+        self._thread = threading.Thread(target=self._run, name=DEVICE, daemon=True)
+        self._thread.start()
+
+    def _forget(self) -> None:
+        self._events: list[EventChunk] = []
+        self._pulses: list[int] = []
+        self._held = 0
+        self._last_us: int | None = None
+        self._last_pulse_us: int | None = None
+        self._counts = EventCounts()
+        self._fault: RigError | None = None
+        self._asked_ns = time.monotonic_ns()
+        self._patience = Patience()
+        self._silent_ns = 0
+
+    @property
+    def counts(self) -> EventCounts:
+        """What this run, or the last one, has received so far."""
+        with self._lock:
+            return EventCounts(**asdict(self._counts))
+
+    def describe(self) -> Json:
+        """What a trial's record keeps of the camera."""
+        return {
+            "camera": self._source.name,
+            "resolution_px": [self.width, self.height],
+            "settings": self.settings.model_dump(mode="json"),
+            "in_force": self._source.in_force,
+            "counts": asdict(self.counts),
+        }
+
+    def health(self) -> DeviceHealth:
+        """What it says of itself now, streaming or not.
+
+        Raises:
+            RigError: the camera is gone, or does not answer.
+        """
+        if self._closed:
+            raise RigError(DEVICE, "it is closed; open it again")
+        return self._source.health(self.settings)
+
+    def start(self) -> None:
+        """Begin to stream; what came before is dropped. Returns within `SETTLE_S`.
+
+        Raises:
+            RigError: the camera is gone.
+        """
+        if not self._thread.is_alive():
+            raise self._fault or RigError(DEVICE, "it is closed; open it again")
+        with self._lock:
+            self._forget()
+        self._source.run(True, self.settings.noise_filter_us)
+        self._want(True)
+        with self._lock:
+            self._silent_ns = 0
+            if self._fault is not None:
+                raise self._fault
+
+    def read(self) -> EventChunk:
+        """Events since the last call.
+
+        Raises:
+            RigError: the camera is gone, silent, set back its clock or was not read in time, and
+                all that came before was read.
+        """
+        with self._lock:
+            parts, self._events, self._held = self._events, [], 0
+            if not parts:
+                self._check()
+        if len(parts) == 1:
+            return parts[0]
+        empty = np.empty(0, np.uint16)
+        parts = parts or [EventChunk(empty, empty, np.empty(0, np.uint8), np.empty(0, np.int64))]
+        return EventChunk(
+            np.concatenate([part.x for part in parts]),
+            np.concatenate([part.y for part in parts]),
+            np.concatenate([part.p for part in parts]),
+            np.concatenate([part.t_us for part in parts]),
+        )
+
+    def read_pulses(self) -> PulseChunk:
+        """Sync pulses since the last call, camera clock in ns. Raises RigError like `read`."""
+        with self._lock:
+            pulses, self._pulses = self._pulses, []
+            if not pulses and not self._events:
+                self._check()
+        return PulseChunk(np.array(pulses, np.int64) * 1000)
+
+    def stop(self) -> None:
+        """Stop streaming; what had arrived can still be read. Returns within `SETTLE_S`."""
+        if self._wanted:
+            with suppress(RigError):
+                self._source.run(False)
+            self._want(False)
+
+    def close(self) -> None:
+        """Give the device back; safe at any time and more than once.
+
+        Raises:
+            RigError: the thread does not end within `CLOSE_S`.
+        """
+        if self._closed:
+            return
+        self.stop()
+        self._closing.set()
+        self._thread.join(CLOSE_S)
+        self._source.close()
+        if self._thread.is_alive():
+            raise RigError(DEVICE, f"reading has not ended within {CLOSE_S:g} s")
+        self._closed = True
+
+    def _check(self) -> None:
+        if self._fault is not None:
+            raise self._fault
+        silent_s = self._silent_ns / 1e9
+        hung_s = self._patience.waited_s(self._asked_ns)
+        if self._keep and hung_s > HANG_S:
+            raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
+        if self._keep and silent_s > self.settings.stall_s:
+            raise RigError(
+                DEVICE, f"neither event nor pulse for {silent_s:.1f} s; look at cable and lens"
+            )
+
+    def _want(self, wanted: bool) -> None:
+        """Keep from now on, or no more, once all is taken that has arrived by now."""
+        self._settled.clear()
+        self._wanted = wanted
+        self._settled.wait(SETTLE_S)
+        # a stream that never pauses is cut where it stands
+        with self._lock:
+            self._keep = wanted
+
+    def _run(self) -> None:
+        source = self._source
+        while not self._closing.is_set():
+            try:
+                wanted = self._wanted
+                look = source.look()
+                if look.events is not None:
+                    self._take_events(look.events, look.filtered)
+                if len(look.trigger_us):
+                    self._take_triggers(look)
+                now_ns = time.monotonic_ns()
+                if look.empty:
+                    with self._lock:
+                        self._keep = wanted
+                        # silence is what was listened to: a computer that stood still heard nothing
+                        self._silent_ns += min(now_ns - self._asked_ns, _LOOK_NS)
+                    if wanted == self._wanted:
+                        self._settled.set()
+                    if not look.running:
+                        self._fail("the connection is gone; look at its cable and open it again")
+                        break
+                    self._closing.wait(POLL_S)
+                self._asked_ns = now_ns
+            except Exception as error:
+                why = str(error).removeprefix(f"{DEVICE}: ")
+                self._fail(f"reading failed: {why}; look at what sends, and open it again")
+                break
+        self._settled.set()
+
+    def _fail(self, what: str) -> None:
+        with self._lock:
+            if self._fault is None:
+                self._fault = RigError(DEVICE, what)
+
+    def _take_events(self, chunk: EventChunk, filtered: int) -> None:
+        if not self._keep:
+            with self._lock:
+                self._counts.before += len(chunk) + filtered
+            return
+        with self._lock:
+            counts, self._silent_ns = self._counts, 0
+            counts.filtered += filtered
+            if not len(chunk) or self._fault is not None:
+                counts.overflowed += len(chunk) if counts.overflowed else 0
+                return
+            if (self._held + len(chunk)) * _EVENT_BYTES > self.settings.buffer_mb * 1e6:
+                counts.overflowed += len(chunk)
+                self._fault = RigError(
+                    DEVICE, f"nobody read for so long that {self.settings.buffer_mb:g} MB are full"
+                )
+                return
+            if not self._in_order(chunk.t_us):
+                self._fault = RigError(
+                    DEVICE, f"its clock fell back after {self._last_us} us; begin a new trial"
+                )
+                return
+            self._last_us = int(chunk.t_us[-1])
+            counts.events += len(chunk)
+            self._held += len(chunk)
+            self._events.append(chunk)
+
+    def _in_order(self, t_us: I64) -> bool:
+        """Whether times go on without a step back; silences are counted on the way."""
+        before = t_us[0] if self._last_us is None else self._last_us
+        steps = np.diff(t_us, prepend=before)
+        if int(steps.min()) < 0:
+            return False
+        counts = self._counts
+        counts.gaps += int(np.count_nonzero(steps > self.settings.gap_s * 1e6))
+        counts.longest_gap_us = max(counts.longest_gap_us, int(steps.max()))
+        return True
+
+    def _take_triggers(self, look: Look) -> None:
+        if not self._keep:
+            return
+        with self._lock:
+            self._silent_ns = 0
+            for at, kind in zip(look.trigger_us.tolist(), look.trigger_kind.tolist(), strict=True):
+                if kind == TIMESTAMP_RESET:
+                    self._fault = RigError(DEVICE, f"its clock began anew at {at} us")
+                elif kind != RISING_EDGE:
+                    self._counts.other_triggers += 1
+                elif self._last_pulse_us is not None and at < self._last_pulse_us:
+                    self._fault = RigError(
+                        DEVICE, f"its clock fell back after the pulse at {self._last_pulse_us} us"
+                    )
+                elif self._fault is None:
+                    self._last_pulse_us = at
+                    self._counts.pulses += 1
+                    self._pulses.append(at)

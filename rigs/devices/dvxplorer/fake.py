@@ -1,0 +1,263 @@
+"""A DVXplorer without a camera: a process that serves events and triggers on the network.
+
+It serves dv's two network streams, one port for events and one for triggers, and says at its end
+what it sent, so that both ends can be compared. It is a process of its own because the library's
+reader holds Python's lock while it connects, and a server beside it could not answer.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from sliplab.rigs.devices.dvxplorer.fake_server import DvServer
+from sliplab.rigs.devices.dvxplorer.fake_stream import (
+    events_header,
+    events_packet,
+    triggers_header,
+    triggers_packet,
+)
+from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings, NetworkStream
+from sliplab.rigs.scene.events import EventOptics, MarkerSensor
+from sliplab.storage.streams import I64, EventChunk
+
+Packet = tuple[EventChunk, I64]
+"""Events, and the rising edges that came with them, us of the camera's clock."""
+Source = Callable[[], Iterable[Packet]]
+READY_S = 600.0
+"""The longest that it takes to make all packets, s."""
+CLIENT_S = 30.0
+"""The longest that it waits for its client, and for what is queued to leave, s."""
+_MOST_WAITING = 256
+"""Packets that may wait for the client before the next one is made to wait."""
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What a server has sent."""
+
+    events: int
+    pulses: int
+    packets: int
+    seconds: float
+
+
+class ServerError(RuntimeError):
+    """The serving process failed or did not answer in time."""
+
+
+class DvxplorerServer:
+    """A process that makes packets, and sends them when told to.
+
+    Args:
+        source: makes the packets; it is called in the process, so it must be a module's function
+            or a `functools.partial` of one.
+        realtime: send each packet when its last event is due; else as fast as it goes.
+        stall_after: packets after which it falls silent until `resume`.
+        size: columns and rows that the stream claims.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        realtime: bool = True,
+        stall_after: int | None = None,
+        size: tuple[int, int] = (640, 480),
+    ) -> None:
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, source, realtime, stall_after, size), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        try:
+            self.events_port, self.triggers_port = self._expect("ready", READY_S)
+        except ServerError:
+            self.close()
+            raise
+
+    @property
+    def settings(self) -> DvxplorerSettings:
+        """Settings of a driver that listens to this server."""
+        return DvxplorerSettings(
+            source=NetworkStream(events_port=self.events_port, triggers_port=self.triggers_port)
+        )
+
+    def go(self) -> None:
+        """Send, once both streams have a client."""
+        self._pipe.send("go")
+
+    def await_stall(self, timeout_s: float) -> None:
+        """Return when it has fallen silent as it was asked to. Raises ServerError."""
+        self._expect("stalled", timeout_s)
+
+    def resume(self) -> None:
+        """Go on after a stall."""
+        self._pipe.send("resume")
+
+    @property
+    def answered(self) -> bool:
+        """Whether it has something to say, so that `finish` need not wait."""
+        return self._pipe.poll(0)
+
+    def finish(self, timeout_s: float) -> Sent:
+        """What was sent, once all of it has left. Raises ServerError."""
+        sent: Sent = self._expect("sent", timeout_s)
+        return sent
+
+    def close(self) -> None:
+        """End the process, whatever it does; the streams break."""
+        self._process.kill()
+        self._process.join(CLIENT_S)
+        self._pipe.close()
+
+    def __enter__(self) -> DvxplorerServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _expect(self, wanted: str, timeout_s: float) -> Any:
+        try:
+            if not self._pipe.poll(timeout_s):
+                raise ServerError(f"the server has not said '{wanted}' within {timeout_s:g} s")
+            said, value = self._pipe.recv()
+        except (EOFError, OSError):
+            raise ServerError(f"the server has ended before it said '{wanted}'") from None
+        if said != wanted:
+            raise ServerError(f"the server said '{said}' instead of '{wanted}': {value}")
+        return value
+
+
+def arrays(chunk: EventChunk, pulses_us: I64, packet_us: int) -> Iterator[Packet]:
+    """Packets of `packet_us` from arrays in order of time; pulses go with the events' times.
+
+    A span without events has a packet all the same, for its pulses.
+    """
+    every = np.concatenate([chunk.t_us[[0, -1]] if len(chunk) else [], pulses_us]).astype(np.int64)
+    if not len(every):
+        return
+    edges = np.arange(every.min(), every.max() + packet_us + 1, packet_us)
+    rows, marks = np.searchsorted(chunk.t_us, edges), np.searchsorted(pulses_us, edges)
+    for k in range(len(edges) - 1):
+        part = slice(rows[k], rows[k + 1])
+        events = EventChunk(chunk.x[part], chunk.y[part], chunk.p[part], chunk.t_us[part])
+        yield events, pulses_us[marks[k] : marks[k + 1]]
+
+
+def scene(seconds: float, seed: int = 1) -> Iterator[Packet]:
+    """Packets of seven markers that are pushed to and fro under steady contact; a pulse in 10 ms.
+
+    Simulated: normal force 0.3 N on a tip, tangential 0.1 N once a second.
+    """
+    optics = EventOptics()
+    ring = 5.6 * np.exp(2j * np.pi * np.arange(6) / 6)
+    places = np.concatenate(([0j], ring))
+    sensor = MarkerSensor(optics, np.stack((places.real, places.imag), axis=-1), seed)
+
+    def load(t_ns: I64) -> np.ndarray[Any, np.dtype[np.float64]]:
+        push = 0.1 * np.sin(2 * np.pi * t_ns / 1e9)
+        still = np.zeros_like(push)
+        # per tip: tangential x and y, normal
+        columns = [push, still, np.full_like(push, 0.3)] * len(places)
+        return np.ascontiguousarray(np.stack(columns, axis=-1))
+
+    sensor.reset(load(np.zeros(1, np.int64))[0], seed)
+    for begin in range(0, round(seconds * 1e9), optics.block_ns):
+        t_ns = np.arange(begin, begin + optics.block_ns + 1, 1_000_000)
+        when, x, y, p = sensor.sense(load(t_ns), t_ns)
+        pulses = np.arange(-(-begin // 10**7) * 10**7, begin + optics.block_ns, 10**7) // 1000
+        yield EventChunk(x, y, p, when // 1000), pulses
+
+
+def _serve(
+    pipe: Connection,
+    source: Source,
+    realtime: bool,
+    stall_after: int | None,
+    size: tuple[int, int],
+) -> None:
+    """The process; it never returns."""
+    status = 1
+    try:
+        packets = [_made(*packet) for packet in source()]
+        events = DvServer(events_header(size, "stand-in"))
+        triggers = DvServer(triggers_header("stand-in"))
+        pipe.send(("ready", (events.port, triggers.port)))
+        if pipe.recv() == "go":
+            pipe.send(("sent", _send(pipe, packets, (events, triggers), realtime, stall_after)))
+            pipe.recv()  # ends when the other side closes
+    except (EOFError, ConnectionError):
+        status = 0
+    except Exception as error:
+        with suppress(OSError):
+            pipe.send(("failed", repr(error)))
+    os._exit(status)
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A packet as it goes on the wire, for each of the two streams."""
+
+    on_events: bytes
+    on_triggers: bytes
+    events: int
+    pulses: int
+    end_us: int
+
+
+def _made(chunk: EventChunk, pulses_us: I64) -> _Made:
+    ends = [int(times[-1]) for times in (chunk.t_us, pulses_us) if len(times)]
+    return _Made(
+        events_packet(chunk) if len(chunk) else b"",
+        triggers_packet(pulses_us) if len(pulses_us) else b"",
+        len(chunk),
+        len(pulses_us),
+        max(ends, default=0),
+    )
+
+
+def _send(
+    pipe: Connection,
+    packets: list[_Made],
+    servers: tuple[DvServer, DvServer],
+    realtime: bool,
+    stall_after: int | None,
+) -> Sent:
+    events, triggers = servers
+    for server in servers:
+        if not server.wait_for_client(CLIENT_S):
+            raise TimeoutError(f"no client has come in {CLIENT_S:g} s")
+    began = time.monotonic()
+    first_us = packets[0].end_us if packets else 0
+    sent_events = sent_pulses = 0
+    for number, packet in enumerate(packets):
+        if number == stall_after:
+            pipe.send(("stalled", None))
+            pipe.recv()
+        wait = began + (packet.end_us - first_us) / 1e6 - time.monotonic()
+        # nothing is said meanwhile: this only lets time pass, and notices the other side's end
+        if realtime and wait > 0 and pipe.poll(wait):
+            pipe.recv()
+        if packet.events:
+            events.send(packet.on_events)
+        if packet.pulses:
+            triggers.send(packet.on_triggers)
+        if events.waiting > _MOST_WAITING and not events.drain(CLIENT_S):
+            raise TimeoutError(f"the client has done nothing for {CLIENT_S:g} s")
+        sent_events += packet.events
+        sent_pulses += packet.pulses
+    for server in servers:
+        if not server.drain(CLIENT_S):
+            raise TimeoutError(f"the client has done nothing for {CLIENT_S:g} s")
+    return Sent(sent_events, sent_pulses, len(packets), time.monotonic() - began)

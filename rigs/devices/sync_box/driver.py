@@ -1,0 +1,273 @@
+"""Driver of the sync box: a board with firmware/sync_box.c on a serial port.
+
+Reports are checked against the train that was asked for, and what is missing is counted. Nothing
+is mended in silence once a train runs: a box that begins anew, falls silent or goes away is a
+`SyncBoxFault` at the next call, and the next `start` connects anew.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sliplab.protocols.timing import Code
+from sliplab.rigs.core.capabilities import DeviceHealth, RigError
+from sliplab.rigs.core.pulse_code import SEEDS
+from sliplab.rigs.devices.sync_box.line import LEAST_HZ, MOST_HZ, NAME, whole
+from sliplab.rigs.devices.sync_box.port import DEVICE, SyncBoxFault, SyncPort, began_anew
+from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
+from sliplab.rigs.devices.sync_box.train import Losses, Train
+from sliplab.storage.streams import ClockReads, PulseChunk
+
+MOST_WAITING = 100_000
+"""Pulses or exposures kept for who reads them: 17 minutes at 100 Hz. More are counted, not kept."""
+AHEAD_US = 1_000_000
+"""An exposure further ahead of the host's clock than this, and 2 %, is a garbled line."""
+MOST_EARLY = 1000
+"""Reports kept that come before the answer to `GO`, should that have to be asked for again."""
+
+
+class SerialSyncBox:
+    """A sync box on a serial port; see `rigs.core.capabilities.SyncBox`.
+
+    Opens the port at `connect`, or at the first call that needs it.
+
+    Args:
+        settings: port and time limits.
+        now_ns: the host's monotonic clock.
+    """
+
+    def __init__(
+        self, settings: SyncBoxSettings, now_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._settings, self._now_ns = settings, now_ns
+        self._port: SyncPort | None = None
+        self._running = False
+        self._train: Train | None = None
+        self._early: list[str] = []
+        self._pulses: list[int] = []
+        self._exposures: list[int] = []
+        self._asked_ns = self._heard_ns = self._questions = self._clock_us = 0
+
+    def connect(self) -> None:
+        """Open the port and see that a sync box answers; anew if there was a fault.
+
+        Raises:
+            SyncBoxFault: no such port, or no sync box with this protocol behind it.
+        """
+        if self._port is None or self._port.fault is not None:
+            self._disconnect()
+            self._port = SyncPort(self._settings, self._now_ns, self._take)
+
+    def close(self) -> None:
+        """Stop the ticks if the box still answers, and give the port back; any number of times."""
+        try:
+            self.stop()
+        except SyncBoxFault:
+            pass  # a box that is gone cannot be stopped, and this call is about the port
+        finally:
+            self._disconnect()
+
+    def _disconnect(self) -> None:
+        if self._port is not None:
+            self._port.close()
+        self._port, self._train, self._running, self._clock_us = None, None, False, 0
+
+    def health(self) -> DeviceHealth:
+        """What the box says of itself, and how far its clock has come since it got power.
+
+        Raises:
+            SyncBoxFault: no answer.
+        """
+        clock = self.read_clock()
+        took_us = (int(clock.after_ns[0]) - int(clock.before_ns[0])) / 1000
+        return DeviceHealth(
+            device=DEVICE,
+            model="sync box",
+            serial=self._settings.port,
+            firmware=NAME,
+            temperature_c=None,
+            clock="its own, 1 us",
+            notes=(f"answers in {took_us:.0f} us",),
+        )
+
+    def start(self, rate_hz: float, seed: int, code: Code = "lfsr") -> None:
+        """Begin ticks and code; a train that runs is given up, and what it sent is dropped.
+
+        Args:
+            rate_hz: 1 to 1,000, to a thousandth.
+            seed: 1 to 4,294,967,294.
+            code: see `rigs.core.pulse_code`.
+
+        Raises:
+            RigError: such a train cannot be sent.
+            SyncBoxFault: the box does not answer.
+        """
+        millihertz = round(rate_hz * 1000)
+        if not LEAST_HZ <= rate_hz <= MOST_HZ or abs(millihertz - rate_hz * 1000) > 1e-6:
+            raise RigError(
+                DEVICE, f"rate {rate_hz} Hz: must be {LEAST_HZ:g} to {MOST_HZ:g}, to a thousandth"
+            )
+        if not 1 <= seed <= SEEDS:
+            raise RigError(DEVICE, f"seed {seed}: must lie between 1 and {SEEDS}")
+        self.connect()
+        self.stop()
+        port = self._open()
+        port.ask(f"ARM {millihertz / 1000:.3f} {seed} 0 {code}", "OK ARM")
+        with port.news:
+            # nothing of an older train comes behind the answer to ARM
+            self._train = Train(millihertz, seed, code)
+            self._pulses, self._exposures, self._early = [], [], []
+            port.lines.wrong = 0
+            self._asked_ns = self._now_ns()
+        port.ask("GO", "OK GO ")
+        with port.news:
+            self._heard_ns, self._running = self._now_ns(), True
+
+    def read_pulses(self) -> PulseChunk:
+        """Pulses sent since the last call, box clock, whole microseconds; tick 0 is at 0.
+
+        Raises:
+            SyncBoxFault: the box began anew, went away, or sends no pulses any more.
+        """
+        if self._port is not None:
+            with self._port.news:
+                self._check(self._port)
+                pulses, self._pulses = self._pulses, []
+        else:
+            pulses = []
+        return PulseChunk(np.array(pulses, np.int64) * 1000)
+
+    def read_exposures(self) -> PulseChunk:
+        """Starts of exposures since the last call, box clock, whole microseconds.
+
+        Raises:
+            SyncBoxFault: as `read_pulses`.
+        """
+        if self._port is not None:
+            with self._port.news:
+                self._check(self._port)
+                exposures, self._exposures = self._exposures, []
+        else:
+            exposures = []
+        return PulseChunk(np.array(exposures, np.int64) * 1000)
+
+    def read_clock(self) -> ClockReads:
+        """The box's clock now, whole microseconds: one row.
+
+        The clock is 0 at tick 0 of the last train; before the first one, when the box got power.
+
+        Raises:
+            SyncBoxFault: no answer, or the clock fell back.
+        """
+        port = self._open()
+        with port.news:
+            self._check(port)
+        # a number, for an answer that comes late must not be taken for the next one
+        self._questions += 1
+        found, before_ns, after_ns = port.ask(f"T? {self._questions}", f"T {self._questions} ")
+        us = int(found)
+        with port.news:
+            fell_us, self._clock_us = self._clock_us - us, us
+            if fell_us > 0:
+                port.fail(began_anew(f"its clock fell back by {fell_us / 1e6:.3f} s"))
+                port.check()
+            first_us = self._train.first_us if self._train is not None else None
+        row = ((us - (first_us or 0)) * 1000, before_ns, after_ns)
+        return ClockReads(*(np.array([value], np.int64) for value in row))
+
+    def stop(self) -> None:
+        """Stop the ticks, with the pulse that is being sent; the clock goes on.
+
+        All pulses can be read afterwards: the box answers behind its last report.
+
+        Raises:
+            SyncBoxFault: no answer.
+        """
+        port = self._port
+        if port is None or not self._running:
+            return
+        with port.news:
+            self._running = False
+            if port.fault is not None:
+                return  # the next read says so; nothing can be stopped any more
+        port.ask("STOP", "OK STOP")
+
+    @property
+    def losses(self) -> Losses:
+        """What of the last train did not arrive."""
+        if self._port is None or self._train is None:
+            return Losses()
+        with self._port.news:
+            return replace(self._train.losses, lines=self._port.lines.wrong)
+
+    def _open(self) -> SyncPort:
+        if self._port is None:
+            self.connect()
+        assert self._port is not None
+        return self._port
+
+    def _check(self, port: SyncPort) -> None:
+        """Raise what is wrong; the port's news are held."""
+        if self._running and self._train is not None:
+            quiet_s = (port.read_to_ns - self._heard_ns) / 1e9
+            if quiet_s > self._train.longest_gap_s + self._settings.silence_s:
+                port.fail(
+                    SyncBoxFault(
+                        f"no pulse reported for {quiet_s:.1f} s. It was reset, unplugged or hangs: "
+                        f"check its cable and supply, then start the trial again"
+                    )
+                )
+        port.check()
+
+    # -- in the reading thread, the port's news held -----------------------------------------
+
+    def _take(self, body: str) -> bool:
+        kind, _, rest = body.partition(" ")
+        train = self._train
+        if kind not in {"P", "X", "D"}:
+            if kind == "T":
+                whole(rest.rpartition(" ")[2])  # else it is garbled, and no answer
+            elif train is not None:
+                self._begin_or_end(train, body)
+            return False
+        if train is None:
+            return True
+        numbers = [whole(word) for word in rest.split(" ")]
+        if kind == "D":
+            (train.losses.told_by_box,) = numbers
+        elif train.first_us is None:
+            if len(self._early) < MOST_EARLY:
+                self._early.append(body)
+        elif kind == "P":
+            number, bit, us = numbers
+            since_us = train.tick(number, bit, us)
+            self._heard_ns = self._now_ns()
+            if since_us is not None:
+                self._keep(self._pulses, since_us, train)
+        else:
+            number, us = numbers
+            passed_us = (self._now_ns() - self._asked_ns) // 1000
+            since_us = train.exposure(number, us, passed_us + passed_us // 50 + AHEAD_US)
+            if since_us >= 0:
+                self._keep(self._exposures, since_us, train)
+        return True
+
+    def _begin_or_end(self, train: Train, body: str) -> None:
+        if body.startswith("OK GO ") and train.first_us is None:
+            train.first_us = whole(body.removeprefix("OK GO "))
+            early, self._early = self._early, []
+            for report in early:
+                self._take(report)
+        elif body.startswith("OK STOP "):
+            train.end(whole(body.removeprefix("OK STOP ")))
+
+    @staticmethod
+    def _keep(waiting: list[int], us: int, train: Train) -> None:
+        if len(waiting) < MOST_WAITING:
+            waiting.append(us)
+        else:
+            train.losses.unread += 1

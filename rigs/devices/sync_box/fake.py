@@ -1,0 +1,255 @@
+"""A sync box on a pty: the firmware's protocol in real time, with faults on request.
+
+The driver opens it like a board, so its whole way is tested without one. What its clock shows
+comes from a callable: a simulated scene may drive it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import get_args
+
+from sliplab.protocols.timing import Code
+from sliplab.rigs.core.pulse_code import SEEDS
+from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
+from sliplab.rigs.devices.sync_box.train import Bits
+
+TURN_S = 0.001
+"""How often the stand-in looks what is due."""
+LEAD_US = 2000
+"""From GO to tick 0."""
+JOIN_S = 2.0
+CODES: dict[str, Code] = {code: code for code in get_args(Code)}
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What ARM said: `last` ticks, 0 without end."""
+
+    millihertz: int
+    last: int
+    seed: int
+    code: Code
+
+    @cached_property
+    def bits(self) -> Bits:
+        """The code, tick by tick."""
+        return Bits(self.seed, self.code)
+
+
+@dataclass(frozen=True)
+class Train:
+    """A train of pulses that the box began, as the rest of a simulated scene sees it."""
+
+    first_ns: int
+    """Tick 0 on the clock that drives the box, ns."""
+    rate_hz: float
+    seed: int
+    code: Code
+
+
+class PtySyncBox:
+    """A sync box to open at `port`. A context manager: its thread ends with it.
+
+    Args:
+        now_ns: the box's clock; any origin, it shows 0 when the box gets power or is reset.
+        exposure_us: where the camera's output is wired, exposures begin this long after each
+            tick; None where it is not.
+        on_train: told of every train before its first tick; and with None and the number of ticks
+            sent when it has ended. In the box's thread.
+
+    Attributes:
+        port: name of the pty.
+        pulses: how many pulses (code bits 1) the train that runs, or the last one, has sent.
+    """
+
+    def __init__(
+        self,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        exposure_us: int | None = None,
+        on_train: Callable[[Train | None, int], None] = lambda train, sent: None,
+    ) -> None:
+        self._now_ns, self._exposure_us, self._on_train = now_ns, exposure_us, on_train
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        self._lock = threading.RLock()
+        self._ending = threading.Event()
+        self._silent, self._corrupt, self._drop = False, 0, 0
+        self._train: _Plan | None = None
+        self._sent = self.pulses = 0
+        self._power_on()
+        self._thread = threading.Thread(target=self._work, name="pty sync box", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> PtySyncBox:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the thread and the pty: to the host the board is unplugged, and it ticks no more."""
+        self._ending.set()
+        self._thread.join(JOIN_S)
+        with self._lock:
+            self._end()
+            for handle in (self._master, self._slave):
+                if handle >= 0:
+                    os.close(handle)
+            self._master = self._slave = -1
+
+    # -- faults ----------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Begin anew as after a brown-out: no train, and a clock at 0. Says so, as the board."""
+        with self._lock:
+            self._power_on()
+            self._say(f"B {NAME}")
+
+    def silence(self, silent: bool = True) -> None:
+        """Hang: neither read nor send, until told otherwise."""
+        with self._lock:
+            self._silent = silent
+
+    def corrupt(self, lines: int) -> None:
+        """Garble the next `lines` lines that are sent."""
+        with self._lock:
+            self._corrupt = lines
+
+    def drop(self, reports: int) -> None:
+        """Drop the next `reports` reports as with a full buffer: they are counted, and told."""
+        with self._lock:
+            self._drop = reports
+
+    # -- the box ---------------------------------------------------------------------------
+
+    def _announce(self, plan: _Plan) -> None:
+        first_ns = self._origin_ns + self._first_us * 1000
+        self._on_train(Train(first_ns, plan.millihertz / 1000, plan.seed, plan.code), 0)
+
+    def _end(self) -> None:
+        if self._train is not None:
+            self._train = None
+            self._on_train(None, self._sent)
+
+    def _power_on(self) -> None:
+        self._end()
+        self._origin_ns = self._now_ns()
+        self._lines = LineReader()
+        self._armed: _Plan | None = None
+        self._first_us = self._sent = self._exposed = self._dropped = self._told = 0
+        self._stamps: list[int] = []
+
+    def _us(self) -> int:
+        return (self._now_ns() - self._origin_ns) // 1000
+
+    def _say(self, body: str) -> None:
+        if self._silent:
+            return
+        line = seal(body)
+        if self._corrupt:
+            self._corrupt -= 1
+            line = line[:-3] + b"??\n"
+        try:
+            os.write(self._master, line)
+        except BlockingIOError:
+            self._dropped += 1  # nobody reads: a real line would be gone as well
+
+    def _report(self, body: str) -> None:
+        if self._drop:
+            self._drop -= 1
+            self._dropped += 1
+        else:
+            self._say(body)
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            waits = [] if self._silent else [self._master]
+            ready = select.select(waits, [], [], TURN_S)[0]
+            with self._lock:
+                if self._silent:
+                    continue
+                for body in self._lines.bodies(os.read(self._master, 4096) if ready else b""):
+                    try:
+                        self._obey(body)
+                    except ValueError:
+                        self._say("E unknown")
+                for _ in range(self._lines.wrong):
+                    self._say("E checksum")
+                self._lines.wrong = 0
+                self._tick()
+
+    def _tick(self) -> None:
+        """Send what is due."""
+        now_us = self._us()
+        if self._train is not None:
+            train, first_us = self._train, self._first_us
+            due = (now_us - first_us) * train.millihertz // 1_000_000_000 + 1
+            due = min(due, train.last or due)
+            bits = train.bits.upto(max(due, 0))
+            for number in range(self._sent, due):
+                us = first_us + number * 1_000_000_000 // train.millihertz
+                self.pulses += int(bits[number])
+                if bits[number] or train.millihertz <= ALL_TO_HZ * 1000:
+                    self._report(f"P {number} {bits[number]} {us}")
+                if self._exposure_us is not None:
+                    self._stamps.append(us + self._exposure_us)
+            self._sent = max(self._sent, due)
+            if train.last and self._sent == train.last:
+                self._end()
+        while self._stamps and self._stamps[0] <= now_us:
+            self._report(f"X {self._exposed} {self._stamps.pop(0)}")
+            self._exposed += 1
+        if self._dropped != self._told:
+            self._told = self._dropped
+            self._say(f"D {self._dropped}")
+
+    def _obey(self, body: str) -> None:
+        command, _, rest = body.partition(" ")
+        if body == "ID?":
+            self._say(f"ID {NAME}")
+        elif command == "T?" and rest.isdecimal():
+            self._say(f"T {rest} {self._us()}")
+        elif command == "ARM":
+            self._arm(rest.split(" "))
+        elif body == "GO":
+            if self._armed is not None:
+                self._train, self._armed = self._armed, None
+                self._first_us = self._us() + LEAD_US
+                self._announce(self._train)
+            if self._train is None:
+                self._say("E not armed")
+            else:
+                self._say(f"OK GO {self._first_us}")
+        elif body == "STOP":
+            self._tick()
+            self._end()
+            self._armed = None
+            self._say(f"OK STOP {self._sent}")
+        else:
+            self._say("E unknown")
+
+    def _arm(self, words: list[str]) -> None:
+        hz, seed, ticks, code = words
+        if self._train is not None:
+            self._say("E running")
+        elif not LEAST_HZ <= float(hz) <= MOST_HZ:
+            self._say("E rate must be 1 to 1000 Hz")
+        elif not 1 <= int(seed) <= SEEDS:
+            self._say(f"E seed must be 1 to {SEEDS}")
+        elif code not in CODES:
+            self._say("E code must be lfsr, irregular or regular")
+        else:
+            self._armed = _Plan(round(float(hz) * 1000), int(ticks), int(seed), CODES[code])
+            self._sent = self._exposed = self._dropped = self._told = self.pulses = 0
+            self._stamps = []
+            self._say("OK ARM")

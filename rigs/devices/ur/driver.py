@@ -1,0 +1,578 @@
+"""Driver of Universal Robots e-Series arms (PolyScope 5.6 and later 5.x, remote control on).
+
+Three ways lead to the controller and the driver keeps them apart, so that losing one leaves two:
+the pose stream (`rigs.devices.ur.rtde`), the control client ur_rtde in a process of its own
+(`rigs.devices.ur.control`), and the two text ports (`rigs.devices.ur.ports`). No wait is without a
+bound; the bounds are the constants below, and `docs/arms.md` has them measured.
+
+A segment is one `movel`, from rest to rest. Its start and end are the first controller cycles in
+which the control script says that the move runs, and that it has ended (bit 15 of
+output_int_register_2), so they are known to one cycle (2 ms at 500 Hz).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from sliplab.rigs.core.capabilities import (
+    ArmFault,
+    ArmState,
+    DeviceHealth,
+    Pose,
+    Progress,
+    RigError,
+    Segment,
+)
+from sliplab.rigs.core.guard import Guard
+from sliplab.rigs.core.path_progress import Run
+from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
+from sliplab.rigs.core.pose_stream import PoseStream, Sample
+from sliplab.rigs.devices.ur import ports as ur_ports
+from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
+from sliplab.rigs.devices.ur.ports import ur_health
+from sliplab.rigs.devices.ur.rtde import Packet, RtdeError, RtdeReader
+from sliplab.rigs.devices.ur.settings import UrSettings
+from sliplab.rigs.devices.ur.status import OUTPUTS, UrStatus, status_of
+from sliplab.storage.streams import Json, PoseChunk, PulseChunk
+
+ANSWER_S = 3.0
+"""Connecting the pose stream, with every answer of its set-up, s."""
+SILENCE_S = 1.0
+"""A pose stream silent for this long is lost, s."""
+COMMAND_S = 2.0
+"""One call of the control client: the controller takes a command within a few cycles, s."""
+PORT_S = 1.0
+"""One request on a text port, s."""
+BEGIN_S = 1.0
+"""From a move being taken to the controller saying that it runs, s."""
+OVERTIME_S = 3.0
+"""How much longer than half as long again a move may take before it is stopped, s."""
+STILL_S = 1.0
+"""From a stop being asked for to the arm standing still, for each way of asking, s."""
+STOP_DECELERATION_MM_S2 = 1000.0
+"""How hard a stop brakes."""
+ARRIVED_MM = 0.1
+"""A move that ends further than this from its target was stopped by somebody."""
+STILL_MM_S = 0.01
+"""Below this commanded speed the arm stands still."""
+JUMP_S = 1.0
+"""A controller clock that moves on by more than this from one packet to the next has jumped, s."""
+_NEWS_S = 0.1
+"""How long a packet with news of the state may be on its way, s."""
+_UNKNOWN_NS = 1 << 62
+"""A move is being handed over: nobody knows yet when the controller took it."""
+_FULL_SPEED = 0.999
+"""The speed slider is up when it stands at least here."""
+
+
+class UrArm:
+    """A Universal Robots arm; an `Arm` of `rigs.core.capabilities`."""
+
+    def __init__(self, settings: UrSettings) -> None:
+        self._settings = settings
+        self._guard = Guard(settings.limits)
+        self._stream = PoseStream()
+        self._reader: RtdeReader | None = None
+        self._control: ControlProcess | None = None
+        self._listener: threading.Thread | None = None
+        self._status: UrStatus | None = None
+        self._lost: str | None = "not connected"
+        self._remote = True
+        self._closing = False
+        self._run = Run((), done=True)
+        self._moved_ns: int | None = None
+        """Host's time when the last move was handed over; None once the arm was seen at rest."""
+        self._missing = 0
+        self._rose_ns: int | None = None
+        self._fell_ns: int | None = None
+        self._starting = threading.Lock()
+        self._commanding = threading.Lock()
+        """Held while a move or a stop is handed over: no move may follow the stop that ends it."""
+
+    def connect(self) -> None:
+        """Open the pose stream, take control, set tool, payload and watchdog.
+
+        Takes at most `ANSWER_S` + 3 `SILENCE_S` + 3 `PORT_S` + 2 `STILL_S` +
+        `ur_control.START_S` + 3 `COMMAND_S`.
+
+        Raises:
+            ArmFault: no connection, somebody else has control, or the arm may not move now.
+        """
+        if self._lost is None and self._control is not None:
+            return
+        try:
+            self._open_stream()
+            self._check_remote()
+            self._check_free()
+            self._take_control()
+        except BaseException:
+            self.close()
+            raise
+
+    def recover(self) -> None:
+        """Take control again after a person has put right what stopped the arm.
+
+        Whatever program is left on the controller is ended first, so that no interrupted move
+        can go on. Takes as long as `connect`. Never unlocks anything.
+
+        Raises:
+            ArmFault: the arm is still in a protective or emergency stop, or not in remote
+                control, or not reachable: a person must go there.
+        """
+        if self._lost is None and self.state() in {
+            ArmState.PROTECTIVE_STOP,
+            ArmState.EMERGENCY_STOP,
+        }:
+            raise self._fault(self.state(), "cannot recover")
+        self.close()
+        with contextlib.suppress(ur_ports.PortError):
+            ur_ports.dashboard(self._settings.host, "stop", PORT_S)
+        self.connect()
+
+    def state(self) -> ArmState:
+        """The arm's state as its last packet says; never waits."""
+        if self._lost is not None or self._status is None:
+            return ArmState.DISCONNECTED
+        if self._status.stopped is not None:
+            return self._status.stopped
+        if not self._remote:
+            return ArmState.REMOTE_CONTROL_OFF
+        if not self._status.running:
+            return ArmState.NOT_RUNNING
+        return ArmState.READY if self._run.done else ArmState.MOVING
+
+    def pose(self) -> Pose:
+        """Where the tool centre point was in the last packet. Raises ArmFault without one."""
+        return self._last().pose
+
+    def now_ns(self) -> int:
+        """The controller's clock in the last packet, ns. Raises ArmFault without one."""
+        return self._last().t_ns
+
+    def health(self) -> DeviceHealth:
+        """What the controller says of itself; takes at most 8 s.
+
+        Raises:
+            ArmFault: it does not answer.
+        """
+        notes = (f"sync line on digital input {self._settings.sync_input}",)
+        try:
+            return ur_health(self._settings.host, notes)
+        except ur_ports.PortError as error:
+            raise ArmFault("arm", f"{error}; check its power and network") from None
+
+    def describe(self) -> Json:
+        """Poses that the controller did not send since connecting, by the gaps in its clock."""
+        return {"poses_missing": self._missing}
+
+    def start(self, path: Sequence[Segment]) -> None:
+        """Begin to follow `path`: checked against all limits, first move taken by the controller.
+
+        Takes at most `PORT_S` + `BEGIN_S` + (1 + segments) `COMMAND_S`, and 2 `PORT_S` on a fault.
+
+        Raises:
+            GuardError: a limit forbids the path; nothing was sent.
+            ArmFault: the arm cannot move.
+            RigError: it is still moving, or the path is empty.
+        """
+        with self._starting:
+            if not path:
+                raise RigError("arm", "was given an empty path")
+            self._check_remote()
+            state = self.state()
+            if state is ArmState.MOVING:
+                raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+            if state is not ArmState.READY:
+                raise self._fault(state, "cannot move")
+            self._check(path)
+            run = Run(path)
+            self._run = run
+            try:
+                self._send(run, path[0])
+            except ArmFault:
+                run.done = True
+                raise
+            run.thread = threading.Thread(target=self._follow, args=(run,), daemon=True)
+            run.thread.start()
+
+    def progress(self) -> Progress:
+        """How far the path has come.
+
+        Raises:
+            ArmFault: the path was given up for a reason that `state` does not tell.
+        """
+        return self._run.progress(self.state())
+
+    def read_poses(self) -> PoseChunk:
+        """Poses since the last call, one a packet."""
+        return self._stream.read()
+
+    def read_pulses(self) -> PulseChunk:
+        """Rising edges of the sync input since the last call, known to one packet."""
+        return self._stream.read_pulses()
+
+    def stop(self) -> None:
+        """Stop the arm by every way that is left; never unlocks anything.
+
+        Takes at most 2 `COMMAND_S` + 4 `PORT_S` + 3 `STILL_S`.
+
+        Raises:
+            ArmFault: a move was handed over, and the arm could not be seen to stand still since,
+                neither in its stream nor on a new connection. Its own watchdog ends the move after
+                1 / `ur_control.WATCHDOG_HZ` s if the network is gone.
+        """
+        run = self._run
+        run.cancelled = True
+        self._stream.wake()
+        resting = self._status is None or self._is_still()
+        if run.done and resting and self._moved_ns is None:
+            return
+        if not (self._ask_control_to_stop() and self._wait_still()):
+            reached = self._end_program()
+            if not (self._wait_still() if self._lost is None else self._is_still_anew()):
+                if self._lost is None:
+                    raise ArmFault("arm", "does not stop: press its emergency stop")
+                if reached:
+                    raise ArmFault(
+                        "arm",
+                        f"took a stop and cannot be seen to stand still ({self._lost}): look at "
+                        "the arm before you go near it",
+                    )
+                raise ArmFault(
+                    "arm",
+                    f"cannot be reached to be stopped ({self._lost}); its own watchdog ends a "
+                    f"move after {1 / WATCHDOG_HZ:g} s: look at the arm before you go near it",
+                )
+        self._moved_ns = None
+        if run.thread is not None and run.thread is not threading.current_thread():
+            run.thread.join(STILL_S)
+        run.done = True
+
+    def close(self) -> None:
+        """Stop, end the control program and give every connection back.
+
+        Raises nothing: `stop` before it, or after it, says whether the arm stands still.
+        """
+        self._closing = True
+        control, self._control = self._control, None
+        if control is not None:
+            if self._lost is not None:
+                if self._moved_ns is not None:
+                    self._end_program()
+            else:
+                try:
+                    control.call("stopL", STOP_DECELERATION_MM_S2 / MM_PER_M, True, within_s=PORT_S)
+                    control.call("stopScript", within_s=PORT_S)
+                except ControlError:
+                    self._end_program()
+            control.close()
+        self._run.cancelled = True
+        self._lost = self._lost or "closed"
+        if self._reader is not None:
+            self._reader.close()
+        self._stream.wake()
+        for thread in (self._listener, self._run.thread):
+            if thread is not None:
+                thread.join(SILENCE_S + STILL_S)
+        self._reader = self._listener = None
+        self._run.done = True
+
+    def _open_stream(self) -> None:
+        reader = RtdeReader(self._settings.host, ANSWER_S, SILENCE_S)
+        try:
+            reader.open(OUTPUTS, self._settings.frequency_hz)
+        except RtdeError as error:
+            raise ArmFault(
+                "arm", f"{error}; check its power, its network and its address"
+            ) from None
+        self._reader, self._status, self._lost, self._closing = reader, None, None, False
+        self._missing = 0
+        self._listener = threading.Thread(target=self._listen, args=(reader,), daemon=True)
+        self._listener.start()
+        first = self._stream.wait_for(lambda: bool(self._status or self._lost), SILENCE_S + 0.5)
+        if not first or self._lost is not None:
+            raise ArmFault("arm", f"no pose came: {self._lost}")
+
+    def _check_free(self) -> None:
+        """The arm stands still, may move, and nobody's program is on it.
+
+        Raises:
+            ArmFault: not so. The control client would end a program, even a paused one, and
+                would wait in vain for an arm without power.
+        """
+
+        def ending() -> bool:  # a program that was just told to end takes a cycle or two
+            return self._status is not None and self._status.program
+
+        state = self.state()
+        if state not in {ArmState.READY, ArmState.NOT_RUNNING}:
+            raise self._fault(state, "cannot connect")
+        self._stream.wait_for(lambda: not ending(), _NEWS_S)
+        status = self._status
+        assert status is not None
+        if status.program:
+            what = (
+                "runs somebody's program" if status.playing else "holds somebody's paused program"
+            )
+            raise ArmFault("arm", f"{what}; end it at the pendant first")
+        if status.off:
+            raise ArmFault("arm", f"is not switched on ({status.off}); {self.state().advice}")
+        if not self._stream.wait_for(self._is_still, STILL_S):
+            raise ArmFault("arm", "moves though no program runs on it; look at the arm")
+        self._moved_ns = None
+
+    def _take_control(self) -> None:
+        settings, tool = self._settings, self._settings.tool
+        try:
+            self._control = ControlProcess(settings.host, settings.frequency_hz)
+        except ControlError as error:
+            if "already in use" in str(error):
+                raise ArmFault(
+                    "arm",
+                    "another program has control of it, or a fieldbus holds its registers; end "
+                    f"that program first, or switch the fieldbus off. Its client says: {error}",
+                ) from None
+            self._end_program()  # its script may have come through
+            raise ArmFault("arm", f"gave no control: {error}") from None
+        tcp = to_ur(Pose(tool.tcp_mm, tool.tcp_rotvec_deg))
+        centre = [value / MM_PER_M for value in tool.centre_of_mass_mm]
+        self._call("setTcp", tcp)
+        self._call("setPayload", tool.mass_kg, centre)
+        self._call("setWatchdog", WATCHDOG_HZ)
+        self._stream.wait_for(lambda: self.state() is ArmState.READY, SILENCE_S)
+        if self.state() is not ArmState.READY:
+            raise self._fault(self.state(), "cannot connect")
+
+    def _listen(self, reader: RtdeReader) -> None:
+        """The reader's thread: every packet, until the stream ends or cannot be believed."""
+        try:
+            while not self._closing:
+                for packet in reader.read():
+                    self._take(packet)
+        except Exception as error:  # a thread that dies must not look like an arm that stands
+            if self._closing:
+                return
+            self._lost = str(error) if isinstance(error, RtdeError) else f"its stream: {error!r}"
+            if self._control is not None:
+                self._control.kill()  # or it would connect again and send the move again
+            self._stream.wake()
+
+    def _take(self, packet: Packet) -> None:
+        status = status_of(packet.values, self._settings.sync_input)
+        before = self._status
+        if before is not None and not 0 <= status.t_ns - before.t_ns <= JUMP_S * 1e9:
+            seconds = (status.t_ns - before.t_ns) / 1e9
+            how = f"fell back by {-seconds:.3f} s" if seconds < 0 else f"jumped by {seconds:.3f} s"
+            raise RtdeError(f"its clock {how}: it began anew, or its packets are not its own")
+        if before is not None:
+            cycles = (status.t_ns - before.t_ns) * self._settings.frequency_hz / 1e9
+            self._missing += max(round(cycles) - 1, 0)
+        if before is not None and status.move_runs != before.move_runs:
+            if status.move_runs:
+                self._rose_ns, self._fell_ns = status.t_ns, None
+            else:
+                self._fell_ns = status.t_ns
+        self._status = status
+        moved_ns = self._moved_ns
+        if moved_ns is not None and packet.host_ns > moved_ns + _NEWS_S * 1e9 and _rests(status):
+            self._rested(moved_ns)
+        x, y, z, a, b, c = packet.values[1:7]
+        xyz_mm = (x * MM_PER_M, y * MM_PER_M, z * MM_PER_M)
+        rotvec_deg = (math.degrees(a), math.degrees(b), math.degrees(c))
+        self._stream.add(Sample(status.t_ns, packet.host_ns, xyz_mm, rotvec_deg, status.sync))
+
+    def _rested(self, moved_ns: int) -> None:
+        """The arm was seen at rest after the move of `moved_ns`, if that is still the last one."""
+        if self._commanding.acquire(blocking=False):  # held: another move is being handed over
+            try:
+                if self._moved_ns == moved_ns:
+                    self._moved_ns = None
+            finally:
+                self._commanding.release()
+
+    def _check(self, path: Sequence[Segment]) -> None:
+        """Every limit known here, then the controller's own."""
+        assert self._status is not None
+        self._guard.check(self.pose(), path)
+        self._guard.check_joints(self._status.joints_deg)
+        self._check_slider("every move would be too slow")
+        for segment in path:
+            if not self._call("isPoseWithinSafetyLimits", to_ur(segment.to)):
+                # The client says no as well when the program has ended under it.
+                if self._stream.wait_for(lambda: self.state() is not ArmState.READY, _NEWS_S):
+                    raise self._fault(self.state(), "cannot move")
+                x, y, z = segment.to.xyz_mm
+                raise RigError(
+                    "arm",
+                    f"its controller holds ({x:.1f}, {y:.1f}, {z:.1f}) mm to be outside its "
+                    "safety limits or its reach",
+                )
+
+    def _check_slider(self, so: str) -> None:
+        """Raises ArmFault, which ends with `so`, if the pendant slows the arm down."""
+        status = self._status
+        if status is not None and status.speed_fraction < _FULL_SPEED:
+            raise ArmFault(
+                "arm",
+                f"its speed slider stands at {status.speed_fraction:.0%}, so {so}: set it to "
+                "100 % at the pendant",
+            )
+
+    def _send(self, run: Run, segment: Segment) -> bool:
+        """Hand one move to the controller; False if a stop came first.
+
+        Raises:
+            ArmFault: it was not taken.
+        """
+        self._stream.wait_for(lambda: not self._moves(), BEGIN_S)
+        speed = segment.speed_mm_s / MM_PER_M
+        acceleration = self._settings.acceleration_mm_s2 / MM_PER_M
+        with self._commanding:
+            if run.cancelled:
+                return False
+            self._rose_ns = self._fell_ns = None
+            self._moved_ns = _UNKNOWN_NS
+            taken = self._call("moveL", to_ur(segment.to), speed, acceleration, True)
+            self._moved_ns = time.monotonic_ns()
+        if not taken:
+            raise self._fault(self.state(), "did not take a move")
+        return True
+
+    def _follow(self, run: Run) -> None:
+        """A path's thread: wait for each segment to end, hand over the next one."""
+        try:
+            for index, segment in enumerate(run.path):
+                if index and not self._send(run, segment):
+                    break
+                times = self._await_segment(run, segment)
+                if times is None:
+                    break
+                run.finished.append(times)
+        except Exception as error:  # a thread that dies must not look like a stop from outside
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
+            if not (self._ask_control_to_stop() and self._wait_still()):
+                self._end_program()
+        finally:
+            run.done = True
+            self._stream.wake()
+
+    def _await_segment(self, run: Run, segment: Segment) -> tuple[int, int] | None:
+        """Start and end of the move that was just sent; None if it was stopped."""
+
+        def slowed() -> bool:
+            return self._status is not None and self._status.speed_fraction < _FULL_SPEED
+
+        def ended() -> bool:
+            over = self._fell_ns is not None or run.cancelled or not self.state().healthy
+            return over or slowed()
+
+        begun = self._stream.wait_for(lambda: self._rose_ns is not None or ended(), BEGIN_S)
+        if not begun and not self._is_at(segment.to):
+            raise ArmFault("arm", f"took a move and did not begin it within {BEGIN_S:g} s")
+        if not begun:  # a way of no length is over before a packet could say that it runs
+            now = self.now_ns()
+            return now, now
+        seconds = distance_mm(self.pose(), segment.to) / segment.speed_mm_s
+        if not self._stream.wait_for(ended, 1.5 * seconds + OVERTIME_S):
+            raise ArmFault("arm", f"did not end a move of {seconds:.1f} s in time; it was stopped")
+        if not self.state().healthy:
+            self._end_program()  # so that nothing goes on when a person unlocks the stop
+            return None
+        if not run.cancelled:
+            self._check_slider("the move was too slow and was given up")
+        if run.cancelled or self._rose_ns is None or self._fell_ns is None:
+            return None
+        return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
+
+    def _ask_control_to_stop(self) -> bool:
+        """Whether the control client took a stop, behind any move that was on its way to it."""
+        if self._control is None or self._lost is not None:
+            return False
+        if not self._commanding.acquire(timeout=COMMAND_S):
+            return False
+        deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
+        try:
+            self._control.call("stopL", deceleration, True, within_s=COMMAND_S)
+        except ControlError:
+            return False
+        finally:
+            self._commanding.release()
+        return True
+
+    def _end_program(self) -> bool:
+        """End the controller's program by the text ports; whether it said that it did."""
+        deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
+        return ur_ports.end_program(self._settings.host, deceleration, PORT_S)
+
+    def _wait_still(self) -> bool:
+        """Whether a packet that was read from now on shows the arm at rest, in time."""
+        now_ns = time.monotonic_ns()
+
+        def still() -> bool:
+            last = self._stream.last
+            return last is not None and last.host_ns > now_ns and self._is_still()
+
+        return self._stream.wait_for(still, STILL_S)
+
+    def _is_still(self) -> bool:
+        return self._status is not None and _rests(self._status)
+
+    def _is_still_anew(self) -> bool:
+        """Whether a connection made for this question alone shows the arm at rest, in time."""
+        reader = RtdeReader(self._settings.host, PORT_S, PORT_S)
+        end = time.monotonic() + PORT_S + STILL_S
+        with contextlib.suppress(RtdeError):
+            try:
+                reader.open(OUTPUTS, self._settings.frequency_hz)
+                while time.monotonic() < end:
+                    newest = reader.read()[-1]
+                    if _rests(status_of(newest.values, self._settings.sync_input)):
+                        return True
+            finally:
+                reader.close()
+        return False
+
+    def _moves(self) -> bool:
+        return self._status is not None and self._status.move_runs
+
+    def _is_at(self, pose: Pose) -> bool:
+        return distance_mm(self.pose(), pose) <= ARRIVED_MM
+
+    def _check_remote(self) -> None:
+        try:
+            answer = ur_ports.dashboard(self._settings.host, "is in remote control", PORT_S)
+        except ur_ports.PortError as error:
+            raise ArmFault("arm", f"does not answer: {error}") from None
+        self._remote = answer.strip().lower() == "true"
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        if self._control is None:
+            raise self._fault(ArmState.DISCONNECTED, "cannot move")
+        try:
+            return self._control.call(name, *arguments, within_s=COMMAND_S)
+        except ControlError as error:
+            self._end_program()
+            stopped = self._lost is None and self._wait_still()
+            how = "it was stopped" if stopped else "it cannot be seen to stand still"
+            raise ArmFault("arm", f"lost its control client; {how}: {error}") from None
+
+    def _last(self) -> Sample:
+        last = self._stream.last
+        if last is None:
+            raise self._fault(ArmState.DISCONNECTED, "has no pose")
+        return last
+
+    def _fault(self, state: ArmState, what: str) -> ArmFault:
+        reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
+        return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")
+
+
+def _rests(status: UrStatus) -> bool:
+    """Whether a packet says that the arm is at rest; a program that was ended clears nothing."""
+    return status.speed_mm_s < STILL_MM_S and not (status.move_runs and status.running)

@@ -1,0 +1,301 @@
+"""A stand-in for a Universal Robots e-Series controller on its three ports.
+
+30004 RTDE, 29999 dashboard, 30003 scripts; the ports are fixed by the clients, so every robot has
+a loopback address of its own (127.0.0.2, .3, ...). ur_rtde 1.6.5's control, receive and dashboard
+clients take it for a PolyScope 5.11 (tested). Its clock may run faster than the host's.
+
+As a process of its own: ``python -m sliplab.rigs.devices.ur.fake 127.0.0.2``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.fake_faults import PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.core.fake_loop import Connections, LoopThread
+from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
+from sliplab.rigs.devices.ur.fake_program import Safety, UrProgram
+from sliplab.rigs.devices.ur.fake_rtde import Client, send
+from sliplab.rigs.devices.ur.rtde import (
+    DATA,
+    GET_VERSION,
+    HEADER,
+    PAUSE,
+    REQUEST_PROTOCOL_VERSION,
+    SETUP_INPUTS,
+    SETUP_OUTPUTS,
+    START,
+)
+from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
+
+DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
+VERSION = (5, 11, 1, 108318)
+"""PolyScope version that it says it is."""
+HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
+JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
+_TICK_S = 0.001
+_STALL_S = 0.02
+"""A stand-in that was kept from running this long must not blame its client for it."""
+
+
+class UrStandIn:
+    """One stand-in robot; `start` opens its ports, `close` gives them back.
+
+    Args:
+        host: loopback address of its own.
+        motion: where the tool centre point is; a straight-line motion from `HOME` if left out.
+        rate: controller seconds a host second.
+        cycle_hz: controller cycles a controller second; 500 on the real one.
+        digital_inputs: levels of the digital inputs by controller time in seconds.
+        faults: what will go wrong.
+        reach_mm: poses further from the base are outside its safety limits.
+        joints_deg: what `actual_q` says.
+        clock: the controller's; one of its own, at `rate`, if left out.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        motion: Motion | None = None,
+        rate: float = 1.0,
+        cycle_hz: int = 500,
+        digital_inputs: Callable[[float], int] = lambda t_s: 0,
+        faults: Sequence[Fault] = (),
+        reach_mm: float = 850.0,
+        joints_deg: Sequence[float] = JOINTS_DEG,
+        clock: CycleClock | None = None,
+    ) -> None:
+        self.host, self._cycle_hz = host, cycle_hz
+        self.motion = motion or StraightMotion(HOME)
+        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        self.program = UrProgram(
+            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate
+        )
+        self.program.faults = list(faults)
+        self._cycle = int(self.clock.now_s() * cycle_hz)
+        self._clients: list[Client] = []
+        self._connections = Connections()
+        self._silent = self._cut_off = False
+        self._unsent = 0
+        self._thread: LoopThread | None = None
+
+    def __enter__(self) -> UrStandIn:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Open the ports and run. Raises OSError if one of them is taken."""
+        self._thread = LoopThread(f"stand-in {self.host}")
+        try:
+            self._thread.call(self._listen)
+        except OSError:
+            self._thread.close()
+            raise
+        self._thread.call(self._tick)
+
+    def close(self) -> None:
+        """Cut every connection and give the ports back."""
+        if self._thread is not None:
+            self._thread.call(self._connections.cut)
+            self._thread.close()
+            self._thread = None
+
+    def happen(self, kind: Kind) -> None:
+        """Make something go wrong now."""
+        self._inside(lambda: self.program.happen(kind))
+
+    def will(self, fault: Fault) -> None:
+        """Make something go wrong when its stage comes."""
+        self._inside(lambda: self.program.faults.append(fault))
+
+    def restore_link(self) -> None:
+        """Take connections again after the link was cut or went silent."""
+        assert self._thread is not None
+        self._thread.call(self._connections.cut)
+        self._silent = self._cut_off = False
+        self._thread.call(self._listen)
+
+    def restore(self) -> None:
+        """A person has put everything right: power, safety, remote control and link."""
+        self._inside(lambda: setattr(self.program, "powered", True))
+        self.unlock()
+        self.set_remote(True)
+        if self._silent or self._cut_off:
+            self.restore_link()
+
+    def set_remote(self, on: bool) -> None:
+        """A person turns remote control on (or off, without ending the program)."""
+        self._inside(lambda: setattr(self.program, "remote", on))
+
+    def set_slider(self, fraction: float) -> None:
+        """A person moves the pendant's speed slider to `fraction`, above 0 and up to 1."""
+        self._inside(lambda: setattr(self.program, "speed_fraction", fraction))
+
+    def hang_program(self, hung: bool) -> None:
+        """The control program says that it runs, and takes no command any more."""
+        self._inside(lambda: setattr(self.program, "hung", hung))
+
+    def unlock(self) -> None:
+        """A person unlocks a protective stop, or releases an emergency or safeguard stop."""
+        self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))
+
+    def pose(self) -> Pose:
+        """Where the tool centre point is now."""
+        return self.motion.pose(self.clock.now_s())
+
+    def moving(self) -> bool:
+        """Whether it is on its way now."""
+        return self.motion.moving(self.clock.now_s())
+
+    def _inside(self, function: Callable[[], None]) -> None:
+        assert self._thread is not None
+        self._thread.call(function)
+
+    def _cut(self, kind: Kind) -> None:
+        if kind is Kind.SILENCE:
+            self._silent = True
+        elif kind is Kind.PACKETS_LOST:
+            self._unsent += PACKETS_LOST
+        elif kind is Kind.LINK_CUT:
+            self._cut_off = True
+            self._connections.cut()
+        else:
+            raise ValueError(f"{kind.value} is not simulated by this stand-in")
+
+    def _listen(self) -> None:
+        for port, talk in (
+            (RTDE_PORT, self._rtde),
+            (DASHBOARD_PORT, self._dashboard),
+            (SCRIPT_PORT, self._script),
+        ):
+            self._connections.listen(self.host, port, talk)
+
+    async def _may_answer(self) -> None:
+        """Returns at once, or never while the controller is silent."""
+        if self._silent:
+            await asyncio.get_running_loop().create_future()
+
+    def _tick(self) -> None:
+        """Every controller cycle that is due, each with its own packets."""
+        asyncio.get_running_loop().call_later(_TICK_S, self._tick)
+        due = int(self.clock.now_s() * self._cycle_hz)
+        late_s = (due - self._cycle) / self._cycle_hz
+        if late_s > _STALL_S * self.clock.rate:
+            self.program.forgive(late_s)
+        while self._cycle < due:
+            self._cycle += 1
+            t_s = self._cycle / self._cycle_hz
+            self.program.cycle(t_s)
+            if self._silent or self._unsent:
+                self._unsent = max(self._unsent - 1, 0)
+                continue
+            for client in self._clients:
+                if client.streaming and self._cycle % client.every == 0:
+                    send(client.writer, DATA, client.packet(self.program, t_s))
+
+    async def _rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        client = Client(writer)
+        self._clients.append(client)
+        try:
+            while True:
+                size, command = HEADER.unpack(await reader.readexactly(HEADER.size))
+                body = await reader.readexactly(size - HEADER.size)
+                self.program.reach(Stage.CONNECTING)
+                if command == SETUP_INPUTS:
+                    self.program.reach(Stage.CONTROL)
+                await self._may_answer()
+                if command == DATA:
+                    client.take(self.program, body)
+                else:
+                    send(writer, command, self._answer(client, command, body))
+        finally:
+            self._clients.remove(client)
+
+    def _answer(self, client: Client, command: int, body: bytes) -> bytes:
+        if command == REQUEST_PROTOCOL_VERSION:
+            return b"\x01" if body == b"\x00\x02" else b"\x00"
+        if command == GET_VERSION:
+            return struct.pack(">4I", *VERSION)
+        if command == SETUP_OUTPUTS:
+            return client.ask_outputs(body, self._cycle_hz)
+        if command == SETUP_INPUTS:
+            others = [other for other in self._clients if other is not client]
+            return client.ask_inputs(body, others)
+        if command in {START, PAUSE}:
+            client.streaming = command == START
+            return b"\x01"
+        raise ConnectionError(f"RTDE command {command} is not simulated")  # ends the connection
+
+    async def _dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await self._may_answer()
+        writer.write(b"Connected: Universal Robots Dashboard Server\n")
+        while line := await reader.readline():
+            await self._may_answer()
+            writer.write((self._dashboard_answer(line.decode().strip()) + "\n").encode())
+
+    def _dashboard_answer(self, request: str) -> str:
+        program = self.program
+        if request == "stop":
+            if not program.remote:
+                return "Failed to execute: stop"
+            program.end_program()
+            return "Stopped"
+        if request == "unlock protective stop":
+            return (
+                "Protective stop releasing" if program.unlock() else f"Failed to execute: {request}"
+            )
+        if request in {"play", "pause", "power on", "power off", "brake release", "shutdown"}:
+            return f"Failed to execute: {request}"  # known there, and not simulated here
+        answers = {
+            "get robot model": "UR5",
+            "get serial number": "20205500000",
+            "PolyscopeVersion": "URSoftware " + ".".join(map(str, VERSION)) + " (Jan 01 2021)",
+            "is in remote control": str(program.remote).lower(),
+            "running": f"Program running: {str(program.program_running).lower()}",
+            "robotmode": f"Robotmode: {'RUNNING' if program.powered else 'POWER_OFF'}",
+            "safetystatus": f"Safetystatus: {program.safety.name}",
+        }
+        return answers.get(request, f'could not understand: "{request}"')
+
+    async def _script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        text = ""
+        while data := await reader.read(65536):
+            if "def rtde_control" in text + data.decode():
+                self.program.reach(Stage.UPLOADING)
+            await self._may_answer()
+            text += data.decode()
+            while (whole := _whole_script(text)) is not None:
+                self.program.script(whole)
+                text = text[len(whole) :]
+
+
+def _whole_script(text: str) -> str | None:
+    """The first whole script of `text`: a function up to its `end`, or one line."""
+    if text.startswith("def "):
+        end = text.find("\nend\n")
+        return None if end < 0 else text[: end + 5]
+    line, newline, _ = text.partition("\n")
+    return line + newline if newline else None
+
+
+def main() -> None:
+    """Run one stand-in until the process is ended."""
+    parser = argparse.ArgumentParser(description="A stand-in for a Universal Robots controller.")
+    parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
+    parser.add_argument("--rate", type=float, default=1.0, help="controller seconds a second")
+    arguments = parser.parse_args()
+    with UrStandIn(arguments.host, rate=arguments.rate):
+        threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,332 @@
+"""The inside of a stand-in Universal Robots controller: safety, registers, the control program.
+
+Facts come from ur_rtde 1.6.5 (`scripts/rtde_control.script` in its source distribution) and the
+RTDE guide of the maker: input_int_register_0 holds a command, output_int_register_0 says 1 ready or
+2 done, output_int_register_2 carries the progress of an asynchronous move (bit 15: running).
+No sockets here; `rigs.devices.ur.fake` carries what this says.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.fake_faults import CLOCK_BACK_S, Fault, Kind, Stage
+from sliplab.rigs.core.fake_motion import Motion
+from sliplab.rigs.core.pose import MM_PER_M, distance_mm, from_ur, to_ur
+
+READY, DONE = 1, 2
+RUNNING_BIT = 1 << 15
+PROTECTIVE_DECELERATION_MM_S2 = 5000.0
+_CONTROL_MARK = "RTDE Control Script"
+_NUMBER = r"([0-9.eE+-]+)"
+
+
+class Safety(IntEnum):
+    """Bits of `safety_status_bits`."""
+
+    NORMAL = 1 << 0
+    PROTECTIVE_STOP = 1 << 2
+    SAFEGUARD_STOP = 1 << 4
+    EMERGENCY_STOP = 1 << 7
+
+
+class Runtime(IntEnum):
+    """Values of `runtime_state`."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+class UrProgram:
+    """What the controller does in one cycle, and the values that it tells.
+
+    Args:
+        motion: where the tool centre point is.
+        reach_mm: poses further than this from the base are not within the safety limits.
+        joints_deg: what the joints are said to be; a stand-in has no joints.
+        digital_inputs: levels of the digital inputs by controller time.
+        cut: what to do for the faults that concern the link.
+        rate: controller seconds a host second; the watchdog watches the host, in its seconds.
+    """
+
+    def __init__(
+        self,
+        motion: Motion,
+        reach_mm: float,
+        joints_deg: Sequence[float],
+        digital_inputs: Callable[[float], int],
+        cut: Callable[[Kind], None],
+        rate: float = 1.0,
+    ) -> None:
+        self.motion, self._reach_mm, self._cut, self._rate = motion, reach_mm, cut, rate
+        self.joints_deg = list(joints_deg)
+        self.digital_inputs = digital_inputs
+        self.ints_in, self.doubles_in = [0] * 48, [0.0] * 48
+        self.ints_out, self.doubles_out = [0] * 48, [0.0] * 48
+        self.safety = Safety.NORMAL
+        self.remote = True
+        self.runtime = Runtime.STOPPED
+        self.tcp = [0.0] * 6
+        self.payload_kg = 0.0
+        self.uploads = 0
+        self.faults: list[Fault] = []
+        self._watchdog_s: float | None = None
+        self._written_s = 0.0
+        self._executing = False
+        self._blocking = False
+        self._asynchronous = False
+        self._operation = 0
+        self._left_from: Pose | None = None
+        self._t = 0.0
+        self._here = motion.pose(0.0).xyz_mm
+        self._tcp_at: tuple[float, list[float]] = (math.nan, [])
+        self._speed_mm_s = [0.0, 0.0, 0.0]
+        self.foreign = False
+        """The program that runs is somebody else's: it reads no register and moves nothing."""
+        self.hung = False
+        """The program says that it runs and takes no command."""
+        self.speed_fraction = 1.0
+        """Where the pendant's speed slider stands; moves are slower by it."""
+        self.powered = True
+        self.clock_shift_s = 0.0
+        """What its packets say of the time, off what it is."""
+        self.refused: list[str] = []
+        """What it was asked for and does not simulate."""
+        self._leg: tuple[Pose, float, float, float] | None = None
+        """Target, speed and acceleration of the last move, and the slider's place."""
+
+    @property
+    def program_running(self) -> bool:
+        """Whether a program is on the controller, a paused one included."""
+        return self.runtime is not Runtime.STOPPED
+
+    def cycle(self, t_s: float) -> None:
+        """Advance to controller time `t_s`."""
+        x, y, z = (value * MM_PER_M for value in self._tcp(t_s)[:3])
+        here = (x, y, z)
+        seconds = max(t_s - self._t, 1e-9)
+        self._speed_mm_s = [(b - a) / seconds for a, b in zip(self._here, here, strict=True)]
+        self._here, self._t = here, t_s
+        self._moving_faults()
+        self._idle_faults()
+        if self._watchdog_s is not None and t_s - self._written_s > self._watchdog_s:
+            self.end_program()  # rtde_set_watchdog(..., "stop")
+        if self.runtime is not Runtime.PLAYING or self.foreign:
+            return
+        self._follow_slider()
+        if self._asynchronous and not self.motion.moving(t_s):
+            self._signal_async(False)
+        if self._blocking:
+            if self.motion.moving(t_s):
+                return
+            self._blocking = False
+            self.ints_out[0] = DONE
+        if not self.hung:
+            self._command(self.ints_in[0])
+
+    def write(self, name: str, value: int | float) -> None:
+        """A client wrote one input register."""
+        index = int(name.rsplit("_", 1)[1])
+        if name.startswith("input_int"):
+            self.ints_in[index] = int(value)
+            if index == 0:
+                self._written_s = self._t
+        else:
+            self.doubles_in[index] = float(value)
+
+    def forgive(self, seconds: float) -> None:
+        """The stand-in itself stood still for `seconds` of controller time and heard nobody."""
+        self._written_s += seconds
+
+    def script(self, text: str) -> None:
+        """A whole script came in on the script port: what ran before is ended by it."""
+        if not self.remote:
+            return
+        self.end_program()
+        able = self.safety is Safety.NORMAL and self.powered
+        if _CONTROL_MARK in text:
+            self.uploads += 1
+            if able:
+                self.runtime = Runtime.PLAYING
+                self.ints_out[0] = READY
+                self.ints_out[2] = 0
+            return
+        if text.startswith("def "):
+            if able:
+                self.runtime, self.foreign = Runtime.PLAYING, True
+            return
+        if found := re.search(rf"stopl\({_NUMBER}\)", text):
+            self.motion.stop(float(found[1]) * MM_PER_M, self._t)
+        else:
+            self.refused.append(f"script {text.strip()[:60]!r}")
+
+    def end_program(self) -> None:
+        """The program ends; the arm slows down and stays."""
+        self.runtime, self.foreign = Runtime.STOPPED, False
+        self._watchdog_s = self._leg = None
+        self._executing = self._blocking = self._asynchronous = False
+        self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
+
+    def happen(self, kind: Kind) -> None:
+        """One thing goes wrong now."""
+        if kind is Kind.EMERGENCY_STOP:
+            self.safety = Safety.EMERGENCY_STOP
+            self.end_program()
+        elif kind in {Kind.PROTECTIVE_STOP, Kind.SAFEGUARD_STOP}:
+            protective = kind is Kind.PROTECTIVE_STOP
+            self.safety = Safety.PROTECTIVE_STOP if protective else Safety.SAFEGUARD_STOP
+            self._pause()
+        elif kind is Kind.PROGRAM_PAUSED:
+            self._pause()
+        elif kind is Kind.POWER_OFF:
+            self.powered = False
+            self.end_program()
+        elif kind is Kind.CLOCK_BACK:
+            self.clock_shift_s -= CLOCK_BACK_S
+        elif kind is Kind.REMOTE_OFF:
+            self.remote = False
+            self.end_program()
+        elif kind is Kind.PROGRAM_END:
+            self.end_program()
+        else:
+            self._cut(kind)
+
+    def _pause(self) -> None:
+        """The arm slows down; a program waits to be resumed, which is not simulated."""
+        self.motion.stop(PROTECTIVE_DECELERATION_MM_S2, self._t)
+        if self.program_running:
+            self.runtime = Runtime.PAUSED
+
+    def reach(self, stage: Stage) -> None:
+        """A client came to a stage; what waits for it happens."""
+        for fault in [fault for fault in self.faults if fault.stage is stage]:
+            self.faults.remove(fault)
+            self.happen(fault.kind)
+
+    def unlock(self) -> bool:
+        """Unlock a protective stop, if there is one; a paused program stays paused."""
+        was = self.safety is Safety.PROTECTIVE_STOP
+        if was:
+            self.safety = Safety.NORMAL
+        return was
+
+    def value(self, name: str, t_s: float) -> int | float | list[float]:
+        """The value of an RTDE output at `t_s`; what is not modelled is 0."""
+        return self.reader(name)(t_s)
+
+    def reader(self, name: str) -> Callable[[float], int | float | list[float]]:
+        """What gives the value of an RTDE output at a controller time."""
+        kind, _, index = name.rpartition("_")
+        if kind == "output_int_register":
+            return lambda t_s, k=int(index): self.ints_out[k]  # type: ignore[misc]
+        if kind == "output_double_register":
+            return lambda t_s, k=int(index): self.doubles_out[k]  # type: ignore[misc]
+        known: dict[str, Callable[[float], int | float | list[float]]] = {
+            "timestamp": lambda t_s: t_s + self.clock_shift_s,
+            "actual_TCP_pose": self._tcp,
+            "target_TCP_pose": self._tcp,
+            "target_TCP_speed": lambda _: [
+                *(v / MM_PER_M for v in self._speed_mm_s),
+                0.0,
+                0.0,
+                0.0,
+            ],
+            "target_speed_fraction": lambda _: self.speed_fraction,
+            "actual_q": lambda _: [angle * 0.017453292519943295 for angle in self.joints_deg],
+            "actual_digital_input_bits": self.digital_inputs,
+            "robot_status_bits": lambda _: self.powered | (2 if self.program_running else 0),
+            "safety_status_bits": lambda _: int(self.safety),
+            "runtime_state": lambda _: int(self.runtime),
+            "robot_mode": lambda _: 7 if self.powered else 3,
+            "payload": lambda _: self.payload_kg,
+        }
+        return known.get(name, lambda _: 0)
+
+    def _velocity(self, t_s: float) -> list[float]:
+        """Of the tool centre point in the last cycle, m/s; turning is left out."""
+        return [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0]
+
+    def _tcp(self, t_s: float) -> list[float]:
+        """The tool centre point as RTDE says it; computed once a cycle."""
+        if self._tcp_at[0] != t_s:
+            self._tcp_at = t_s, to_ur(self.motion.pose(t_s))
+        return self._tcp_at[1]
+
+    def _command(self, command: int) -> None:
+        if command == 0:
+            self._executing = False
+            self.ints_out[0] = READY
+        elif not self._executing:
+            self._executing = True
+            self._execute(command)
+            if not self._blocking and self.program_running:
+                self.ints_out[0] = DONE
+
+    def _execute(self, command: int) -> None:
+        values = self.doubles_in
+        if command == 3:
+            self._left_from = self.motion.pose(self._t)
+            to, speed = from_ur(values[:6]), values[6] * MM_PER_M
+            self._leg = to, speed, values[7] * MM_PER_M, self.speed_fraction
+            self.motion.move(to, speed * self.speed_fraction, self._leg[2], self._t)
+            self._begin(bool(self.ints_in[1]))
+        elif command in {33, 34}:
+            self._signal_async(False)
+            self._leg = None
+            # stopJ is given in rad/s^2; without joints it is taken for m/s^2
+            self.motion.stop(values[0] * MM_PER_M, self._t)
+            self._begin(bool(self.ints_in[1]))
+        elif command == 17:
+            self.payload_kg = values[0]
+        elif command == 29:
+            self.tcp = values[:6]
+        elif command == 31:
+            self.happen(Kind.PROTECTIVE_STOP)
+        elif command == 35:
+            self._watchdog_s, self._written_s = self._rate / values[0], self._t
+        elif command == 36:
+            far = distance_mm(from_ur(values[:6]), Pose((0, 0, 0), (0, 0, 0)))
+            self.ints_out[1] = int(far <= self._reach_mm)
+        else:  # 255 is the command to end; any other one is not simulated: its program fails
+            if command != 255:
+                self.refused.append(f"command {command}")
+            self.end_program()
+
+    def _follow_slider(self) -> None:
+        """A move goes on at another speed once the slider has been moved."""
+        if self._leg is None or self._leg[3] == self.speed_fraction:
+            return
+        to, speed, acceleration, _ = self._leg
+        self._leg = to, speed, acceleration, self.speed_fraction
+        if self.motion.moving(self._t):
+            self.motion.move(to, max(speed * self.speed_fraction, 1e-6), acceleration, self._t)
+
+    def _begin(self, asynchronous: bool) -> None:
+        if asynchronous:
+            self._signal_async(True)
+        else:
+            self._blocking = True
+
+    def _signal_async(self, running: bool) -> None:
+        self._asynchronous = running
+        if running:
+            self._operation = (self._operation + 1) % 128
+        self.ints_out[2] = (self._operation << 24) | (RUNNING_BIT if running else 0)
+
+    def _moving_faults(self) -> None:
+        if self._left_from is None or not self.motion.moving(self._t) or not self.faults:
+            return
+        gone = distance_mm(self._left_from, self.motion.pose(self._t))
+        due = [f for f in self.faults if f.stage is Stage.MOVING and gone >= f.after_mm]
+        for fault in due:
+            self.faults.remove(fault)
+            self.happen(fault.kind)
+
+    def _idle_faults(self) -> None:
+        if self.faults and self.runtime is Runtime.PLAYING and not self.motion.moving(self._t):
+            self.reach(Stage.IDLE)

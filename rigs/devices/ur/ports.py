@@ -1,0 +1,112 @@
+"""The two text ports of a Universal Robots controller, with a bound on every wait.
+
+29999 is the dashboard: one line for a request, one for an answer (the maker's dashboard guide for
+e-Series, PolyScope 5). 30003 takes scripts: whatever script comes ends the one that runs. Both
+need no program on the controller, so they are what is left when the control client is lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+
+from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
+
+DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
+HEALTH_S = 1.0
+"""For each question to the dashboard about the arm's health, s."""
+_LONGEST_LINE = 10_000
+"""Bytes; an answer has some 100."""
+
+
+class PortError(RuntimeError):
+    """A text port did not take or answer a request in time."""
+
+
+def dashboard(host: str, request: str, within_s: float) -> str:
+    """The dashboard's answer to one request, without its newline.
+
+    Raises:
+        PortError: no connection or no answer within `within_s` seconds.
+    """
+    deadline = time.monotonic() + within_s
+    try:
+        with socket.create_connection((host, DASHBOARD_PORT), within_s) as link:
+            _line(link, deadline)  # the greeting
+            link.sendall(request.encode() + b"\n")
+            return _line(link, deadline)
+    except OSError as error:
+        raise PortError(f"dashboard of {host}: '{request}': {error}") from None
+
+
+def send_script(host: str, script: str, within_s: float) -> None:
+    """Hand a script to the controller, ending the program that runs there.
+
+    Raises:
+        PortError: it could not be handed over within `within_s` seconds.
+    """
+    try:
+        with socket.create_connection((host, SCRIPT_PORT), within_s) as link:
+            link.sendall(script.encode())
+            link.shutdown(socket.SHUT_WR)
+    except OSError as error:
+        raise PortError(f"script port of {host}: {error}") from None
+
+
+def end_program(host: str, deceleration_m_s2: float, within_s: float) -> bool:
+    """End the controller's program, and any move with it, by one port or the other.
+
+    Takes at most twice `within_s`.
+
+    Returns:
+        Whether the controller said that it did. A script that was handed over may do it too, but
+        nothing says so: only a pose stream that is still there can show it.
+    """
+    try:
+        if dashboard(host, "stop", within_s) == "Stopped":
+            return True
+    except PortError:
+        pass  # the other port may still take a script
+    with contextlib.suppress(PortError):
+        send_script(host, f"stopl({deceleration_m_s2:g})\n", within_s)
+    return False
+
+
+def _line(link: socket.socket, deadline: float) -> str:
+    data = b""
+    while not data.endswith(b"\n"):
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("no answer in time")
+        link.settimeout(left)
+        more = link.recv(4096)
+        if not more:
+            raise ConnectionError("the connection was closed")
+        data += more
+        if len(data) > _LONGEST_LINE:
+            raise ConnectionError("what comes is no line")
+    return data.decode(errors="replace").strip()
+
+
+def ur_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
+    """Of a Universal Robots controller, by its dashboard (e-Series guide, PolyScope 5).
+
+    Raises:
+        PortError: it does not answer.
+    """
+
+    def ask(request: str) -> str:
+        answer = dashboard(host, request, HEALTH_S)
+        return UNKNOWN if answer.startswith("could not understand") else answer
+
+    remote = "in remote control" if ask("is in remote control") == "true" else "NOT remote control"
+    return DeviceHealth(
+        device="arm",
+        model=ask("get robot model"),
+        serial=ask("get serial number"),
+        firmware=ask("PolyscopeVersion"),
+        temperature_c=None,
+        clock="the controller's, in every pose",
+        notes=(remote, *notes),
+    )

@@ -1,0 +1,26 @@
+"""Settings of a Universal Robots arm as a rig file gives them; cheap to import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from sliplab.rigs.core.arm_settings import BaseArmSettings, Positive
+
+
+class UrSettings(BaseArmSettings):
+    """A Universal Robots e-Series arm, PolyScope 5.6 to 5.x, in remote control.
+
+    Its ports are fixed by the client and by the controller: 30004 RTDE, 29999 dashboard, 30003
+    scripts. Segments are not blended: the arm comes to rest between two of them, so each is at
+    constant speed between its ramps.
+    """
+
+    driver: Literal["ur"] = "ur"
+    acceleration_mm_s2: Positive = 100.0
+    """At the start and the end of each segment."""
+    frequency_hz: Annotated[int, Field(ge=10, le=500)] = 500
+    """Rate of the pose stream; 500 is the controller's own."""
+    sync_input: Annotated[int, Field(ge=0, le=17)] = 0
+    """Bit of `actual_digital_input_bits` that the sync line is on (0 to 7: standard inputs)."""

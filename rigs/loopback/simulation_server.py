@@ -1,0 +1,329 @@
+"""One simulated scene on one real-time clock, behind stand-ins that speak the devices' wires.
+
+What a stand-in sends is what the simulated devices of `rigs.mock` would have handed over: the same
+world, the same noise, the same faults by name. Only the way to the host differs, so a trial looks
+the same through either. The world follows the host's monotonic clock a little behind it, so that a
+controller's move never lies in the world's past.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sliplab.protocols.program import PlateAction
+from sliplab.protocols.timing import Timing
+from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
+from sliplab.rigs.core.fake_faults import Kind
+from sliplab.rigs.devices.dvxplorer.fake_live import LiveDvxplorer
+from sliplab.rigs.devices.settings import ArmSettings
+from sliplab.rigs.devices.sync_box.fake import PtySyncBox, Train
+from sliplab.rigs.loopback.arm_path import MotionPath
+from sliplab.rigs.loopback.fake_arms import StandingArm, standing_arm
+from sliplab.rigs.loopback.sync_level import SyncLevel
+from sliplab.rigs.mock.clocks import trial_clocks
+from sliplab.rigs.mock.devices import build_mock
+from sliplab.rigs.mock.event_camera import MockEventCamera
+from sliplab.rigs.mock.frame_camera import MockFrameCamera
+from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.people import MockPlate, SimulatedOperator
+from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.sync import MockSyncBox
+from sliplab.rigs.mock.truth import truth_of
+from sliplab.rigs.mock.world import World, start_pose
+from sliplab.storage.clockmap import ClockMap
+from sliplab.storage.streams import FrameChunk
+
+I64 = npt.NDArray[np.int64]
+LAG_NS = 20_000_000
+"""How far the world is behind the host's clock: longer than a controller's cycle."""
+REST_S = 2.0
+"""The longest that a trial's begin waits for the arm to be at rest."""
+CLEAR_MM = 5.0
+PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
+"""How far a person moves a stopped arm clear of the plate, and how fast."""
+_NONE = np.empty(0, np.int64)
+NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
+"""What is sent when no more frames come."""
+
+
+class SimulationServer:
+    """The scene and its stand-ins; `turn` lets it follow the clock, from one thread.
+
+    Args:
+        settings: the simulated scene and devices, with their faults.
+        timing: which signals reach which device; frames by hardware trigger.
+        arm: settings of the arm's driver: a stand-in of its kind listens where it will look.
+        on_frames: is given the frames of each turn.
+    """
+
+    def __init__(
+        self,
+        settings: MockSettings,
+        timing: Timing,
+        arm: ArmSettings,
+        on_frames: Callable[[FrameChunk], None],
+    ) -> None:
+        _rehearse(settings, timing)
+        self._origin_ns = time.monotonic_ns() - LAG_NS
+        clocks = trial_clocks(settings.clocks, settings.seed, settings.seed)
+        plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
+        self._arm_clock = clocks.arm
+        self._arm_by_host = arm.driver == "abb_socket"
+        self._path = MotionPath(plane, start_pose(settings), clocks.arm)
+        self.world = World(settings, self._path, run_on=True)
+        self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
+        self._box = MockSyncBox(self.world)
+        self._events = MockEventCamera(self.world, self._box)
+        self._frames = MockFrameCamera(self.world, self._box, timing.frames)
+        self._plate = MockPlate(self.world)
+        self._operator = SimulatedOperator(self.world)
+        self._on_frames, self._grabbing = on_frames, False
+        self._trains: deque[tuple[Train | None, int]] = deque()
+        self._train: Train | None = None
+        self._level = SyncLevel(self._box_clock)
+        self._sent: Counter[str] = Counter()
+        self._stamps_us: list[I64] = []
+        self._size = settings.event_camera.width, settings.event_camera.height
+        self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+        self.camera = LiveDvxplorer(self._size)
+        self.arm: StandingArm = standing_arm(
+            arm, self._path.motion, self._arm_now_s, self._arm_input
+        )
+        self._events.start()
+
+    def close(self) -> None:
+        """Take every stand-in away."""
+        for part in (self.arm, self.camera, self.sync_box):
+            part.close()
+
+    # -- time ------------------------------------------------------------------------------
+
+    def _total_ns(self) -> int:
+        """True time of all trials: the host's clock."""
+        return time.monotonic_ns() - self._origin_ns
+
+    def _box_now_ns(self) -> int:
+        return self._box_clock.to_reference(self._total_ns())
+
+    def _arm_now_s(self) -> float:
+        return self._arm_clock.to_reference(self._total_ns()) / 1e9
+
+    def _arm_input(self, t_s: float) -> bool:
+        return self._level.high(self._arm_clock.to_device(round(t_s * 1e9)))
+
+    def turn(self) -> None:
+        """Let the world follow the clock, and send what its devices have to say."""
+        world = self.world
+        passed = self._total_ns() - LAG_NS - world.past_ns - world.now_ns
+        while self._trains:
+            self._tick(*self._trains.popleft())
+        if passed > 0:
+            world.pass_time(passed)
+        if self._path.cut_ns is not None:
+            self._path.cut_ns = None
+            protective = world.arm_state is ArmState.PROTECTIVE_STOP
+            self.arm.happen(Kind.PROTECTIVE_STOP if protective else Kind.PROGRAM_END)
+        chunk, pulses = self._events.read(), self._events.read_pulses()
+        if len(chunk) or len(pulses.t_ns):
+            self.camera.send(chunk, pulses)
+            self._sent["events"] += len(chunk)
+            self._sent["event_pulses"] += len(pulses.t_ns)
+            self._stamps_us.append(chunk.t_us)
+        if self._grabbing:
+            self._send_frames()
+
+    def _send_frames(self) -> None:
+        frames = self._frames.read()
+        if len(frames.number):
+            self._on_frames(frames)
+            self._sent["frames"] += len(frames.number)
+
+    # -- the sync box ----------------------------------------------------------------------
+
+    def _on_train(self, train: Train | None, sent: int) -> None:
+        """In the box's thread."""
+        self._level.follow(train, sent)
+        self._trains.append((train, sent))
+
+    def _tick(self, train: Train | None, sent: int) -> None:
+        if train is not None:
+            self._train = train
+            first = self._box_clock.to_device(train.first_ns) - self.world.past_ns
+            self._box.start(train.rate_hz, train.seed, train.code, first)
+        elif self._train is not None:
+            # half a tick behind the last one
+            end = self._train.first_ns + round((sent - 0.5) * 1e9 / self._train.rate_hz)
+            self._box.stop(self._box_clock.to_device(end) - self.world.past_ns)
+
+    # -- what a rig asks of a simulation ---------------------------------------------------
+
+    def begin_trial(self, seed: int) -> None:
+        """Draw everything that varies by trial from `seed`; the skin is at rest.
+
+        Raises:
+            RigError: the arm is moving.
+        """
+        end = time.monotonic() + REST_S
+        while True:
+            self.turn()
+            if not self._path.moving(self.world.now_ns) or time.monotonic() > end:
+                break
+        self.world.begin_trial(seed)
+        self._path.begin(self.world.past_ns)
+        self._events.start()
+        self._sent.clear()
+        self._stamps_us.clear()
+
+    def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
+        """The truth of a trial after these moments of the clock that the arm's times are told by.
+
+        See `rigs.mock.truth.truth_of`.
+        """
+        self.turn()
+
+        def true_ns(arm_ns: int) -> int:
+            if self._arm_by_host:
+                total_ns = arm_ns - self._origin_ns
+            else:
+                total_ns = int(self._arm_clock.to_device(arm_ns))
+            return total_ns - self.world.past_ns
+
+        hold_ns = None if hold_arm_ns is None else true_ns(hold_arm_ns)
+        return truth_of(
+            self.world, self._box.clock, true_ns(reference_arm_ns), hold_true_ns=hold_ns
+        )
+
+    def sent(self) -> Counter[str]:
+        """What was sent since the trial began, by stream; pulses of the box since its last ARM."""
+        return self._sent + Counter({"box_pulses": self.sync_box.pulses})
+
+    def events_between(self, first_us: int, last_us: int) -> int:
+        """How many events with stamps from the first to the last of these were sent, us."""
+        return sum(
+            int(np.count_nonzero((stamps >= first_us) & (stamps <= last_us)))
+            for stamps in self._stamps_us
+        )
+
+    def act(self, action: PlateAction, seconds: float) -> None:
+        """What the plate does."""
+        self.turn()
+        self._plate.act(action, seconds)
+
+    def mass_kg(self) -> float:
+        """Mass mounted now."""
+        return self._plate.mass_kg()
+
+    def ask(self, task: str, prompt: str, expected: str) -> bool:
+        """What a person does."""
+        if task == "protective_stop":
+            self.arm.restore()
+        return self._operator.ask(task, prompt, expected)
+
+    def grab(self, width_px: int, height_px: int) -> None:
+        """The frame camera begins to grab a region; its counter is at 0."""
+        self.turn()
+        self._frames.stop()
+        self._frames.set_region(width_px, height_px)
+        self._frames.start()
+        self._grabbing = True
+
+    def stop_grabbing(self) -> None:
+        """The frame camera stops; what it exposed before is sent, and an empty chunk."""
+        if self._grabbing:
+            self.turn()
+            self._frames.stop()
+            self._grabbing = False
+        self._on_frames(NO_FRAMES)
+
+    # -- what a person at the rig would see and do -----------------------------------------
+
+    def arm_place(self) -> tuple[float, float, float]:
+        """Where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        x, y, depth = self.world.plane.sensor(self.arm.pose())[:3]
+        return float(x), float(y), float(depth)
+
+    def at_rest(self) -> bool:
+        """Whether the arm truly stands still."""
+        return not self.arm.moving()
+
+    def happen(self, device: str, kind: str) -> None:
+        """Make something go wrong on the wire now.
+
+        Args:
+            device: ``arm``, ``sync_box`` or ``event_camera``.
+            kind: of the arm a value of `rigs.core.fake_faults.Kind`; of the sync box ``reset``,
+                ``silence`` or ``unplug``; of the event camera ``stall`` or ``unplug``.
+
+        Raises:
+            RigError: no such fault.
+        """
+        known: dict[str, dict[str, Callable[[], None]]] = {
+            "arm": {found.value: partial(self.arm.happen, found) for found in Kind},
+            "sync_box": {
+                "reset": self.sync_box.reset,
+                "silence": self.sync_box.silence,
+                "unplug": self.sync_box.close,
+            },
+            "event_camera": {"stall": self.camera.stall, "unplug": self.camera.close},
+        }
+        try:
+            what = known[device][kind]
+        except KeyError:
+            raise RigError(device, f"no stand-in can show '{kind}' of it") from None
+        what()
+
+    def restore(self, device: str) -> tuple[str, tuple[int, int]]:
+        """A person puts right whatever is wrong with a device.
+
+        A stopped arm is unlocked and moved clear of the plate; the others are plugged in again.
+
+        Returns:
+            The sync box's port and the event camera's ports, which may be new ones.
+
+        Raises:
+            RigError: no such device.
+        """
+        if device == "arm":
+            self.arm.restore()
+            x, y, depth = self.arm_place()
+            if depth > -CLEAR_MM:
+                clear = self.world.plane.pose(x, y, -CLEAR_MM)
+                now_s = self._arm_now_s()
+                self._path.motion.move(clear, PENDANT_MM_S, PENDANT_MM_S2, now_s)
+        elif device == "sync_box":
+            self.sync_box.close()
+            self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+        elif device == "event_camera":
+            self.camera.close()
+            self.camera = LiveDvxplorer(self._size)
+        else:
+            raise RigError(device, "is no device of a stand-in")
+        return self.sync_box.port, self.camera.ports
+
+
+def _rehearse(settings: MockSettings, timing: Timing) -> None:
+    """Let a world like this one run for a moment: what has to be compiled or loaded is then there.
+
+    Compiling holds Python's lock for seconds, in which no stand-in would answer.
+    """
+    devices = build_mock(settings, timing)
+    devices.arm.connect()
+    devices.begin_trial(1)
+    devices.frames.set_region(64, 64)
+    devices.events.start()
+    devices.frames.start()
+    devices.sync.start(100.0, 1)
+    home = devices.arm.pose()
+    devices.arm.start([Segment(Pose((home.xyz_mm[0] + 1.0, *home.xyz_mm[1:]), home.rotvec_deg), 5)])
+    for _ in range(10):
+        devices.clock.wait(0.05)
+        for read in (devices.events.read, devices.events.read_pulses, devices.frames.read):
+            read()
+    devices.truth(devices.clock.now_ns() - 100_000_000)

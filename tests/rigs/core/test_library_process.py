@@ -1,0 +1,114 @@
+"""A library in a process of its own: every call ends, and an answer belongs to its call."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from contextlib import suppress
+from multiprocessing.connection import Connection
+
+import pytest
+
+from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
+
+HERE = "tests.rigs.core.test_library_process"
+
+
+def serve(fd: int, word: str) -> None:
+    """The child: it says things back, late or never."""
+    pipe = Connection(fd)
+    pipe.send((True, word))
+    with suppress(EOFError):
+        while True:
+            name, arguments, _ = pipe.recv()
+            if name == "die":
+                os.write(2, b"terminate called\n  what(): no \xff packet\n")
+                os._exit(6)
+            if name == "late":
+                threading.Event().wait(arguments[0])
+            pipe.send((name != "fail", name))
+
+
+@pytest.fixture
+def process() -> LibraryProcess:
+    return LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0)
+
+
+def test_calls_and_refusals(process: LibraryProcess) -> None:
+    assert process.begun == "hello"
+    assert process.call("any", within_s=20.0) == "any"
+    with pytest.raises(LibraryError, match="fail: fail"):
+        process.call("fail", within_s=20.0)
+    assert process.call("any", within_s=20.0) == "any"
+    process.end()
+    with pytest.raises(LibraryError, match="the echo is gone"):
+        process.call("any", within_s=20.0)
+    process.end()
+
+
+def test_a_death_says_what_the_library_said_last(process: LibraryProcess) -> None:
+    with pytest.raises(LibraryError, match=r"the echo died \(it said:   what\(\): no . packet\)"):
+        process.call("die", within_s=20.0)
+    process.close()
+
+
+def test_a_call_that_is_too_late_ends_the_child(process: LibraryProcess) -> None:
+    began = time.monotonic()
+    with pytest.raises(LibraryError, match=r"late: no answer within 0\.2 s"):
+        process.call("late", 60.0, within_s=0.2)
+    with pytest.raises(LibraryError, match="is gone"):
+        process.call("any", within_s=20.0)
+    assert time.monotonic() - began < 30.0
+    process.close()
+
+
+def test_a_computer_that_stood_still_is_no_fault_of_the_child(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    process = LibraryProcess("echo", f"{HERE}:serve", ("hello",), 60.0, patient=True)
+    pipe, now_ns = process._pipe, time.monotonic_ns
+    late_ns = [0]
+
+    class StoodStill:
+        """A pipe during whose first wait a minute passes."""
+
+        closed = False
+        send, recv = staticmethod(pipe.send), staticmethod(pipe.recv)
+
+        def poll(self, within_s: float) -> bool:
+            if not late_ns[0]:
+                late_ns[0] = 60_000_000_000
+                return False
+            return pipe.poll(within_s)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "monotonic_ns", lambda: now_ns() + late_ns[0])
+        patch.setattr(process, "_pipe", StoodStill())
+        assert process.call("any", within_s=20.0) == "any"
+        assert late_ns[0]
+    with pytest.raises(LibraryError, match=r"late: no answer within 0\.3 s"):
+        process.call("late", 60.0, within_s=0.3)
+    process.close()
+
+
+def test_after_ctrl_c_an_answer_is_still_its_own_calls(
+    process: LibraryProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipe = process._pipe
+
+    class Interrupted:
+        """A pipe during whose first wait a person presses Ctrl-C."""
+
+        closed = False
+        send = staticmethod(pipe.send)
+
+        def poll(self, within_s: float) -> bool:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(process, "_pipe", Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        process.call("late", 0.1, within_s=20.0)
+    monkeypatch.setattr(process, "_pipe", pipe)
+    assert process.call("other", within_s=20.0) == "other"
+    process.close()

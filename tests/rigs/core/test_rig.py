@@ -1,0 +1,275 @@
+"""The rig runs a trial, and stops in order: arm first, then cameras."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.protocols import Plan, Protocol, make_plan
+from sliplab.protocols.yaml_file import parse_yaml, validate
+from sliplab.rigs.build import build_rig
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from sliplab.rigs.core.plate_frame import PlateFrame
+from sliplab.rigs.core.rig import Rig, StopRequested
+from sliplab.rigs.rig_file import RigFile
+from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk
+from tests.conftest import ROOT, SMALL
+
+RIG: dict[str, Any] = parse_yaml((ROOT / "rigs" / "mock.yaml").read_text(), "mock.yaml")
+FRAME_PX = (256, 256)
+
+
+class Memory:
+    """A sink that keeps everything, and can be asked to fail."""
+
+    def __init__(self, fail_after: int | None = None, error: BaseException | None = None) -> None:
+        self.parts: dict[str, list[np.ndarray]] = {}
+        self.calls = 0
+        self.fail_after, self.error = fail_after, error
+
+    def _keep(self, name: str, values: np.ndarray) -> None:
+        self.parts.setdefault(name, []).append(values)
+
+    def add_events(self, chunk: EventChunk) -> None:
+        self.calls += 1
+        if self.fail_after is not None and self.calls > self.fail_after:
+            assert self.error is not None
+            raise self.error
+        for name in ("x", "y", "p", "t_us"):
+            self._keep(f"events {name}", getattr(chunk, name))
+
+    def add_event_pulses(self, chunk: PulseChunk) -> None:
+        self._keep("event pulses", chunk.t_ns)
+
+    def add_arm_pulses(self, chunk: PulseChunk) -> None:
+        self._keep("arm pulses", chunk.t_ns)
+
+    def add_sync_pulses(self, chunk: PulseChunk) -> None:
+        self._keep("sync pulses", chunk.t_ns)
+
+    def add_exposures(self, chunk: PulseChunk) -> None:
+        self._keep("exposures", chunk.t_ns)
+
+    def add_box_reads(self, chunk: ClockReads) -> None:
+        self._keep("box reads", chunk.device_ns)
+
+    def add_frame_camera_reads(self, chunk: ClockReads) -> None:
+        self._keep("frame camera reads", chunk.device_ns)
+
+    def add_poses(self, chunk: PoseChunk) -> None:
+        self._keep("pose times", chunk.t_ns)
+        self._keep("poses", chunk.xyz_mm)
+
+    def add_frames(self, chunk: FrameChunk) -> None:
+        self._keep("frame numbers", chunk.number)
+        self._keep("frame times", chunk.t_ns)
+        self._keep("frames", chunk.images)
+
+    def all(self, name: str) -> np.ndarray:
+        return np.concatenate(self.parts[name])
+
+
+def short_plan() -> Plan:
+    """Slides of 2 mm after half a second of holding."""
+    data = copy.deepcopy(SMALL)
+    data["collection"]["motion"][2] = {"phase": "hold", "settle": "0.2 s", "duration": "0.5 s"}
+    data["collection"]["motion"][3]["distance"] = "2 mm"
+    return make_plan(validate(Protocol, data, "test"), "test")
+
+
+def make_rig(**mock: Any) -> Rig:
+    """The shipped mock rig with other mock settings."""
+    rig = build_rig(validate(RigFile, {**RIG, "mock": {**RIG["mock"], **mock}}, "test"))
+    rig.connect()
+    return rig
+
+
+def run(rig: Rig, plan: Plan, sink: Memory, seed: int = 7) -> Any:
+    """The first trial of a plan."""
+    return rig.run_trial(plan.program(plan.trials[0]), sink, seed, FRAME_PX, 100)
+
+
+def test_streams_hold_the_recorded_part_in_order() -> None:
+    rig, plan, sink = make_rig(), short_plan(), Memory()
+    done = run(rig, plan, sink)
+    recorded = plan.seconds(plan.trials[0], recorded_only=True)
+    start, end = done.recorded_ns
+    assert (end - start) / 1e9 == pytest.approx(recorded, rel=2e-3)
+    for name in ("events t_us", "event pulses", "arm pulses", "sync pulses", "pose times"):
+        times = sink.all(name)
+        assert len(times)
+        assert np.all(np.diff(times) >= 0)
+    numbers = sink.all("frame numbers")
+    assert np.array_equal(numbers, np.arange(len(numbers)))
+    assert abs(len(numbers) - recorded * 100) <= 2
+    assert sink.all("frames").shape == (len(numbers), 256, 256)
+    span = np.ptp(sink.all("events t_us")) / 1e6
+    assert span >= recorded - 0.01
+    assert [step.phase for step, kept in done.steps if kept] == ["hold", "slide"]
+
+
+def test_a_trial_depends_on_nothing_that_ran_before() -> None:
+    plan = short_plan()
+    first, second = Memory(), Memory()
+    run(make_rig(), plan, first)
+    other = make_rig()
+    other.press(2.0, 2.0, 5.0, 2)
+    run(other, plan, Memory(), seed=99)
+    other.frame = other.frame.with_zero(0.0)
+    run(other, plan, second)
+    for name in first.parts:
+        assert np.array_equal(first.all(name), second.all(name)), name
+
+
+@pytest.mark.parametrize(
+    ("timing", "streams"),
+    [
+        ({}, set()),
+        ({"frames": "exposure line"}, {"exposures"}),
+        ({"frames": "device time stamps"}, {"box reads", "frame camera reads"}),
+        ({"frames": "host arrival"}, {"box reads"}),
+        ({"arm": "host time"}, {"box reads"}),
+    ],
+)
+def test_what_is_read_besides_is_what_the_timing_needs(
+    timing: dict[str, Any], streams: set[str]
+) -> None:
+    data = {**RIG, "timing": timing, "mock": {"frame_camera": {"level": "tracks"}}}
+    rig = build_rig(validate(RigFile, data, "test"))
+    rig.connect()
+    sink = Memory()
+    run(rig, short_plan(), sink)
+    possible = {"exposures", "box reads", "frame camera reads"}
+    assert possible & set(sink.parts) == streams
+    for name in streams & {"box reads", "frame camera reads"}:
+        times = sink.all(name)
+        assert len(times) >= 8  # one a poll
+        assert np.all(np.diff(times) > 0)
+    assert (len(sink.all("arm pulses")) > 0) == ("arm" not in timing)
+    if "exposures" in streams:
+        assert len(sink.all("exposures")) >= len(sink.all("frame numbers"))
+
+
+def test_the_box_is_started_with_the_rigs_code() -> None:
+    rig = build_rig(validate(RigFile, {**RIG, "timing": {"code": "regular"}}, "test"))
+    rig.connect()
+    sink = Memory()
+    rig.listen(0.6, sink, 100)
+    gaps = np.diff(sink.all("sync pulses"))
+    assert gaps[0] == 160_000_000
+    assert np.all(gaps[1:] == 20_000_000)
+
+
+class Journal:
+    """Notes every call of a device, and hands it on."""
+
+    def __init__(self, name: str, device: Any, notes: list[str]) -> None:
+        self._name, self._device, self._notes = name, device, notes
+
+    def __getattr__(self, attribute: str) -> Any:
+        found = getattr(self._device, attribute)
+        if not callable(found):
+            return found
+
+        def call(*args: Any) -> Any:
+            self._notes.append(f"{self._name}.{attribute}")
+            return found(*args)
+
+        return call
+
+
+def watched(rig: Rig) -> list[str]:
+    """Replace the rig's devices by journals; returns the notes."""
+    notes: list[str] = []
+    for name in ("arm", "events", "frames", "sync"):
+        setattr(rig, name, Journal(name, getattr(rig, name), notes))
+    return notes
+
+
+def after_the_stop(notes: list[str]) -> list[str]:
+    """The calls from the last arm.stop on."""
+    return notes[len(notes) - 1 - notes[::-1].index("arm.stop") :]
+
+
+def test_a_protective_stop_leaves_the_arm_where_it_is() -> None:
+    rig = make_rig(faults=[{"kind": "arm_protective_stop", "at_s": 1.0}])
+    notes = watched(rig)
+    with pytest.raises(ArmFault, match="protective stop in the phase 'slide'"):
+        run(rig, short_plan(), Memory())
+    calls = after_the_stop(notes)
+    assert "arm.start" not in calls
+    assert calls.index("arm.stop") < calls.index("events.stop") < calls.index("sync.stop")
+    assert rig.arm.state() is ArmState.PROTECTIVE_STOP
+    with pytest.raises(ArmFault, match="protective stop"):
+        run(rig, short_plan(), Memory())
+    assert rig.arm.state() is ArmState.PROTECTIVE_STOP
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
+def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(
+    error: BaseException,
+) -> None:
+    rig = make_rig()
+    notes = watched(rig)
+    with pytest.raises(type(error)):
+        run(rig, short_plan(), Memory(fail_after=3, error=error))
+    calls = after_the_stop(notes)
+    assert calls.index("arm.start") < calls.index("events.stop")
+    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
+    assert rig.arm.state() is ArmState.READY
+
+
+def test_a_stop_request_is_looked_at_in_the_motion() -> None:
+    rig = make_rig()
+    looks = iter([False] * 12)
+    rig.should_stop = lambda: next(looks, True)
+    with pytest.raises(StopRequested):
+        run(rig, short_plan(), Memory())
+    rig.should_stop = lambda: False
+    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm <= -5.0 + 1e-6
+
+
+def test_touching_off_finds_the_surface() -> None:
+    rig = make_rig()
+    found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 5)]
+    assert np.abs(found).max() < 0.06  # the taught plane is the true one; depth steps are 0.2 mm
+    assert rig.frame.zero_mm == found[-1]
+
+
+def test_touching_off_finds_a_surface_that_was_taught_wrong() -> None:
+    rig = make_rig()
+    origin, axes = rig.frame.origin - 0.5 * rig.frame.axes[2], rig.frame.axes
+    rig.frame = PlateFrame(origin, axes)
+    assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
+
+
+def test_touching_off_goes_no_deeper_than_its_limit() -> None:
+    rig = make_rig()
+    rig.frame = PlateFrame(rig.frame.origin - 5.0 * rig.frame.axes[2], rig.frame.axes)
+    with pytest.raises(RigError, match=r"within 1.5 mm of the taught plane; teach"):
+        rig.touch_off(0.5, 1.5, 1)
+    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm <= -1.5 + 1e-6
+
+
+def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
+    rig = make_rig(
+        faults=[{"kind": "arm_protective_stop", "trial": 1, "at_s": 1.0, "since": "trial"}]
+    )
+    notes = watched(rig)
+    with pytest.raises(ArmFault, match="protective stop in the phase 'touching off'"):
+        rig.touch_off(0.5, 1.5, 1)
+    assert notes.index("arm.stop") < notes.index("events.stop")
+    assert rig.frame.zero_mm == 0.0
+
+
+def test_a_plate_that_is_not_there_cannot_be_moved() -> None:
+    from sliplab.protocols import load_plan
+
+    rig = make_rig()
+    rig.plate = None
+    plan = load_plan(ROOT / "protocols" / "pilot_gravity.yaml")
+    with pytest.raises(RigError, match="no sliding plate to raise"):
+        run(rig, plan, Memory())

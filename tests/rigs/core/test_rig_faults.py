@@ -1,0 +1,235 @@
+"""Devices that go in the middle of a trial: the arm is stopped first, and all others after it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.protocols import load_plan
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
+from tests.conftest import ROOT
+from tests.rigs.core.test_rig import Memory, after_the_stop, make_rig, run, short_plan, watched
+
+STOPS = ["arm.stop", "events.stop", "frames.stop", "sync.stop"]
+
+
+def gone(device: str) -> dict[str, Any]:
+    return {"kind": "device_gone", "device": device, "at_s": 0.8}
+
+
+@pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera", "sync_box"])
+def test_whichever_device_goes_the_others_are_stopped_in_order(device: str) -> None:
+    rig = make_rig(faults=[gone(device)])
+    notes = watched(rig)
+    with pytest.raises(RigError, match="does not answer") as caught:
+        run(rig, short_plan(), Memory())
+    assert caught.value.device == device.replace("_", " ")
+    calls = after_the_stop(notes)
+    assert [call for call in calls if call in STOPS] == STOPS
+    assert ("arm.start" in calls) == (device != "arm")  # it retracts if it can
+    notes.clear()
+    rig.close()
+    closed = [call for call in notes if call.endswith("close")]
+    assert closed == ["arm.close", "events.close", "frames.close", "sync.close"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("disk full")])
+def test_whoever_stops_the_rig_hears_that_the_arm_could_not_be(error: BaseException) -> None:
+    """The arm goes while the third poll of the recording is written, which fails."""
+    rig = make_rig(faults=[gone("arm")])
+    sink = Memory(fail_after=3, error=error)
+    wait = rig.clock.wait
+
+    def slow_disk(chunk: Any) -> None:
+        wait(1.0)
+        raise error
+
+    sink.add_events = slow_disk  # type: ignore[method-assign]
+    notes = watched(rig)
+    with pytest.raises(ArmFault, match="does not answer") as caught:
+        run(rig, short_plan(), sink)
+    assert caught.value.__cause__ is error
+    assert [call for call in after_the_stop(notes) if call in STOPS] == STOPS
+
+
+def test_a_device_that_comes_back_between_polls_has_lost_a_little() -> None:
+    fault = {**gone("event_camera"), "seconds": 0.01, "at_s": 0.85}
+    rig, sound = make_rig(faults=[fault]), Memory()
+    run(rig, short_plan(), sound)
+    plain = Memory()
+    run(make_rig(), short_plan(), plain)
+    lost = len(plain.all("events t_us")) - len(sound.all("events t_us"))
+    assert 0 < lost < 0.1 * len(plain.all("events t_us"))
+
+
+@pytest.mark.parametrize("device", ["arm", "event_camera", "frame_camera"])
+def test_a_clock_that_begins_again_does_not_stop_a_trial(device: str) -> None:
+    rig = make_rig(faults=[{"kind": "clock_restart", "device": device, "at_s": 0.2}])
+    sink, plain = Memory(), Memory()
+    hit, sound = run(rig, short_plan(), sink), run(make_rig(), short_plan(), plain)
+    assert hit.truth["per_papilla_ns"] == sound.truth["per_papilla_ns"]
+    stamps = {"arm": "arm pulses", "event_camera": "event pulses", "frame_camera": "frame times"}
+    for name, stream in stamps.items():
+        assert np.any(np.diff(sink.all(stream)) < 0) == (name == device)
+        assert len(sink.all(stream)) == len(plain.all(stream))
+
+
+class Unstoppable:
+    """An arm that takes a stop and is never seen to stand still."""
+
+    TEXT = "does not stop: press its emergency stop"
+
+    def __init__(self, arm: Any) -> None:
+        self._arm = arm
+        self.asked = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def stop(self) -> None:
+        self.asked += 1
+        raise ArmFault("arm", self.TEXT)
+
+
+def test_closing_says_that_the_arm_was_not_seen_to_stand_and_closes_all() -> None:
+    rig = make_rig()
+    notes = watched(rig)
+    rig.arm = Unstoppable(rig.arm)
+    ended: list[bool] = []
+    rig.ending = (lambda: ended.append(True),)
+    with pytest.raises(ArmFault, match=Unstoppable.TEXT):
+        rig.close()
+    closed = [call for call in notes if call.endswith("close")]
+    assert closed == ["arm.close", "events.close", "frames.close", "sync.close"]
+    assert ended == [True]
+
+
+def closed_while(error: BaseException, rig: Any) -> None:
+    """What a command does: something fails, and the rig is closed on the way out."""
+    try:
+        raise error
+    finally:
+        rig.close()
+
+
+def test_closing_after_a_failure_says_both() -> None:
+    rig = make_rig()
+    rig.arm = Unstoppable(rig.arm)
+    with pytest.raises(ArmFault, match=rf"{Unstoppable.TEXT} \(before that: sync box: is gone\)"):
+        closed_while(RigError("sync box", "is gone"), rig)
+
+
+def test_closing_says_nothing_twice() -> None:
+    rig = make_rig()
+    rig.arm = Unstoppable(rig.arm)
+    with pytest.raises(ArmFault, match=Unstoppable.TEXT) as caught:
+        run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
+    assert isinstance(caught.value.__cause__, OSError)
+    asked = rig.arm.asked
+    with pytest.raises(ArmFault) as again:
+        closed_while(caught.value, rig)
+    assert again.value is caught.value
+    assert rig.arm.asked > asked  # it was tried again
+
+
+def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped() -> None:
+    rig = make_rig()
+    stop, pressed = rig.arm.stop, iter([True, True])
+
+    def interrupted() -> None:
+        if next(pressed, False):
+            raise KeyboardInterrupt
+        stop()
+
+    rig.arm.stop = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        run(rig, short_plan(), Memory(fail_after=3, error=KeyboardInterrupt()))
+    assert rig.arm.state() is ArmState.READY
+    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
+
+
+def test_ctrl_c_while_the_arm_moves_clear_stops_it() -> None:
+    rig = make_rig()
+    start, wait, clearing = rig.arm.start, rig.clock.wait, [False]
+
+    def noted(path: Any) -> None:
+        start(path)
+        clearing[0] = failed[0]
+
+    def interrupted(seconds: float) -> None:
+        wait(seconds)
+        if clearing[0]:
+            clearing[0] = False
+            raise KeyboardInterrupt
+
+    failed = [False]
+    sink = Memory(fail_after=3, error=OSError("disk full"))
+    keep = sink.add_events
+
+    def full(chunk: Any) -> None:
+        failed[0] = sink.calls >= 3
+        keep(chunk)
+
+    sink.add_events = full  # type: ignore[method-assign]
+    rig.arm.start, rig.clock.wait = noted, interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        run(rig, short_plan(), sink)
+    assert rig.arm.state() is ArmState.READY  # it stands, half-way clear
+
+
+def test_an_arm_that_does_not_come_clear_is_told_of() -> None:
+    """It is stopped by somebody on its way out: healthy, and still in contact."""
+    rig = make_rig()
+    start, failed = rig.arm.start, [False]
+
+    def hindered(path: Any) -> None:
+        start(path)
+        if failed[0]:
+            rig.arm.stop()
+
+    def full(chunk: Any) -> None:
+        failed[0] = True
+        raise OSError("disk full")
+
+    sink = Memory()
+    sink.add_events = full  # type: ignore[method-assign]
+    rig.arm.start = hindered  # type: ignore[method-assign]
+    with pytest.raises(ArmFault, match="did not come clear of the plate"):
+        run(rig, short_plan(), sink)
+
+
+def test_a_device_with_a_fault_of_its_own_does_not_keep_the_others() -> None:
+    """Not every driver's library raises what the rig's interface allows."""
+    rig = make_rig()
+
+    def broken() -> None:
+        raise ValueError("a library's own")
+
+    rig.events.stop = broken  # type: ignore[method-assign]
+    notes: list[str] = []
+    stop = rig.sync.stop
+    rig.sync.stop = lambda: (notes.append("sync.stop"), stop())[1]  # type: ignore[method-assign, func-returns-value]
+    with pytest.raises(OSError, match="disk full"):
+        run(rig, short_plan(), Memory(fail_after=3, error=OSError("disk full")))
+    assert notes == ["sync.stop"]
+
+
+@pytest.mark.parametrize("device", ["arm", "event_camera"])
+def test_a_plate_that_nobody_has_caught_is_told_of(device: str) -> None:
+    """It hangs on the sensor while the recording runs, and falls when the arm moves clear."""
+    plan = load_plan(ROOT / "protocols" / "pilot_gravity.yaml")
+    rig = make_rig(faults=[gone(device)])
+    assert rig.plate is not None
+    mass = plan.mass_kg(plan.trials[0])
+    rig.operator.ask("changeover", "Mount the plate.", f"{mass} kg")
+    with pytest.raises(RigError, match=r"does not answer .*\. The plate was let go .* catch it"):
+        run(rig, plan, Memory())
+
+
+def test_a_plate_that_was_caught_or_never_let_go_is_not_told_of() -> None:
+    rig = make_rig(faults=[gone("event_camera")])
+    with pytest.raises(RigError, match="does not answer") as caught:
+        run(rig, short_plan(), Memory())
+    assert "plate" not in str(caught.value)

@@ -1,0 +1,111 @@
+"""Which packets of a UDP port are poses of the controller, and how the others are counted."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+from abb_robot_client._egm_protobuf import egm_pb2
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
+from tests.rigs.devices.conftest import egm_message
+from tests.rigs.waiting import own_address
+
+ROBOT = own_address()
+HERE = Pose((400.0, 1.0, 300.0), (180.0, 0.0, 0.0))
+Take = Callable[..., EgmPose | None]
+
+
+def packet(number: int, t_s: float | None, pose: Pose = HERE) -> egm_pb2.EgmRobot:
+    return egm_message(number, t_s, pose)
+
+
+@pytest.fixture
+def receiver() -> Iterator[EgmReceiver]:
+    made = EgmReceiver(ROBOT, 6510, ROBOT)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def take(receiver: EgmReceiver) -> Iterator[Take]:
+    """Sends one packet to the receiver and returns what it makes of it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
+        robot.bind((ROBOT, 0))
+
+        def send(data: egm_pb2.EgmRobot | bytes, link: socket.socket = robot) -> EgmPose | None:
+            raw = data if isinstance(data, bytes) else data.SerializeToString()
+            link.sendto(raw, (ROBOT, 6510))
+            return receiver.read(5.0)
+
+        yield send
+
+
+def test_a_packet_of_the_controller_is_a_pose(take: Take, receiver: EgmReceiver) -> None:
+    came = take(packet(1, 12.345678))
+    assert came is not None
+    assert came.t_ns == 12_345_678_000
+    assert came.measured.xyz_mm == HERE.xyz_mm
+    assert receiver.counts == EgmCounts()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff" * 40,
+        b"hello",
+        packet(1, 1.0, Pose((math.nan, 0.0, 0.0), HERE.rotvec_deg)),
+        packet(1, 1.0, Pose((math.inf, 0.0, 0.0), HERE.rotvec_deg)),
+        packet(1, 1.0, Pose((1e9, 0.0, 0.0), HERE.rotvec_deg)),
+    ],
+)
+def test_what_is_no_packet_is_dropped_and_the_next_one_is_read(
+    take: Take, receiver: EgmReceiver, data: egm_pb2.EgmRobot | bytes
+) -> None:
+    assert take(data) is None
+    assert receiver.counts == EgmCounts(malformed=1)
+    assert take(packet(2, 2.0)) is not None
+
+
+def test_a_rotation_that_is_none_is_dropped(take: Take, receiver: EgmReceiver) -> None:
+    still = packet(1, 1.0)
+    still.feedBack.cartesian.orient.u1 = 0.0
+    still.feedBack.cartesian.orient.u0 = 0.0
+    assert take(still) is None
+    assert receiver.counts == EgmCounts(malformed=1)
+
+
+def test_other_senders_are_not_believed(take: Take, receiver: EgmReceiver) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((own_address(), 0))
+        assert take(packet(1, 1.0, Pose((9999.0, 9999.0, 9999.0), HERE.rotvec_deg)), other) is None
+        assert take(b"\xff" * 40, other) is None
+    assert receiver.counts == EgmCounts(foreign=2)
+
+
+def test_lost_late_and_doubled_packets_are_counted(take: Take, receiver: EgmReceiver) -> None:
+    assert take(packet(10, 1.000)) is not None
+    assert take(packet(14, 1.016)) is not None
+    assert receiver.counts == EgmCounts(lost=3)
+    assert take(packet(12, 1.008)) is None
+    assert take(packet(14, 1.016)) is None
+    assert receiver.counts == EgmCounts(lost=3, late=2)
+    assert take(packet(0, 1.500)) is not None  # counted anew with the next program
+    assert take(packet(1, 1.504)) is not None
+    assert receiver.counts == EgmCounts(lost=3, late=2)
+
+
+@pytest.mark.parametrize(("number", "t_s"), [(2, 95.0), (2, 99.999), (0, 95.0)])
+def test_a_clock_that_goes_back_is_a_fault(take: Take, number: int, t_s: float) -> None:
+    assert take(packet(1, 100.0)) is not None
+    with pytest.raises(EgmFault, match=rf"clock went back by {100 - t_s:.3f} s"):
+        take(packet(number, t_s))
+
+
+def test_packets_without_time_are_a_fault(take: Take) -> None:
+    with pytest.raises(EgmFault, match=r"carry no time.*RobotWare 6\.07"):
+        take(packet(1, None))

@@ -1,0 +1,41 @@
+"""The module for a real controller and what the stand-in makes of it, held together."""
+
+from __future__ import annotations
+
+import re
+
+from sliplab.rigs.devices.abb.fake import WATCH_S
+from sliplab.rigs.devices.abb.settings import AbbSettings
+from sliplab.rigs.devices.abb.watchdog import BEAT, BEAT_S, ECHO, LIMIT
+from tests.conftest import ROOT
+
+RAPID = ROOT / "docs" / "rapid"
+MODULE = (RAPID / "sliplab_watchdog.mod").read_text()
+
+
+def test_the_module_speaks_by_the_signals_that_the_driver_knows() -> None:
+    code = "\n".join(line.partition("!")[0] for line in MODULE.splitlines())
+    assert set(re.findall(r"sliplab_(?!watchdog)\w+", code)) == {BEAT, ECHO, LIMIT}
+    signals = (RAPID / "sliplab_watchdog_eio.cfg").read_text()
+    assert re.findall(r'-Name "(\w+)" -SignalType "AO"( -Access "All")?', signals) == [
+        (BEAT, ' -Access "All"'),
+        (LIMIT, ' -Access "All"'),
+        (ECHO, ""),
+    ]
+
+
+def test_the_module_is_loaded_into_a_task_whose_end_stops_the_arm() -> None:
+    system = (RAPID / "sliplab_watchdog_sys.cfg").read_text()
+    (task,) = set(re.findall(r'-Task "(\w+)"', system)) & set(re.findall(r'-Name "(\w+)"', system))
+    assert len(task) <= 16  # the controller's limit of a task's name
+    assert '-TrustLevel "SysStop"' in system
+    assert MODULE.startswith("MODULE sliplab_watchdog\n")
+    assert MODULE.count("SystemStopAction\\Stop;") == 1
+
+
+def test_the_stand_in_has_the_cycle_of_the_module_and_beats_fit_into_every_limit() -> None:
+    found = re.search(r"CONST num cycle_s:=([0-9.]+);", MODULE)
+    assert found is not None
+    assert float(found[1]) == WATCH_S
+    shortest = AbbSettings.model_json_schema()["properties"]["watchdog_s"]["anyOf"][0]["minimum"]
+    assert shortest > BEAT_S + WATCH_S

@@ -1,0 +1,190 @@
+"""The grab thread against results that no emulated camera gives: chunks, disorder, lateness."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.rigs.devices.basler.frame_time import Stamping
+from sliplab.rigs.devices.basler.grabbing import NO_ID, Grab, GrabSettings
+
+pytestmark = [pytest.mark.usefixtures("pylon_emulation"), pytest.mark.realtime]
+Until = Callable[[Callable[[], bool]], None]
+CHUNKS = GrabSettings(
+    stamping=Stamping("chunk", "hardware trigger"),
+    mid_exposure_ns=1000,
+    first_id=0,
+    period_ns=10_000_000,
+    late_ns=100_000_000,
+    sync_bit=2,
+    queue=100,
+    first_ns=0,
+    stall_ns=0,
+)
+
+
+class Result:
+    """A grab result with chunks."""
+
+    def __init__(self, block: int, **changes: Any) -> None:
+        self.BlockID, self.ImageNumber, self.NumberOfSkippedImages = block, block + 1, 0
+        self.TimeStamp, self.Array = 0, np.full((2, 3), block % 256, np.uint8)
+        self.ChunkTimestamp = SimpleNamespace(Value=time.monotonic_ns())
+        self.ChunkLineStatusAll = SimpleNamespace(Value=0)
+        self.good = True
+        vars(self).update(changes)
+
+    def IsValid(self) -> bool:
+        return True
+
+    def GrabSucceeded(self) -> bool:
+        return self.good
+
+    def Release(self) -> None:
+        pass
+
+
+class Device:
+    """What the thread needs of a camera; gives what it is told to."""
+
+    def __init__(self, *results: Result) -> None:
+        self.results, self.error, self.removed = list(results), None, False
+
+    def RetrieveResult(self, timeout_ms: int, handling: Any) -> Any:
+        if self.error is not None:
+            raise self.error
+        return self.results.pop(0) if self.results else None
+
+    def IsCameraDeviceRemoved(self) -> bool:
+        return self.removed
+
+
+@contextmanager
+def grabbing(
+    device: Device, settings: GrabSettings = CHUNKS, ends: dict[int, int] | None = None
+) -> Iterator[Grab]:
+    grab = Grab(device, settings, {} if ends is None else ends)
+    try:
+        yield grab
+    finally:
+        grab.stop()
+
+
+def changed(**changes: Any) -> GrabSettings:
+    return GrabSettings(**vars(CHUNKS) | changes)
+
+
+def test_chunks_give_time_and_level_of_the_sync_line(until: Until) -> None:
+    level = SimpleNamespace(Value=0b0100)
+    other = SimpleNamespace(Value=0b1011)
+    stamp = SimpleNamespace(Value=5_000_000)
+    device = Device(
+        Result(0, ChunkTimestamp=stamp, ChunkLineStatusAll=level),
+        Result(1, ChunkLineStatusAll=other),
+    )
+    with grabbing(device) as grab:
+        until(lambda: grab.counts.grabbed == 2)
+        first, second = grab.take()
+        assert (first.number, first.t_ns, first.sync) == (0, 5_001_000, 1)
+        assert (second.number, second.sync) == (1, 0)
+
+
+def test_a_frame_out_of_order_or_twice_is_counted_and_kept_back(until: Until) -> None:
+    with grabbing(Device(*map(Result, (0, 2, 1, 2, 3)))) as grab:
+        until(lambda: grab.counts.grabbed == 3)
+        assert [frame.number for frame in grab.take()] == [0, 2, 3]
+        counts = grab.counts
+        assert (counts.skipped, counts.out_of_order) == (1, 2)
+
+
+def test_without_block_ids_what_pylon_overwrote_is_counted(until: Until) -> None:
+    device = Device(
+        Result(0, BlockID=NO_ID, ImageNumber=1),
+        Result(0, BlockID=NO_ID, ImageNumber=2, NumberOfSkippedImages=3),
+    )
+    with grabbing(device) as grab:
+        until(lambda: grab.counts.grabbed == 2)
+        assert grab.counts.skipped == 3
+
+
+def test_a_frame_that_took_longer_than_allowed_is_late_and_handed_on(until: Until) -> None:
+    now = time.monotonic_ns()
+    slow = SimpleNamespace(Value=now - 10**9)
+    device = Device(Result(0), Result(1, ChunkTimestamp=slow))
+    with grabbing(device) as grab:
+        until(lambda: grab.counts.grabbed == 2)
+        assert grab.counts.late == 1
+
+
+def test_a_promised_stamp_that_is_missing_ends_the_run(until: Until) -> None:
+    device = Device(Result(0, ChunkTimestamp=SimpleNamespace(Value=0)))
+    with grabbing(device) as grab:
+        until(lambda: grab.fault is not None)
+        assert "says no time" in str(grab.fault)
+
+
+def test_an_exposure_end_that_comes_late_is_waited_for_and_one_that_never_comes_given_up(
+    until: Until,
+) -> None:
+    ends: dict[int, int] = {1: 9_000}
+    settings = changed(
+        stamping=Stamping("exposure end event", "exposure line"), sync_bit=None, late_ns=10**12
+    )
+    device = Device(Result(0), Result(1))
+    with grabbing(device, settings, ends) as grab:
+        until(lambda: grab.counts.grabbed == 1)
+        assert grab.counts.unstamped == 1
+        assert [frame.t_ns for frame in grab.take()] == [8_000]
+        device.results.append(Result(2))
+        until(lambda: not device.results)
+        ends[2] = 19_000
+        until(lambda: grab.counts.grabbed == 2)
+        assert [frame.number for frame in grab.take()] == [2]
+
+
+def test_a_frame_that_still_waits_for_its_time_at_the_end_is_counted(until: Until) -> None:
+    settings = changed(stamping=Stamping("exposure end event", "exposure line"), sync_bit=None)
+    device = Device(Result(0))
+    with grabbing(device, settings) as grab:
+        until(lambda: not device.results)
+        grab.stop()
+        assert (grab.counts.unstamped, grab.counts.lost) == (1, 1)
+
+
+def test_a_full_queue_waits_for_its_reader_and_loses_nothing(until: Until) -> None:
+    with grabbing(Device(*map(Result, range(10))), changed(queue=4)) as grab:
+        until(lambda: grab.counts.grabbed == 4)
+        got = [frame.number for frame in grab.take()]
+        until(lambda: grab.counts.grabbed == 8)
+        got += [frame.number for frame in grab.take()]
+        until(lambda: grab.counts.grabbed == 10)
+        got += [frame.number for frame in grab.take()]
+        assert got == list(range(10))
+
+
+def test_a_pylon_that_hangs_is_an_error(until: Until, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sliplab.rigs.devices.basler.grabbing.HANG_S", 0.3)
+    go = threading.Event()
+    device = Device()
+    monkeypatch.setattr(device, "RetrieveResult", lambda *_: go.wait(60.0) and None)
+    with grabbing(device) as grab:
+        until(lambda: grab.fault is not None)
+        assert "has not answered" in str(grab.fault)
+        go.set()
+
+
+def test_whatever_pylon_raises_is_a_rigs_error(until: Until) -> None:
+    device = Device()
+    with grabbing(device) as grab:
+        device.error = RuntimeError("the driver is confused")
+        until(lambda: grab.fault is not None)
+        assert isinstance(grab.fault, RigError)
+        assert "confused" in str(grab.fault)

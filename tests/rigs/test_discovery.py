@@ -1,0 +1,91 @@
+"""Whether devices can be reached is told by name, with what to look at."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from sliplab.rigs.devices.dvxplorer.fake_live import LiveDvxplorer
+from sliplab.rigs.devices.settings import DeviceSettings
+from sliplab.rigs.discovery import reach
+from tests.rigs.waiting import own_address
+
+LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
+
+
+@pytest.fixture
+def listening() -> Iterator[tuple[str, int]]:
+    """An address where somebody takes connections."""
+    host = own_address()
+    with socket.create_server((host, 0)) as server:
+        yield host, server.getsockname()[1]
+
+
+def devices(**more: Any) -> DeviceSettings:
+    plain = {
+        "arm": {"driver": "abb_socket", "host": own_address(), "limits": LIMITS},
+        "frame_camera": {},
+        "sync_box": {"port": "/dev/nothing"},
+    }
+    return DeviceSettings.model_validate({**plain, **more})
+
+
+def test_what_is_not_there_is_named_with_what_to_look_at() -> None:
+    found = reach(devices())
+    assert set(found) == {"arm", "event camera", "frame camera", "sync box"}
+    assert "look at its power, its cable and the address" in (found["arm"] or "")
+    assert (
+        found["sync box"] == "there is no /dev/nothing; look at its cable, and at /dev/serial/by-id"
+    )
+    assert "was not found" in (found["event camera"] or "")
+
+
+def stream(events_port: int, triggers_port: int) -> dict[str, Any]:
+    """An event camera on the network."""
+    ports = {"events_port": events_port, "triggers_port": triggers_port}
+    return {"source": {"kind": "network", "host": "127.0.0.1", **ports}}
+
+
+def test_an_arm_and_streams_that_answer_are_reached(listening: tuple[str, int]) -> None:
+    host, port = listening
+    camera = LiveDvxplorer((640, 480))
+    try:
+        found = reach(
+            devices(
+                arm={"driver": "abb_socket", "host": host, "port": port, "limits": LIMITS},
+                event_camera=stream(*camera.ports),
+            )
+        )
+    finally:
+        camera.close()
+    assert found["arm"] is None
+    assert found["event camera"] is None
+
+
+def test_a_stream_without_its_other_or_a_silent_port_is_not_reached() -> None:
+    camera = LiveDvxplorer((640, 480))
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        number = silent.getsockname()[1]
+        try:
+            half = reach(devices(event_camera=stream(camera.ports[0], 1)))["event camera"]
+            mute = reach(devices(event_camera=stream(camera.ports[0], number)))["event camera"]
+        finally:
+            camera.close()
+    assert half is not None
+    assert half.startswith("127.0.0.1:1: ")
+    assert mute is not None
+    assert mute.startswith(f"127.0.0.1:{number}: no answer within 2 s")
+
+
+def test_a_port_is_reached_and_a_rig_without_one_is_told() -> None:
+    master, slave = os.openpty()
+    try:
+        assert reach(devices(sync_box={"port": os.ttyname(slave)}))["sync box"] is None
+        assert reach(devices(sync_box=None))["sync box"] == "no port is named"
+    finally:
+        os.close(master)
+        os.close(slave)
