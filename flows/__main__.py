@@ -11,7 +11,7 @@ import os
 import sys
 from contextlib import suppress
 
-from sliplab.flows.running.limits import exhausted, run_in_child, too_few_threads
+from sliplab.flows.running.process import exhausted, run_in_child, too_few_threads
 
 
 def main() -> None:
@@ -19,10 +19,9 @@ def main() -> None:
     if reason := too_few_threads() or run_in_child():
         sys.exit(_fail(reason, 1))
     try:
-        from sliplab.flows.running import garbage
-        from sliplab.flows.running.standard_streams import OutputLost, guarded
+        from sliplab.flows.running.process import OutputLost, collect_garbage_seldom, guarded
 
-        garbage.seldom()
+        collect_garbage_seldom()
         try:
             with guarded():
                 code = _run()

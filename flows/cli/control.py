@@ -173,7 +173,7 @@ def serve(
     as_json: JsonOption = False,
 ) -> None:
     """Serve collect, label, train, evaluate, report, study and chain; Ctrl-C ends, arm first."""
-    from sliplab.flows.serving.serve_file import load_schedules
+    from sliplab.flows.server.schedules import load_schedules
     from sliplab.rigs.rig_file import load_rig_file
     from sliplab.rigs.rig_inheritance import rig_path
 
@@ -188,7 +188,7 @@ def serve(
             console.print_table(f"schedules of {schedules}", columns, rows)
         return
     prepare_store(store)
-    from sliplab.flows.serving.serve import serve as run
+    from sliplab.flows.server.serve import serve as run
     from sliplab.storage.trials.store import Store
 
     run(

@@ -20,8 +20,7 @@ from pydantic import ValidationError
 from typer.exceptions import TyperException
 
 from sliplab.flows.running import console, extras
-from sliplab.flows.running.limits import exhausted
-from sliplab.flows.running.standard_streams import OutputLost
+from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError, disk_error
 from sliplab.storage.files import disk_fault

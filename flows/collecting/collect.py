@@ -19,7 +19,7 @@ from sliplab.flows.collecting.trial_gate import carry_out, refuse_paused
 from sliplab.flows.planning.run_request import RunRequest, campaign_counts, check_disk
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, run
-from sliplab.flows.running.timing import timed
+from sliplab.flows.running.run_records import timed
 from sliplab.protocols import Trial
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels import labelling
-from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
+from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows import dataset
-from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.flows.running.parallel_map import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

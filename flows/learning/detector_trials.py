@@ -19,7 +19,7 @@ from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
-from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.flows.running.parallel_map import TrialWork, keep_trials, stale_trials
 from sliplab.protocols.settings import Windows
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording

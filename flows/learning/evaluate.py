@@ -25,7 +25,7 @@ from sliplab.flows.learning.train import Model, rules_of, training_settings, wan
 from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import key_inputs, score_windows
 from sliplab.flows.running.orchestration import Opaque, run
-from sliplab.flows.running.timing import timed
+from sliplab.flows.running.run_records import timed
 from sliplab.protocols.settings import Detection
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.derived import Derived, make_key

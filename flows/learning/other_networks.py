@@ -34,8 +34,8 @@ from sliplab.flows.learning.trial_scores import score_row, summaries
 from sliplab.flows.learning.window_scores import intervals_of
 from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
-from sliplab.flows.running.timing import timed
-from sliplab.flows.running.trial_work import TrialWork, keep_trials, stale_trials
+from sliplab.flows.running.parallel_map import TrialWork, keep_trials, stale_trials
+from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows

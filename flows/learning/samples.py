@@ -13,7 +13,7 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
 from sliplab.flows.labelling.reviewed import Labels
-from sliplab.flows.running.trial_work import TrialWork, each_trial
+from sliplab.flows.running.parallel_map import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import Samples, Windows

@@ -23,7 +23,7 @@ from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.orchestration import Opaque, run
-from sliplab.flows.running.timing import timed
+from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
 from sliplab.storage.files import read_json, write_bytes, write_json, write_text

@@ -21,7 +21,7 @@ from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.samples import STEP as SAMPLES
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console
-from sliplab.flows.running.timing import timed
+from sliplab.flows.running.run_records import timed
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 

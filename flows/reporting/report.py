@@ -24,8 +24,8 @@ from sliplab.flows.reporting import sections
 from sliplab.flows.reporting.report_against import compare, load_other
 from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.reporting.summary import make_summary
-from sliplab.flows.running import timing
 from sliplab.flows.running.orchestration import Opaque, run
+from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
 from sliplab.storage.files import make_folder, read_json, write_json, write_text
 from sliplab.storage.names import safe_name
@@ -84,7 +84,7 @@ def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
     store, campaigns, key = wanted.content
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
-    with timing.timed(store, "report"):
+    with timed(store, "report"):
         _, evaluation = evaluate.evaluation_of(store)
         model = evaluate.choose_model(
             wanted_models(store, campaigns, evaluation.get("reviewed") is not None)
@@ -103,7 +103,7 @@ def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
             simulated=summary["simulated"],
         )
         write_text(folder / "index.html", html)
-    summary["timing_s"] = timing.read(store)
+    summary["timing_s"] = step_seconds(store)
     write_json(folder / "summary.json", summary)
     Derived.of(store, STEP).write(STEP, key, {})
 

@@ -16,7 +16,7 @@ from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.campaign_section import reference_rows, wear
 from sliplab.flows.reporting.report_trials import accounted, intervals, trial_summary
-from sliplab.flows.running import timing
+from sliplab.flows.running.run_records import step_seconds
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
 from sliplab.rigs.rig_file import load_rig_file
@@ -106,7 +106,7 @@ def make_summary(
         "sync": _sync(campaigns),
         "quality": _quality(campaigns),
         "planned": {item.name: _planned(item) for item in campaigns},
-        "timing_s": timing.read(store),
+        "timing_s": step_seconds(store),
         "versions": {name: version(name) for name in _PACKAGES},
         "protocols": {
             item.name: {

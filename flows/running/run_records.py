@@ -12,15 +12,24 @@ for ever. The same program reports the ends that a server, which did not answer 
 from __future__ import annotations
 
 import re
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from sliplab.storage.files import make_folder, read_json, sweep_temporary, write_new_json
+from sliplab.storage.files import (
+    make_folder,
+    read_json,
+    sweep_temporary,
+    write_json,
+    write_new_json,
+)
 from sliplab.storage.process import is_here, named, now, this_process
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.control import FOLDER
+from sliplab.storage.trials.store import Store
 
 EMBEDDED = "embedded"
 _ID = r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"
@@ -160,3 +169,23 @@ def hooks(store: Path, server: str) -> dict[str, list[Any]]:
 
 def _folder(store: Path) -> Path:
     return store / FOLDER / "runs"
+
+
+def _timing_file(store: Store) -> Path:
+    return store.folder / "derived" / "timing.json"
+
+
+def step_seconds(store: Store) -> dict[str, float]:
+    """Wall seconds by step, of the last run that had something to do."""
+    path = _timing_file(store)
+    return {key: float(value) for key, value in read_json(path).items()} if path.exists() else {}
+
+
+@contextmanager
+def timed(store: Store, step: str) -> Iterator[None]:
+    """Keep the wall seconds of the block under `step` if it ends well."""
+    start = time.perf_counter()
+    yield
+    path = _timing_file(store)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, {**step_seconds(store), step: round(time.perf_counter() - start, 2)})

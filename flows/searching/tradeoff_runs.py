@@ -115,7 +115,7 @@ def everywhere(
     """
     from sliplab.flows.running.orchestration import Opaque
     from sliplab.flows.running.orchestration import run as orchestrate
-    from sliplab.flows.running.spread import spread_flow
+    from sliplab.flows.running.parallel_map import parallel_map_flow
 
     found: dict[int, Any] = {}
 
@@ -123,7 +123,7 @@ def everywhere(
         found[number] = result
         done()
 
-    orchestrate(spread_flow, Opaque(("trade-off", piece, jobs, keep, cluster)), cluster)
+    orchestrate(parallel_map_flow, Opaque(("trade-off", piece, jobs, keep, cluster)), cluster)
     return [found[number] for number in range(len(jobs))]
 
 

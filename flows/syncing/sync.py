@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows.running import console
-from sliplab.flows.running.trial_work import TrialWork, run_trials, stale_trials
+from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.flows.syncing.sync_numbers import campaign_numbers
 from sliplab.flows.syncing.sync_page import PAGE, render

@@ -27,7 +27,7 @@ from sliplab.flows.learning.samples import by_id, load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting.report import read_summary, report
-from sliplab.flows.running import trial_work
+from sliplab.flows.running import parallel_map
 from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
 from sliplab.protocols.errors import InputError
@@ -340,7 +340,7 @@ def test_the_same_seed_gives_the_same_summary(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, rig_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(trial_work, "START_S", 0.0)  # all in processes, and still the same
+    monkeypatch.setattr(parallel_map, "START_S", 0.0)  # all in processes, and still the same
     run_requests = [
         make_request(Path(run_request.plan.file), rig_path, tmp_path / "store")
         for run_request in ran[0]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.running.limits import exhausted, too_few_threads
+from sliplab.flows.running.process import exhausted, too_few_threads
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
@@ -180,7 +180,7 @@ def test_hdf5_does_not_crash_a_program_whose_file_may_grow_no_more(
 
 CRASH = """
 import os, signal, sys, time
-from sliplab.flows.running import limits
+from sliplab.flows.running import process
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (4 << 30, 4 << 30))

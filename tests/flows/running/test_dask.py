@@ -23,7 +23,7 @@ from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.running import cluster as clusters
-from sliplab.flows.running import stopping, trial_work
+from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.searching.tradeoff_runs import everywhere
 from sliplab.protocols.errors import InputError
@@ -54,7 +54,7 @@ def here(taken: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
     folder = tmp_path_factory.mktemp("here") / "store"
     shutil.copytree(taken, folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trial_work, "START_S", math.inf)
+        patch.setattr(parallel_map, "START_S", math.inf)
         return run_steps(folder, None)
 
 
@@ -189,7 +189,7 @@ def test_what_cannot_be_used_is_said_at_once(
         pass
     store = Store.open(taken)
     with connected(address) as found, monkeypatch.context() as patch:
-        patch.setattr(trial_work, "place_of", lambda _: str(tmp_path / "elsewhere"))
+        patch.setattr(parallel_map, "place_of", lambda _: str(tmp_path / "elsewhere"))
         with pytest.raises(ClusterError, match=r"worker tcp://.* is not a store .*same path"):
             label(store, collected(store), found)
     with monkeypatch.context() as patch:

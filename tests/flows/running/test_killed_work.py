@@ -18,13 +18,13 @@ import pytest
 
 from sliplab.analysis.campaigns import collected
 from sliplab.flows.labelling.label import label
-from sliplab.flows.running import trial_work
-from sliplab.flows.running.spread import WorkerKilled
+from sliplab.flows.running import parallel_map
+from sliplab.flows.running.parallel_map import WorkerKilled
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import six_trials
-from tests.flows.serving.serving import until
+from tests.flows.server.serving import until
 
 pytestmark = pytest.mark.programs
 
@@ -103,7 +103,7 @@ def test_a_worker_process_that_is_killed_is_said_and_the_rest_is_made(
     for path in (taken / "derived" / "labels").rglob("*"):
         if path.is_file():
             path.unlink()
-    monkeypatch.setattr(trial_work, "START_S", 0.0)
+    monkeypatch.setattr(parallel_map, "START_S", 0.0)
     over = threading.Event()
     others = set(active_children())
 

@@ -15,7 +15,7 @@ from prefect.runtime import flow_run
 from prefect.settings import temporary_settings
 
 from benchmarks.orchestration import _drained
-from sliplab.flows.running import embedded_database
+from sliplab.flows.running import embedded_server
 from sliplab.flows.running.orchestration import Opaque, embedded, run
 
 COUNT = 120
@@ -68,22 +68,22 @@ def test_a_new_file_begins_as_a_copy_only_of_one_that_is_sound(
 
     def make() -> None:
         made.append("made")
-        _fill(tmp_path / "home" / embedded_database.NAME)
+        _fill(tmp_path / "home" / embedded_server.NAME)
 
-    monkeypatch.setattr(embedded_database, "_make", make)
+    monkeypatch.setattr(embedded_server, "_make", make)
     (tmp_path / "home").mkdir()
-    template = embedded_database._template()
+    template = embedded_server._template()
     assert template is not None
     template.parent.mkdir(parents=True)
     if kept == "damaged":
         template.write_bytes(b"not a database at all" * 1000)
     elif kept != "none":
         _fill(template, runs=kept == "used")
-    embedded_database.ready(tmp_path / "home")
+    embedded_server.ready(tmp_path / "home")
     assert made == ([] if kept == "sound" else ["made"])
-    assert _tables(tmp_path / "home" / embedded_database.NAME) >= {"flow_run", "task_run"}
-    assert embedded_database._sound(template)  # the next one begins with it
-    embedded_database.ready(tmp_path / "home")  # which is there now
+    assert _tables(tmp_path / "home" / embedded_server.NAME) >= {"flow_run", "task_run"}
+    assert embedded_server._sound(template)  # the next one begins with it
+    embedded_server.ready(tmp_path / "home")  # which is there now
     assert made == ([] if kept == "sound" else ["made"])
 
 

@@ -24,7 +24,7 @@ import pytest
 from sliplab.flows.running.embedded_server import EmbeddedServer
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.serving.serving import until
+from tests.flows.server.serving import until
 
 pytestmark = pytest.mark.programs
 

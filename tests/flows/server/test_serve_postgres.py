@@ -20,7 +20,7 @@ from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
-from tests.flows.serving.serving import LIMIT_S, Page, serving, until
+from tests.flows.server.serving import LIMIT_S, Page, serving, until
 
 TRIALS = 20
 BIN = max(Path("/usr/lib/postgresql").glob("*/bin"), default=None)

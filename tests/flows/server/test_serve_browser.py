@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
-from tests.flows.serving.serving import Page, serving
+from tests.flows.server.serving import Page, serving
 
 pytestmark = [needs_browser, pytest.mark.programs]
 

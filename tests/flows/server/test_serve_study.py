@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.serving import serve_flows
-from sliplab.flows.serving.serve_parameters import Study
+from sliplab.flows.server import deployments
+from sliplab.flows.server.schedules import Study
 from sliplab.flows.study import Outcome
 from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from tests.conftest import ROOT
@@ -41,10 +41,10 @@ def test_a_served_study_asks_for_the_same_trials(
 
     monkeypatch.setattr("sliplab.flows.study.study", study)
     monkeypatch.setattr(
-        serve_flows, "when_free", lambda _run_request, _patience, work, _run: work()
+        deployments, "when_free", lambda _run_request, _patience, work, _run: work()
     )
     here: Any = SimpleNamespace(rig=ROOT / "rigs" / "rehearsal.yaml", folder=tmp_path / "store")
-    said = serve_flows._study(Study(extra=extra), here, None)
+    said = deployments._study(Study(extra=extra), here, None)
     assert said == "3 trials taken; report: 1 done"
     run_requests, check = asked
     assert check == LABELS_CHECKED

@@ -21,11 +21,10 @@ from sliplab.flows.collecting.stops import WindowOver
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration, run_records
 from sliplab.flows.running.embedded_server import EmbeddedServer
-from sliplab.flows.serving import serve, serve_runs
-from sliplab.flows.serving.serve_file import Scheduled
-from sliplab.flows.serving.serve_parameters import Ask, Chain, Collect, OnRig
-from sliplab.flows.serving.serve_runs import until_of
-from sliplab.flows.serving.service import Service
+from sliplab.flows.server import deployments, serve
+from sliplab.flows.server.deployments import until_of
+from sliplab.flows.server.schedules import Ask, Chain, Collect, OnRig, Scheduled
+from sliplab.flows.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.derived import Derived
@@ -33,7 +32,7 @@ from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.crash import campaign
-from tests.flows.serving.serving import Page
+from tests.flows.server.serving import Page
 
 RIG = ROOT / "rigs" / "rehearsal.yaml"
 
@@ -77,7 +76,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
 ) -> None:
     from prefect.client.orchestration import get_client
 
-    from sliplab.flows.serving.serve_flows import collect
+    from sliplab.flows.server.deployments import collect
 
     with get_client(sync_client=True) as client:
         showing.sign_rig(client, "rehearsal", True)  # as a killed program left it
@@ -98,7 +97,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
 
 
 def test_what_goes_wrong_is_one_message(service: Service, protocol: Path) -> None:
-    from sliplab.flows.serving.serve_flows import chain, collect, pause, resume
+    from sliplab.flows.server.deployments import chain, collect, pause, resume
 
     state = collect(Collect(protocol=protocol.with_name("none.yaml")), return_state=True)
     assert state.type.value == "FAILED"
@@ -159,7 +158,7 @@ def test_nothing_is_quoted_of_what_is_no_protocol(
 
 
 def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protocol: Path) -> None:
-    from sliplab.flows.serving.serve_flows import collect
+    from sliplab.flows.server.deployments import collect
 
     with ExitStack() as stack:
         stack.enter_context(exclusive(service.folder / ".lock", "the store"))
@@ -170,11 +169,11 @@ def test_a_rig_in_use_is_waited_for_as_long_as_was_said(service: Service, protoc
 def test_a_rig_that_is_free_again_is_taken(
     service: Service, protocol: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serve_runs, "LOOK_S", 0.01)
+    monkeypatch.setattr(deployments, "LOOK_S", 0.01)
     run_request = make_request(protocol, RIG, service.folder)
     answers = [Locked("the rig is in use by anna"), Locked("still"), {"taken": 1}]
     told: list[str] = []
-    monkeypatch.setattr(serve_runs, "_report_waiting", lambda run, why: told.append(why))
+    monkeypatch.setattr(deployments, "_report_waiting", lambda run, why: told.append(why))
 
     def work() -> dict[str, Any]:
         answer = answers.pop(0)
@@ -182,11 +181,11 @@ def test_a_rig_that_is_free_again_is_taken(
             raise answer
         return answer
 
-    assert serve_runs.when_free(run_request, 10.0, work, None) == {"taken": 1}
+    assert deployments.when_free(run_request, 10.0, work, None) == {"taken": 1}
     assert told == ["the rig is in use by anna"]
     answers[:] = [Locked("the rig is in use by anna")]
     with pytest.raises(WindowOver, match="nothing was taken: the rig is in use by anna"):
-        serve_runs.when_free(replace(run_request, until=0.0), 10.0, work, None)
+        deployments.when_free(replace(run_request, until=0.0), 10.0, work, None)
 
 
 def test_a_window_that_is_over_moves_nothing(service: Service, protocol: Path) -> None:
@@ -208,7 +207,7 @@ def test_runs_of_killed_processes_are_closed_at_the_next_start(
     from prefect.client.orchestration import get_client
     from prefect.states import Completed, Running
 
-    from sliplab.flows.serving.serve_flows import label
+    from sliplab.flows.server.deployments import label
 
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
@@ -244,7 +243,7 @@ def test_a_servers_name_has_no_secrets() -> None:
 def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     service: Service, server: EmbeddedServer, tmp_path: Path
 ) -> None:
-    from sliplab.flows.serving.serve_flows import collect
+    from sliplab.flows.server.deployments import collect
 
     when = serve._prefects(
         [
@@ -296,7 +295,7 @@ def test_what_a_killed_service_had_taken_is_closed(
     from prefect.client.orchestration import get_client
     from prefect.states import Pending
 
-    from sliplab.flows.serving.serve_flows import label
+    from sliplab.flows.server.deployments import label
 
     async def register() -> None:
         await (await label.ato_deployment("stranded")).aapply()

@@ -18,11 +18,11 @@ from urllib.request import urlopen
 
 import pytest
 
-from sliplab.flows.serving import serve
+from sliplab.flows.server import serve
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
-from tests.flows.serving.serving import Page, serving, until
+from tests.flows.server.serving import Page, serving, until
 
 pytestmark = pytest.mark.programs
 

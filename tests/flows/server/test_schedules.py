@@ -13,8 +13,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.flows.serving.serve_file import load_schedules
-from sliplab.flows.serving.serve_windows import DAYS, window_end
+from sliplab.flows.server.schedules import DAYS, load_schedules, window_end
 from sliplab.protocols import InputError
 from tests.conftest import ROOT
 

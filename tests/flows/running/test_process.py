@@ -13,8 +13,8 @@ from typing import TextIO
 
 import pytest
 
-from sliplab.flows.running import standard_streams
-from sliplab.flows.running.standard_streams import OutputLost
+from sliplab.flows.running import process
+from sliplab.flows.running.process import OutputLost
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.programs
@@ -59,7 +59,7 @@ def test_each_stream_may_be_closed_or_full(line: str, code: int, said: str) -> N
 def test_a_closed_stream_is_no_file_of_ours() -> None:
     """The next file that is opened has a number of its own, so nothing can be printed into it."""
     line = (
-        "import os; from sliplab.flows.running.standard_streams import guarded\n"
+        "import os; from sliplab.flows.running.process import guarded\n"
         "with guarded(): assert os.open('/dev/null', os.O_RDONLY) > 2"
     )
     done = shell(f'{sys.executable} -c "{line}" <&- >&- 2>&-')
@@ -77,14 +77,14 @@ def pipe() -> Iterator[tuple[int, int]]:
 
 
 def stream(handle: int, *, required: bool) -> TextIO:
-    return standard_streams._text(handle, "", None, required=required)
+    return process._text(handle, "", None, required=required)
 
 
 def test_messages_that_nobody_reads_are_dropped(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stalled reader of the log must not hold up an arm."""
-    monkeypatch.setattr(standard_streams, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(process, "PATIENCE_S", 0.01)
     read, write = pipe
     messages = stream(write, required=False)
     for number in range(1000):
@@ -129,7 +129,7 @@ def test_a_result_without_a_reader_is_an_error_once() -> None:
 def test_streams_of_a_test_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr("sys.stdout", out)
-    with standard_streams.guarded():
+    with process.guarded():
         assert sys.stdout is out
 
 

@@ -2,7 +2,7 @@
 
 Prefect's runner takes a single run at a time, because a rig is one thing. Each is a process of its
 own, which stops its arm and ends when this program ends, however that happens. Pause, resume and
-stop are carried past it (`flows.serving.serve_control`).
+stop are carried past it (`flows.server.control_runs`).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from urllib.request import ProxyHandler, build_opener
 from sliplab import protocols
 from sliplab.flows.running import console, run_records
 from sliplab.flows.running.embedded_server import new_password
-from sliplab.flows.serving.serve_control import answer_page
-from sliplab.flows.serving.serve_file import Scheduled
-from sliplab.flows.serving.serve_watch import PageServer, ask_on, watch
-from sliplab.flows.serving.service import Service
+from sliplab.flows.server.control_runs import answer_page
+from sliplab.flows.server.page_server import PageServer, ask_on, watch
+from sliplab.flows.server.schedules import Scheduled
+from sliplab.flows.server.service import Service
 from sliplab.protocols import InputError
 from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.lock import exclusive
@@ -184,7 +184,7 @@ async def _serve(
 ) -> None:
     from prefect.runner import Runner
 
-    from sliplab.flows.serving.serve_flows import CONTROL, ON_RIG
+    from sliplab.flows.server.deployments import CONTROL, ON_RIG
 
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny, write
-from tests.flows.serving.serving import FINAL, Page, serving, until
+from tests.flows.server.serving import FINAL, Page, serving, until
 
 pytestmark = pytest.mark.programs
 

@@ -1,0 +1,342 @@
+"""What each deployment may be asked for, and the file that says when.
+
+timezone: Europe/Rome
+schedules:
+  - {name: nights, flow: collect, protocol: kinematic.yaml,
+     days: [mon, tue, wed, thu], from: "22:00", until: "06:00"}
+  - {name: morning report, flow: report, cron: "30 7 * * mon-fri"}
+
+Store and rig are no parameters: they are what `sliplab serve` was started with, so that nobody
+can send an arm's data elsewhere from a page. A window is computed from when its run was due and not
+from when it began: a run that starts late, because the computer was off, must not take the rest of
+its night out of the next day.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model
+
+from sliplab.protocols import InputError
+from sliplab.protocols.yaml_file import KeyedError, StrictModel, parse_yaml, read_text, validate
+
+DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+_CLOCK = r"([01]\d|2[0-3]):([0-5]\d)"
+_UNTIL = re.compile(rf"(?:({'|'.join(DAYS)}) )?{_CLOCK}", re.ASCII)
+_FROM = re.compile(_CLOCK, re.ASCII)
+
+
+def _zone(name: str) -> str:
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError("is no time zone; write one like Europe/Rome or UTC") from None
+    return name
+
+
+def _until(text: str) -> str:
+    if not _UNTIL.fullmatch(text):
+        raise ValueError('must be a time like "06:00", or a day and a time like "mon 06:00"')
+    return text
+
+
+def _from(text: str) -> str:
+    if not _FROM.fullmatch(text):
+        raise ValueError('must be a time like "22:00", quoted')
+    return text
+
+
+Zone = Annotated[str, AfterValidator(_zone)]
+Until = Annotated[str, AfterValidator(_until)]
+From = Annotated[str, AfterValidator(_from)]
+
+
+def window_end(due: datetime, until: str, zone: str) -> datetime:
+    """The first moment after `due` at which the clock on the wall shows `until`.
+
+    Args:
+        due: when the run was due, with a time zone.
+        until: ``06:00``, or ``mon 06:00``.
+
+    Returns:
+        With the zone `zone`; an hour that a change of the clocks leaves out is the one after it.
+    """
+    found = _UNTIL.fullmatch(until)
+    if found is None:
+        raise ValueError(f"{until!r} is no time")
+    day, hour, minute = found.groups()
+    wall = ZoneInfo(zone)
+    first = due.astimezone(wall).replace(
+        hour=int(hour), minute=int(minute), second=0, microsecond=0, fold=0
+    )
+    for days in range(9):
+        moment = first + timedelta(days=days)  # by the clock on the wall
+        # round over UTC: an hour that does not exist becomes one that does
+        if (day is None or DAYS[moment.weekday()] == day) and moment.timestamp() > due.timestamp():
+            return datetime.fromtimestamp(moment.timestamp(), wall)
+    raise AssertionError("unreachable")
+
+
+def cron_of(days: list[str], begin: str) -> str:
+    """The cron line of a window's begin: ``0 22 * * mon,tue``."""
+    hour, minute = begin.split(":")
+    return f"{int(minute)} {int(hour)} * * {','.join(days)}"
+
+
+class Parameters(StrictModel):
+    """Base of all: an unknown parameter is an error."""
+
+
+class OnRig(Parameters):
+    """What everything that moves the arm may be told."""
+
+    operator: str = Field(default="", description="Who stands at the rig.")
+    temperature_c: float | None = Field(
+        default=None, ge=-50, le=100, description="Room, degrees Celsius."
+    )
+    humidity_percent: float | None = Field(
+        default=None, ge=0, le=100, description="Relative, percent."
+    )
+    note: str = Field(default="", description="Anything worth keeping.")
+    until: Until | None = Field(
+        default=None,
+        description='When the rig must be free again: "06:00" or "mon 06:00". No trial is begun '
+        "that would not be over by then.",
+    )
+    timezone: Zone = Field(default="UTC", description="Of `until`, such as Europe/Rome.")
+    patience_min: float = Field(
+        default=10.0,
+        ge=0,
+        le=1440,
+        description="How long to wait for a rig or a store that another program uses, minutes; "
+        "with `until`, as long as the window lasts.",
+    )
+
+
+class Collect(OnRig):
+    """Takes the trials that the store lacks."""
+
+    protocol: Path = Field(description="A protocol file (.yaml) below the service's own folder.")
+    trials: int | None = Field(
+        default=None, ge=1, le=1_000_000, description="Take so many of the missing, no more."
+    )
+    enable: list[str] = Field(default=[], description="Optional levels to switch on: factor=level.")
+    campaign: str | None = Field(default=None, description="Its name; the protocol's by default.")
+
+
+class Chain(Collect):
+    """Collection, then labels and evaluation of what there is."""
+
+    train: bool = Field(
+        default=True,
+        description="Train again where trials came in; else evaluate a fresh model only.",
+    )
+
+
+class Study(OnRig):
+    """The whole chain over the shipped protocols, to the report."""
+
+    pilot: bool = Field(default=False, description="The small protocols.")
+    extra: bool = Field(
+        default=True, description="Also the disturbance of 125 % that the paper left out."
+    )
+
+
+class Step(Parameters):
+    """One step on what is stored."""
+
+    campaigns: list[str] = Field(default=[], description="Only these campaigns; all by default.")
+
+
+class Evaluate(Step):
+    """Scores the network on trials it has never seen."""
+
+    margin: float | None = Field(
+        default=None, ge=0, le=1e6, description="Spikes a winner must lead by."
+    )
+    smoothing: int | None = Field(
+        default=None, ge=1, le=1000, description="Windows to average over."
+    )
+
+
+class Ask(Parameters):
+    """A word to the collection that runs."""
+
+    who: str = Field(default="", description="Who asks; kept with the request.")
+    why: str = Field(default="", description="The reason; kept with the request.")
+    wait_s: float = Field(
+        default=600.0, ge=0, le=86400, description="How long to wait until it is carried out, s."
+    )
+
+
+FlowName = Literal["collect", "label", "train", "evaluate", "report", "study", "chain"]
+SCHEDULED: dict[FlowName, type[Parameters]] = {
+    "collect": Collect,
+    "label": Step,
+    "train": Step,
+    "evaluate": Evaluate,
+    "report": Step,
+    "study": Study,
+    "chain": Chain,
+}
+"""What a schedule may start; `pause`, `resume` and `stop` are for people."""
+
+
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+_NAME = re.compile(r"[a-z0-9][a-z0-9 _-]{0,60}")
+
+
+class Timing(StrictModel):
+    """When something is started: on days from an hour on, or by a cron line."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    name: str
+    days: list[Day] | None = Field(default=None, min_length=1)
+    from_: From | None = Field(default=None, alias="from")
+    cron: str | None = None
+    active: bool = True
+
+
+_TIMING = {*Timing.model_fields, "flow", "timezone"}
+
+
+def _schedule(flow: FlowName, parameters: type[Parameters]) -> type[BaseModel]:
+    """Timing and the parameters of one flow in one mapping, as a person writes it."""
+    kind: Any = Literal[flow]
+    made: type[BaseModel] = create_model(
+        f"{flow} schedule", __base__=(Timing, parameters), flow=(kind, ...)
+    )
+    return made
+
+
+_MODELS = {flow: _schedule(flow, parameters) for flow, parameters in SCHEDULED.items()}
+
+
+class Scheduled(StrictModel):
+    """One schedule, ready for Prefect.
+
+    Attributes:
+        parameters: of the flow, as JSON.
+    """
+
+    name: str
+    flow: FlowName
+    cron: str
+    timezone: str
+    active: bool
+    parameters: dict[str, Any]
+
+
+class _File(StrictModel):
+    """The file before each schedule is looked at by its flow."""
+
+    timezone: Zone
+    schedules: list[dict[str, Any]]
+
+
+def load_schedules(path: Path) -> list[Scheduled]:
+    """The schedules of a file; protocols are named from the file's own folder.
+
+    Raises:
+        InputError: anything wrong, with file, key, value and what would be right.
+    """
+    read = parse_yaml(read_text(path, "schedule file"), path)
+    file = validate(_File, read, path)
+    made: list[Scheduled] = []
+    for number, data in enumerate(file.schedules):
+        where = f"schedules[{number}]"
+        try:
+            made.append(_one(data, file.timezone, path))
+        except InputError as error:
+            key = f"{where}.{error.key}" if error.key else where
+            value = error.value and read.written.get(key, error.value)
+            raise InputError(path, key, value, error.expected) from None
+        if made[-1].name in {item.name for item in made[:-1]}:
+            raise InputError(path, f"{where}.name", made[-1].name, "stands twice")
+    return made
+
+
+def _one(data: dict[str, Any], timezone: str, path: Path) -> Scheduled:
+    flow = data.get("flow")
+    if not isinstance(flow, str) or flow not in _MODELS:
+        raise InputError(path, "flow", flow, f"must be one of {', '.join(get_args(FlowName))}")
+    if "timezone" in data:
+        raise InputError(path, "timezone", data["timezone"], "stands once, at the file's top")
+    model: Any = validate(_MODELS[flow], data, path)
+    try:
+        cron = _cron(model, timezone)
+    except KeyedError as error:
+        raise InputError(path, error.key, error.value, str(error)) from None
+    if not _NAME.fullmatch(model.name):
+        raise InputError(path, "name", model.name, "must be letters a-z, digits, blanks, - and _")
+    parameters = model.model_dump(mode="json", exclude=_TIMING, exclude_unset=True)
+    if issubclass(SCHEDULED[flow], OnRig):
+        parameters["timezone"] = timezone
+    if "protocol" in parameters:
+        parameters["protocol"] = _protocol(path, model.protocol, model.enable)
+        _check_campaign(path, model.campaign)
+    return Scheduled(
+        name=model.name, flow=flow, cron=cron, timezone=timezone, active=model.active,
+        parameters=parameters,
+    )  # fmt: skip
+
+
+def _cron(model: Any, timezone: str) -> str:
+    """The cron line.
+
+    Raises:
+        KeyedError: there is none, or two ways of saying it, or it is not one.
+    """
+    if model.cron is None:
+        if model.days is None or model.from_ is None:
+            missing = "days" if model.days is None else "from"
+            raise KeyedError(missing, None, "is missing; give days and from, or else cron")
+        return cron_of(model.days, model.from_)
+    for key, value in (("days", model.days), ("from", model.from_)):
+        if value is not None:
+            raise KeyedError(key, value, "stands beside cron; give one of the two")
+    from prefect.client.schemas.schedules import CronSchedule
+
+    try:
+        CronSchedule(cron=model.cron, timezone=timezone)
+    except ValueError:
+        raise KeyedError(
+            "cron", model.cron, 'is no cron line; one is like "0 22 * * mon-thu"'
+        ) from None
+    return str(model.cron)
+
+
+def _protocol(path: Path, name: Path, enable: list[str]) -> str:
+    """A protocol's path, found now: a night must not fail for a name.
+
+    Raises:
+        InputError: there is none, or it or a level to be enabled is wrong.
+    """
+    from sliplab.protocols import load_plan
+
+    found = (path.parent / name).resolve()
+    if not found.is_file():
+        raise InputError(path, "protocol", str(name), f"is no file ({found})")
+    try:
+        load_plan(found, enable)
+    except InputError as error:
+        if error.file == "--enable":
+            raise InputError(path, "enable", enable, error.expected) from None
+        raise InputError(path, "protocol", str(name), error.message) from None
+    return str(found)
+
+
+def _check_campaign(path: Path, name: str | None) -> None:
+    from sliplab.storage.names import safe_name
+    from sliplab.storage.trials.store import StoreError
+
+    try:
+        safe_name("any" if name is None else name)
+    except StoreError as error:
+        raise InputError(path, "campaign", name, str(error)) from None
