@@ -115,6 +115,20 @@ class StepTimes:
     end_ns: int
 
 
+@dataclass(frozen=True)
+class PathSegment:
+    """A straight segment that the arm was commanded to move along, or a position to hold."""
+
+    start_ns: int
+    end_ns: int
+    """On the arm's clock."""
+    begin_mm: tuple[float, float, float]
+    end_mm: tuple[float, float, float]
+    """Tool centre point in the arm's base frame."""
+    speed_mm_s: float = 0.0
+    """Along the segment; 0 for a position to hold."""
+
+
 @runtime_checkable
 class Sink(Protocol):
     """Where a rig puts its streams; a trial being written is one."""

@@ -18,7 +18,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import Any
 
-from sliplab.flows.collecting.quality import Assessment, assess
+from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.trial_gate import TrialGate
 from sliplab.flows.running import stopping
 from sliplab.protocols import Plan, Task, Trial
@@ -164,7 +164,7 @@ class Session:
                 folder = writer.seal()
                 found = assess(
                     folder,
-                    run,
+                    _motion(run),
                     collection.gates,
                     self.rig.timing,
                     collection.recording.sync_rate,
@@ -293,6 +293,12 @@ class Session:
             disk_free=shutil.disk_usage(self.campaign.folder).free,
             **_installed(),
         )
+
+
+def _motion(run: TrialRun) -> Motion:
+    """Return what the quality of a trial is judged by."""
+    moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
+    return Motion(run.recorded_ns, (moving.start_ns, moving.end_ns), run.path)
 
 
 @cache

@@ -32,7 +32,7 @@ from sliplab.rigs.core.capabilities import (
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.pulse_code import SEEDS
 from sliplab.rigs.core.touching import LOOK_S, QUIET_S, RateTouch, count_central
-from sliplab.storage.streams import Json, Sink, StepTimes
+from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
@@ -47,20 +47,6 @@ class StopRequested(Exception):
 
 
 @dataclass(frozen=True)
-class Way:
-    """A straight way that the arm was told to take in one recorded step, or a place to stay at."""
-
-    start_ns: int
-    end_ns: int
-    """On the arm's clock."""
-    begin_mm: tuple[float, float, float]
-    end_mm: tuple[float, float, float]
-    """Tool centre point in the arm's base frame."""
-    speed_mm_s: float = 0.0
-    """Along the way; 0 for a place to stay at."""
-
-
-@dataclass(frozen=True)
 class TrialRun:
     """What the rig can say of a trial besides its streams."""
 
@@ -68,8 +54,8 @@ class TrialRun:
     """Each step with its times, and whether it was recorded."""
     zero_mm: float
     truth: Json | None
-    ways: tuple[Way, ...] = ()
-    """What the arm was told to do in the recorded steps."""
+    path: tuple[PathSegment, ...] = ()
+    """Commanded segments of the recorded steps."""
 
     @property
     def recorded_ns(self) -> tuple[int, int]:
@@ -184,7 +170,7 @@ class Rig:
             self.begin_trial(program.home, seed)
             if self.simulation is not None:
                 sink = self.simulation.sink(sink)
-            steps, ways = [], []
+            steps, path = [], []
             at, recording, reference = program.home, False, 0
             for index, step in enumerate(program.steps):
                 if step.recorded and not recording:
@@ -200,12 +186,12 @@ class Rig:
                 began, at = at, step_seconds(step, at)[1]
                 if step.recorded:
                     speed = step.speed_mm_s if isinstance(step, Move) else 0.0
-                    ways.append(self._way(times, began, at, speed))
+                    path.append(self._segment(times, began, at, speed))
             truth = None
             if self.simulation is not None:
                 hold = next(times.start_ns for times, kept in steps if kept)
                 truth = self.simulation.truth(reference, hold)
-            return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(ways))
+            return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(path))
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm the skin up: press at the plate's centre and let go, `times` times."""
@@ -386,9 +372,11 @@ class Rig:
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
 
-    def _way(self, times: StepTimes, begin: Position, end: Position, speed: float) -> Way:
+    def _segment(
+        self, times: StepTimes, begin: Position, end: Position, speed: float
+    ) -> PathSegment:
         places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
-        return Way(times.start_ns, times.end_ns, *places, speed)
+        return PathSegment(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
         """Where the tool centre point is now, in plate coordinates."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.flows.collecting.quality import BURST_US, _event_burst
+from sliplab.analysis.quality import BURST_US, _event_burst
 from sliplab.protocols.settings import Labelling
 from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session

@@ -1,0 +1,339 @@
+"""Quality of a recorded trial: clocks fitted, losses counted, motion checked, gates applied.
+
+Runs on the sealed files of a trial before it is committed, so that a doubtful trial is taken again
+while the rig still stands there. The motion is checked from the stored poses, across the path and
+along it, so the check is the same for every arm: it finds a controller that slows a move down and
+still reports it as done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from sliplab.analysis.clocks.synchronise import TrialSync, streams_of, synchronise
+from sliplab.analysis.labels.places import handed_over
+from sliplab.analysis.labels.rest import offsets
+from sliplab.protocols.conditions import Gates
+from sliplab.protocols.settings import Labelling
+from sliplab.protocols.timing import Timing
+from sliplab.storage.schema.trial import Clocks, Counts, Gate
+from sliplab.storage.streams import F64, I64, PathSegment
+from sliplab.storage.trials.columns import TRACKS
+from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.writer import DATA
+
+UNVOUCHED_S = 0.3
+"""A recording may begin and end this much before and after the pulses on which a clock's fit
+stands: the code may be silent for 16 ticks."""
+BURST_US = 10_000
+"""The interval in which `gates.event_burst` counts events."""
+WINDOW_S = 0.5
+"""The shortest interval over which a speed is measured, s."""
+ARRIVAL_WINDOW_S = 1.0
+"""The same where poses are timed by their arrival: a busy host reads some of them late."""
+_WINDOW_POSES = 5
+_NOISE = 0.01
+"""Intervals are long enough that the poses' noise changes a speed by this share of it at most."""
+_SETTLE_S, _ACCELERATION_MM_S2 = 0.1, 50.0
+"""Ramps at either end of a segment, at most a quarter of it each; no speed is measured there."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The arm's motion in one trial, on its controller's clock.
+
+    Attributes:
+        recorded_ns: start and end of the recorded steps.
+        moving_ns: start and end of the slide or the retraction, in which the sensor moves.
+        path: commanded segments of the recorded steps.
+    """
+
+    recorded_ns: tuple[int, int]
+    moving_ns: tuple[int, int]
+    path: Sequence[PathSegment]
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Clock maps, gates and counts of one attempt."""
+
+    clocks: Clocks
+    gates: dict[str, Gate]
+    counts: Counts
+
+    @property
+    def passed(self) -> bool:
+        """Whether every gate is passed."""
+        return all(gate.passed for gate in self.gates.values())
+
+    @property
+    def causes(self) -> str:
+        """The failed gates with their figures, as one text."""
+        failed = {name: gate for name, gate in self.gates.items() if not gate.passed}
+        return "; ".join(_cause(name, gate) for name, gate in failed.items())
+
+
+def _cause(name: str, gate: Gate) -> str:
+    """Return why one gate was not passed: its figure, or why there is none."""
+    value, limit = gate.value, gate.limit
+    if value is None or isinstance(value, str):  # why a clock was refused
+        return f"{name}: {value}"
+    return f"{name}: cannot be told" if value < 0 else f"{name} = {value} (limit {limit})"
+
+
+def _gate(value: float, limit: float) -> Gate:
+    """Apply an upper limit; a negative figure is one that is unknown."""
+    return Gate(value=value, limit=limit, passed=0 <= value <= limit)
+
+
+def assess(
+    folder: Path,
+    motion: Motion,
+    gates: Gates,
+    timing: Timing,
+    rate_hz: int,
+    mid_exposure_ns: int | None,
+) -> Assessment:
+    """Fit the clocks of a sealed trial and apply the protocol's gates.
+
+    Args:
+        timing: how the rig's devices are timed.
+        mid_exposure_ns: from a frame's trigger to its time; None without a video.
+    """
+    with StreamReader(folder / DATA) as reader:
+        streams = streams_of(reader, mid_exposure_ns)
+        event_us = reader.event_times()
+        pose_mm = reader.column("poses/xyz")
+        tracks = [reader.column(name) for name in TRACKS if reader.has(name)]
+    sync = synchronise(streams, timing, rate_hz)
+    results = _sync_gates(sync, gates, motion.recorded_ns, mid_exposure_ns is not None)
+    if mid_exposure_ns is not None:
+        lost = _frames_lost(streams.frame_number, motion.recorded_ns, rate_hz)
+        results["frames_lost"] = _gate(lost, gates.frames_lost)
+    results["event_gap_s"] = _gate(
+        _event_gap(event_us, sync, motion.moving_ns), float(gates.event_gap)
+    )
+    results["event_burst"] = _gate(_event_burst(event_us), gates.event_burst)
+    if gates.hold_slip is not None and tracks:
+        slip = _hold_slip_px(streams.frame_ns, tracks, sync, motion.moving_ns[0])
+        results["hold_slip_px"] = _gate(slip, float(gates.hold_slip))
+    away = path_deviation_mm(streams.pose_ns, pose_mm, motion.path)
+    results["path_deviation_mm"] = _gate(away, float(gates.path_deviation))
+    off = speed_deviation_percent(streams.pose_ns, streams.pose_host_ns, pose_mm, motion.path)
+    results["speed_deviation_percent"] = _gate(off, float(gates.speed_deviation))
+    counts = Counts(
+        events=len(event_us),
+        frames=len(streams.frame_ns),
+        poses=len(streams.pose_ns),
+        pulses=len(streams.sync_pulses),
+    )
+    return Assessment(sync.record(), results, counts)
+
+
+def _sync_gates(
+    sync: TrialSync, gates: Gates, recorded_ns: tuple[int, int], video: bool
+) -> dict[str, Gate]:
+    """Check that every device has a clock map, good for its grade and all of the recording."""
+    limits = gates.sync_uncertainty
+    results: dict[str, Gate] = {}
+    for device in ("events", "arm", "frames")[: 3 if video else 2]:
+        name = f"sync_uncertainty_{device}_s"
+        known = sync.devices.get(device)
+        if known is None:
+            results[name] = Gate(value=sync.refused[device], limit=None, passed=False)
+            continue
+        grade = "digital input" if device == "events" else known.grade
+        # a latency is a difference: both maps count
+        both = sync.against_events_ns(device) if device != "events" else known.uncertainty_ns
+        value = (known.uncertainty_ns if both is None else both) / 1e9
+        limit = limits.limit_s(grade)
+        results[name] = Gate(value=value, limit=limit, grade=known.grade, passed=value <= limit)
+    results["sync_unvouched_s"] = _gate(_unvouched_s(sync, recorded_ns), UNVOUCHED_S)
+    return results
+
+
+def _unvouched_s(sync: TrialSync, recorded_ns: tuple[int, int]) -> float:
+    """Return how long the recording goes on, at either end, beyond the pulses of a clock's fit, s.
+
+    -1 where the arm's clock is not known.
+    """
+    if "arm" not in sync.devices:
+        return -1.0
+    start, end = (int(sync.devices["arm"].map.to_reference(t)) for t in recorded_ns)
+    beyond = 0
+    for device in sync.devices.values():
+        if device.fit is not None:
+            first = device.map.to_reference(device.fit.first_ns)
+            last = device.map.to_reference(device.fit.last_ns)
+            beyond = max(beyond, first - start, end - last)
+    return beyond / 1e9
+
+
+def _frames_lost(numbers: I64, recorded_ns: tuple[int, int], rate_hz: int) -> int:
+    """Count frames missing between the first and the last, and against the recorded time."""
+    start, end = recorded_ns
+    expected = int((end - start) / 1e9 * rate_hz)
+    if not len(numbers):
+        return expected
+    gaps = int(numbers[-1]) + 1 - len(numbers)
+    return max(gaps, expected - 1 - len(numbers), 0)
+
+
+def _event_gap(event_us: I64, sync: TrialSync, moving_ns: tuple[int, int]) -> float:
+    """Return the longest silence of the event camera while the arm moved in contact, seconds.
+
+    -1 when it is unknown, because a clock has no map or there are no events.
+    """
+    if "events" not in sync.devices or "arm" not in sync.devices or not len(event_us):
+        return -1.0
+    arm, events = (sync.devices[name].map for name in ("arm", "events"))
+    start, end = (int(events.to_device(int(arm.to_reference(t)))) // 1000 for t in moving_ns)
+    inside = event_us[np.searchsorted(event_us, start) : np.searchsorted(event_us, end, "right")]
+    edges = np.concatenate([[start], inside, [end]])
+    return float(np.max(np.diff(edges))) / 1e6
+
+
+def _hold_slip_px(frame_ns: I64, tracks: list[Any], sync: TrialSync, moving_ns: int) -> float:
+    """Return the largest distance that a marker moved in the recorded hold, px.
+
+    -1 when it is unknown, because a clock has no map or no marker was seen at both ends.
+
+    Args:
+        tracks: markers (n, m, 2), and perhaps the plate's marker (n, 2), px.
+        moving_ns: when the hold is over, on the arm's clock.
+    """
+    if "frames" not in sync.devices or "arm" not in sync.devices:
+        return -1.0
+    times = np.asarray(sync.devices["frames"].map.to_reference(frame_ns))
+    start_ns = int(sync.devices["arm"].map.to_reference(moving_ns))
+    held = times < start_ns
+    if not held.any():
+        return -1.0
+    markers, plate = (*(column[held].astype(np.float64) for column in tracks), None)[:2]
+    places = handed_over(markers, plate)
+    moved = offsets(places, times[held], start_ns, Labelling().reference_ms).hold_slip_px
+    return float(np.nanmax(moved)) if np.isfinite(moved).any() else -1.0
+
+
+@njit(cache=True, nogil=True)
+def _event_burst(event_us):  # type: ignore[no-untyped-def]
+    """Count the most events in any 10 ms that begin with an event."""
+    most, end = 0, 0
+    for begin in range(len(event_us)):
+        while end < len(event_us) and event_us[end] < event_us[begin] + BURST_US:
+            end += 1
+        most = max(most, end - begin)
+    return most
+
+
+def path_deviation_mm(pose_ns: I64, pose_mm: F64, path: Sequence[PathSegment]) -> float:
+    """Return the largest distance of the tool from its commanded path, mm, to a micrometre.
+
+    Only across the path: along it an arm may be early or late while it accelerates. -1 without
+    poses in some segment, or when the arm's clock cannot be trusted.
+    """
+    worst = 0.0
+    for segment in path:
+        if segment.end_ns <= segment.start_ns:
+            continue
+        inside = (pose_ns >= segment.start_ns) & (pose_ns <= segment.end_ns)
+        if not inside.any():
+            return -1.0
+        begin = np.asarray(segment.begin_mm)
+        along = np.asarray(segment.end_mm) - begin
+        from_begin = pose_mm[inside] - begin
+        length_2 = float(along @ along)
+        share = np.zeros(len(from_begin)) if length_2 == 0 else from_begin @ along / length_2
+        across: F64 = from_begin - np.clip(share, 0.0, 1.0)[:, None] * along
+        worst = max(worst, float(np.max(np.linalg.norm(across, axis=1))))
+    return round(worst, 3)
+
+
+def speed_deviation_percent(
+    pose_ns: I64, host_ns: I64, pose_mm: F64, path: Sequence[PathSegment]
+) -> float:
+    """Return the largest deviation of the speed along the path, percent, to a tenth.
+
+    Measured in overlapping intervals of `WINDOW_S` or longer, as the noise of the poses demands,
+    without the ramps at either end of a segment. -1 where it is unknown: too few poses, or a clock
+    that cannot be trusted.
+
+    Args:
+        pose_ns: controller's time of every pose, (n,).
+        host_ns: when each reached the host, (n,); equal to `pose_ns` where that is all there is.
+        pose_mm: tool centre points in the arm's base frame, (n, 3).
+    """
+    worst = 0.0
+    for segment in path:
+        begin = np.asarray(segment.begin_mm)
+        along = np.asarray(segment.end_mm) - begin
+        length = float(np.linalg.norm(along))
+        if length == 0.0:
+            continue
+        inside = (pose_ns >= segment.start_ns) & (pose_ns <= segment.end_ns)
+        t_s = (pose_ns[inside] - segment.start_ns) / 1e9
+        if len(t_s) < 2 or np.any(np.diff(t_s) < 0):
+            return -1.0
+        gone_mm = (pose_mm[inside] - begin) @ (along / length)
+        part = _at_speed(gone_mm, length, segment.speed_mm_s)
+        arrival = np.array_equal(pose_ns[inside], host_ns[inside])
+        shortest_s = ARRIVAL_WINDOW_S if arrival else WINDOW_S
+        speeds = _speeds(t_s[part], gone_mm[part], segment.speed_mm_s, shortest_s)
+        if not len(speeds) or not np.all(np.isfinite(speeds)):
+            return -1.0
+        worst = max(worst, float(np.max(np.abs(speeds / segment.speed_mm_s - 1.0))))
+    return round(100.0 * worst, 1)
+
+
+def _at_speed(gone_mm: F64, length: float, speed: float) -> slice:
+    """Return the poses of a segment without its ramps, and one more on either side."""
+    edge = min(speed * _SETTLE_S + speed**2 / (2 * _ACCELERATION_MM_S2), length / 4)
+    begun, not_over = gone_mm >= edge, gone_mm <= length - edge
+    first = int(np.argmax(begun)) if begun.any() else len(gone_mm)
+    last = len(gone_mm) - 1 - int(np.argmax(not_over[::-1]))
+    return slice(max(first - 1, 0), last + 2)
+
+
+def _speeds(t_s: F64, gone_mm: F64, speed: float, shortest_s: float) -> F64:
+    """Return slopes of position over time in overlapping intervals, mm/s; empty without any."""
+    seconds = float(t_s[-1] - t_s[0]) if len(t_s) > 1 else 0.0
+    if seconds <= 0.0:
+        return np.empty(0)
+    rate = len(t_s) / seconds
+    noise = _noise_mm(t_s, gone_mm) / (_NOISE * speed)
+    # the slope of n points over T scatters by noise * sqrt(12 / n) / T, and n is rate * T
+    shortest_s = max(shortest_s, float(np.cbrt(12 * noise**2 / rate)), _WINDOW_POSES / rate)
+    intervals = max(1, int(seconds / shortest_s))
+    width = seconds / intervals
+    begins = np.linspace(t_s[0], t_s[-1] - width, 2 * intervals - 1)
+    # the pose before and the one behind belong to it: no gap between poses goes unseen
+    firsts = np.maximum(np.searchsorted(t_s, begins, "right") - 1, 0)
+    ends = np.searchsorted(t_s, begins + width, "left") + 1
+    slopes = [
+        _slope(t_s[first:end], gone_mm[first:end])
+        for first, end in zip(firsts.tolist(), ends.tolist(), strict=True)
+    ]
+    return np.array(slopes)
+
+
+def _slope(t_s: F64, gone_mm: F64) -> float:
+    """Return the least-squares slope through poses; infinite where all have one time."""
+    from_middle = t_s - t_s.mean()
+    spread = float(from_middle @ from_middle)
+    return float(from_middle @ gone_mm) / spread if spread > 0.0 else np.inf
+
+
+def _noise_mm(t_s: F64, gone_mm: F64) -> float:
+    """Return the standard deviation of poses about the line between their neighbours, mm."""
+    if len(t_s) < 3:
+        return 0.0
+    between = t_s[2:] - t_s[:-2]
+    share = np.divide(t_s[1:-1] - t_s[:-2], between, np.full(len(between), 0.5), where=between > 0)
+    off = gone_mm[1:-1] - ((1 - share) * gone_mm[:-2] + share * gone_mm[2:])
+    return float(1.4826 * np.median(np.abs(off)) / np.sqrt(1.5))
