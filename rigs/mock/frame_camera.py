@@ -22,11 +22,9 @@ from sliplab.rigs.mock.frame_faults import FrameFaults
 from sliplab.rigs.mock.free_run import FreeRun, Trigger
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.scene.board import BoardCamera, BoardPlace, BoardPrint, draw_board
-from sliplab.rigs.scene.exposure import Exposures, expose
-from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.frames import Exposures, FrameOptics, PlateView, Reflections, expose
+from sliplab.rigs.scene.lens import BoardCamera, BoardPlace, BoardPrint, draw_board
 from sliplab.rigs.scene.randomness import generator
-from sliplab.rigs.scene.reflections import Reflections
 from sliplab.storage.streams import ClockReads, FrameChunk
 
 F32 = npt.NDArray[np.float32]

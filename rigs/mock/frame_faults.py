@@ -8,7 +8,7 @@ import numpy.typing as npt
 from sliplab.rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
 from sliplab.rigs.mock.free_run import Trigger
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.scene.exposure import Exposures, Way
+from sliplab.rigs.scene.frames import Exposures, Way
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ import numpy as np
 from sliplab.rigs.core.capabilities import Pose, Segment
 from sliplab.rigs.mock.geometry import matrix, rotvec_deg
 from sliplab.rigs.mock.world import World
-from sliplab.rigs.scene.board import VIEWS
+from sliplab.rigs.scene.lens import VIEWS
 from sliplab.rigs.scene.randomness import generator
 
 HAND_MM = 0.02

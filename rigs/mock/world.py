@@ -26,7 +26,7 @@ from sliplab.rigs.mock.path import SENSOR, ArmPath, Leg
 from sliplab.rigs.mock.physics import Physics
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.skins import skin_of
-from sliplab.rigs.scene.board import BoardPlace
+from sliplab.rigs.scene.lens import BoardPlace
 from sliplab.rigs.scene.skin import Skin
 from sliplab.rigs.scene.vibration import Vibration
 

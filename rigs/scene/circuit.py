@@ -24,8 +24,8 @@ from numba import njit
 from sliplab.rigs.scene.crossings import distance_at
 from sliplab.rigs.scene.edges import CUT, level_at, widen
 from sliplab.rigs.scene.marker_path import excursion, fit_blocks, stands_still
-from sliplab.rigs.scene.sorting import larger
-from sliplab.rigs.scene.watch import near_rim
+from sliplab.rigs.scene.readout import larger
+from sliplab.rigs.scene.rim_pixels import near_rim
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -266,7 +266,7 @@ def events_of_circuit(  # type: ignore[no-untyped-def]
         seen: rectangles in which markers have been, see `edges.darken`; widened.
         base_ns: true time from which events count.
         pixels: scratch.
-        events: packed events as in `sorting`, the first `n` of them.
+        events: packed events as in `readout`, the first `n` of them.
 
     Returns:
         the events, which may have moved, and how many there are.

@@ -1,6 +1,6 @@
 """When the rim of a moving disc crosses one pixel's next thresholds, however the disc moves.
 
-For pixels whose distance is not known to be monotone on a whole piece; `pixels` has the others.
+For pixels whose distance is not known to be monotone on a whole segment; `pixels` has the others.
 
 g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a piece
 of time on which g is proven to be monotone: its rate lies between bounds from the control points
@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, rim_of
-from sliplab.rigs.scene.pieces import FINE, K0, K1, NODE
 
 _DONE_PX = 1e-10
 
@@ -152,7 +151,7 @@ def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, c
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_piece(  # type: ignore[no-untyped-def]
-    x, y, on, off, last_one, level, step, ga, piece, base, begin, final, since, until, inverse,
+    x, y, on, off, last_one, level, step, ga, segment, base, begin, final, since, until, inverse,
     curve, tree, contrast, edge, head, stack, out, n,
 ):  # fmt: skip
     """Events of one pixel on a piece of a block, however its distance goes.
@@ -160,9 +159,9 @@ def events_of_piece(  # type: ignore[no-untyped-def]
     Args:
         on, off, last_one, level: the pixel's state, see `edges`; step: its threshold.
         ga: its distance at the begin.
-        piece: see `pieces`.
+        segment: see `marker_path.SEGMENT`.
         base, begin, final: where the tree of the block begins; the block's first and last row.
-        since, until, inverse, curve: see `pieces` and `marker_path.fit_block`.
+        since, until, inverse, curve: see `marker_path.cut_block` and `fit_blocks`.
         tree: of `marker_path.bound_rates`.
         head: packed event at the begin of the block.
         stack: scratch, (160, 3).
@@ -172,14 +171,18 @@ def events_of_piece(  # type: ignore[no-untyped-def]
         the pixel's state, and how many events `out` holds now.
     """
     reach = CUT * edge
-    last, node, size = int(piece[K1]), int(piece[NODE]), 1
+    last, node, size = segment.k1, segment.node, 1
     while size < final - begin:
         size *= 2
     while node > 1:
         node, size = node // 2, size // 2
     # parts yet to be done, the next one on top: a node of the tree with its steps, or, with a
     # number not above 0, a step with the part of it from sa to sb
-    stack[0, 0], stack[0, 1], stack[0, 2] = piece[NODE], piece[K0], piece[K0] + size
+    stack[0, 0], stack[0, 1], stack[0, 2] = (
+        segment.node,
+        segment.k0,
+        segment.k0 + size,
+    )
     depth = 1
     while depth > 0:
         depth -= 1
@@ -240,7 +243,19 @@ def events_of_piece(  # type: ignore[no-untyped-def]
                 t = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
                 t = min(max(t, begun), b)
                 begun = solve(
-                    x, y, target, falling, begun, b, t, k, piece[FINE], since, until, inverse, curve
+                    x,
+                    y,
+                    target,
+                    falling,
+                    begun,
+                    b,
+                    t,
+                    k,
+                    segment.fine,
+                    since,
+                    until,
+                    inverse,
+                    curve,
                 )
             if falling:
                 level += step

@@ -251,3 +251,124 @@ def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
     most = np.sqrt(largest(spread, 0, last)) + largest(spread, 1, last)
     most += np.sqrt(largest(spread, 2, last)) + largest(spread, 3, last)
     return np.sqrt(dx * dx + dy * dy) + abs(dr) + most, most
+
+
+SEGMENT = np.dtype([
+    # first step and the step behind the last one; the node of the block's tree that is this
+    # segment; the block
+    ("k0", "i8"), ("k1", "i8"), ("node", "i8"), ("block", "i8"),
+    # when the segment begins and ends, ns after its block; when the block begins, ns after the
+    # first row; how far the marker strays from its chord at most, px
+    ("begin", "f8"), ("end", "f8"), ("zero", "f8"), ("stray", "f8"),
+    # mean rates of column, row and radius; how far rates stray from them together; the highest
+    # speed of the centre, px/ns
+    ("mx", "f8"), ("my", "f8"), ("mr", "f8"), ("deviation", "f8"), ("speed", "f8"),
+    # column, row and radius at both ends, px, and their rates there, px/ns
+    ("x0", "f8"), ("y0", "f8"), ("r0", "f8"), ("x1", "f8"), ("y1", "f8"), ("r1", "f8"),
+    ("vx0", "f8"), ("vy0", "f8"), ("vr0", "f8"), ("vx1", "f8"), ("vy1", "f8"), ("vr1", "f8"),
+    # how long a step of Newton's method may be after which a time is good, ns
+    ("fine", "f8"),
+])  # fmt: skip
+"""A part of a marker's path on which it does not move far."""
+_MOST_PX = 2.0
+_CLOSE = 1e-4  # of the block: after a step as small as that the next error is below 1e-7
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: ignore[no-untyped-def]
+    """How far rates in some steps stray from their means, px/ns: of the centre, and of the radius.
+
+    Args:
+        first, last: first step, and the step behind the last one.
+        spread: scratch, (4, at least the steps).
+    """
+    n = last - first
+    ax, bx, cx = curve[1, first:last], curve[2, first:last], curve[3, first:last]
+    ay, by, cy = curve[5, first:last], curve[6, first:last], curve[7, first:last]
+    ar, br, cr = curve[9, first:last], curve[10, first:last], curve[11, first:last]
+    square, growth = spread[0], spread[1]
+    for k in range(n):
+        x, y = ax[k] - mean_x, ay[k] - mean_y
+        most = x * x + y * y
+        x, y = x + bx[k], y + by[k]
+        most = max(most, x * x + y * y)
+        x, y = x + (bx[k] + 3.0 * cx[k]), y + (by[k] + 3.0 * cy[k])
+        square[k] = max(most, x * x + y * y)
+    for k in range(n):
+        r = ar[k] - mean_r
+        most = abs(r)
+        r += br[k]
+        most = max(most, abs(r))
+        growth[k] = max(most, abs(r + (br[k] + 3.0 * cr[k])))
+    return np.sqrt(largest(spread, 0, n)), largest(spread, 1, n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def cut_block(first, last, block, zero, reach, since, until, curve, spread, segments, n):  # type: ignore[no-untyped-def]
+    """Cut a block into pieces in which the marker does not move far.
+
+    What is done follows from the block's own rows alone.
+
+    Args:
+        first, last: the block's first and last row.
+        zero: when it begins, ns after the first row of all.
+        reach: how far from the rim the edge ends, px.
+        since, until: when each step begins and ends, ns after the begin of its block.
+        spread: scratch, see `deviation`.
+        pieces: (most, FIELDS), written from `n` on; room for as many as there are steps.
+
+    Returns:
+        how many pieces there are now.
+    """
+    size, parts, done = 1, 1, first
+    while size < last - first:
+        size *= 2
+    length = until[last - 1]
+    while done < last:
+        k0, k1 = done, min(done + size // parts, last)
+        begin, end = since[k0], until[k1 - 1]
+        inverse = 1.0 / (end - begin)
+        mean_x = (curve[0, k1] - curve[0, k0]) * inverse
+        mean_y = (curve[4, k1] - curve[4, k0]) * inverse
+        mean_r = (curve[8, k1] - curve[8, k0]) * inverse
+        apart, grows = deviation(k0, k1, mean_x, mean_y, mean_r, curve, spread)
+        speed = np.sqrt(mean_x * mean_x + mean_y * mean_y) + apart
+        if done == first and parts == 1:
+            way = (speed + abs(mean_r) + grows) * length
+            while parts < size and way > parts * _MOST_PX:
+                parts *= 2
+            if parts > 1:
+                continue
+        segment = segments[n]
+        segment.k0, segment.k1, segment.begin, segment.end = k0, k1, begin, end
+        segment.zero, segment.block = zero, block
+        # on a way that begins and ends as the mean does; and by so much is a pixel that is not
+        # nearer than the edge at both ends of a chord nearer in between
+        chord = (mean_x * mean_x + mean_y * mean_y) * (end - begin) ** 2
+        bow = 0.5 * (apart + grows) * (end - begin)
+        left = min(curve[8, k0], curve[8, k1]) - bow - reach - 0.5 * np.sqrt(chord)
+        segment.stray = bow + (0.125 * chord / left if left > 0.0 else np.inf)
+        segment.node = parts + (k0 - first) // (size // parts)
+        segment.mx, segment.my, segment.mr = mean_x, mean_y, mean_r
+        segment.deviation, segment.speed = apart + grows, speed
+        segment.x0, segment.y0, segment.r0 = curve[0, k0], curve[4, k0], curve[8, k0]
+        segment.x1, segment.y1, segment.r1 = curve[0, k1], curve[4, k1], curve[8, k1]
+        segment.vx0, segment.vy0, segment.vr0 = (
+            curve[1, k0],
+            curve[5, k0],
+            curve[9, k0],
+        )
+        e = k1 - 1
+        segment.vx1 = curve[1, e] + 2.0 * curve[2, e] + 3.0 * curve[3, e]
+        segment.vy1 = curve[5, e] + 2.0 * curve[6, e] + 3.0 * curve[7, e]
+        segment.vr1 = curve[9, e] + 2.0 * curve[10, e] + 3.0 * curve[11, e]
+        segment.fine = _CLOSE * length
+        n += 1
+        done = k1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def farthest(segment):  # type: ignore[no-untyped-def]
+    """How long the ways of centre and radius are on a piece, at most and together, px."""
+    return (segment.speed + abs(segment.mr) + segment.deviation) * (segment.end - segment.begin)

@@ -127,7 +127,7 @@ def noise_events(  # type: ignore[no-untyped-def]
 
     Args:
         discs: column, row and radius of each disc at this time, px, (n, 3).
-        events: packed as in `sorting`, ns after `base_ns`; written from `n` on.
+        events: packed as in `readout`, ns after `base_ns`; written from `n` on.
 
     Returns:
         the next candidate, and how many events there are now.

@@ -1,7 +1,13 @@
-"""Events of one marker's pixels over the blocks of a look: tiles of pixels through all pieces.
+"""Pixels side by side: which of many meet thresholds on a piece of a marker's path, and when.
 
-What is done on a piece follows from the rows of its block alone, to the bit, and pixels do not
-wait for each other, so neither the cut of a trial into calls nor the order of pixels matters.
+One pixel's events wait for each other; those of many do not, and where their numbers lie side
+by side a compiler does four or eight of them at a time. So all that a pixel needs stands in a
+tile, one field after the other with a lane for each pixel, and is worked on in loops without
+branches. Fields are constant distances apart, which is how the compiler knows that lanes do not
+touch each other.
+
+A tile of pixels goes through all pieces of a look. Those of its pixels that fire on a piece are
+gathered in a tile of roots, one threshold after the other.
 """
 
 from __future__ import annotations
@@ -9,34 +15,330 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sliplab.rigs.scene import edges, roots
-from sliplab.rigs.scene import pieces as of
-from sliplab.rigs.scene import pixel_lanes as lanes
-from sliplab.rigs.scene.crossings import events_of_piece
-from sliplab.rigs.scene.edges import CUT
-from sliplab.rigs.scene.marker_path import bound_rates
-from sliplab.rigs.scene.pixel_lanes import COMES, DOUBT, LANES, NOTHING, classify, place_pixels
-from sliplab.rigs.scene.roots import (
-    begin_piece,
-    fetch,
-    finish,
-    guess,
-    move,
-    next_thresholds,
-    refine,
+from sliplab.rigs.scene.branchless import logarithm
+from sliplab.rigs.scene.crossings import events_of_piece, solve
+from sliplab.rigs.scene.edges import CUT, FAR, LAST, LEVEL, OFF, ON, TAIL
+from sliplab.rigs.scene.marker_path import (
+    bound_rates,
 )
+
+LANES = 256
+STRIDE = LANES + 8
+"""From one field to the next; a bit more than there are lanes, so that fields do not all compete
+for the same sets of the cache."""
+(
+    P_X,
+    P_Y,
+    P_ON,
+    P_OFF,
+    P_LAST,
+    P_LEVEL,
+    P_STEP,
+    P_BEGIN,
+    P_END,
+    P_KIND,
+    P_CODE,
+) = (STRIDE * k for k in range(11))
+"""Fields of a tile of pixels: column and row; as in `edges`, four; the threshold; distance from the
+rim at the begin and at the end of a piece, px; what happens on it; column and row in a packed
+event."""
+PIXEL_FIELDS = 11
+NOTHING, COMES, GOES, DOUBT = 0.0, 1.0, 2.0, 3.0
+"""Kinds: meets no threshold; falls monotonely to its positive one, rises to its negative one; may
+meet any number."""
+_DONE_PX = 1e-10
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
+    """Distances from the rim at the begin of the first piece."""
+    for j in range(n):
+        dx, dy = tile[P_X + j] - column, tile[P_Y + j] - row
+        tile[P_END + j] = np.sqrt(dx * dx + dy * dy) - radius
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
+    """What each of n pixels does on a piece.
+
+    Args:
+        reach: distance from the rim beyond which a pixel may be another disc's, px.
+    """
+    x1, y1, r1, stray = segment.x1, segment.y1, segment.r1, segment.stray
+    half_x, half_y = 0.5 * (segment.x0 - x1), 0.5 * (segment.y0 - y1)
+    mean_x, mean_y, mean_r = segment.mx, segment.my, segment.mr
+    apart, speed, length = (
+        segment.deviation,
+        segment.speed,
+        segment.end - segment.begin,
+    )
+    # no point of the path is farther from the middle of its ends than half its length
+    way = 0.5 * speed * length
+    for j in range(n):
+        dx, dy = tile[P_X + j] - x1, tile[P_Y + j] - y1
+        away = np.sqrt(dx * dx + dy * dy)
+        begin, end = tile[P_END + j], away - r1
+        on, off = tile[P_ON + j], tile[P_OFF + j]
+        dx, dy = dx - half_x, dy - half_y
+        inverse = 1.0 / max(np.sqrt(dx * dx + dy * dy), 1e-3)
+        mean = -(dx * mean_x + dy * mean_y) * inverse - mean_r
+        # how far a direction turns on the way: see `crossings.turning`
+        share = way * inverse
+        spread = apart + (1.34 * share if share <= 0.5 else 2.0) * speed
+        slowest, fastest = mean - spread, mean + spread
+        turns = (slowest < 0.0) & (fastest > 0.0) & (2.0 * spread * length > _DONE_PX)
+        # as `crossings.may_reach`, without its division
+        width, product = 2.0 * spread, slowest * fastest * length
+        least = begin * fastest - end * slowest + product
+        most = end * fastest - begin * slowest - product
+        reaches = (least <= on * width) | ((most >= off * width) & (least < reach * width))
+        falls = end < begin
+        meets = (on >= end) if falls else ((off <= end) & (begin < reach))
+        sure = (COMES if falls else GOES) if meets else NOTHING
+        kind = (DOUBT if reaches else NOTHING) if turns else sure
+        near = (min(begin, end) - stray <= on) | (max(begin, end) + stray >= off)
+        tile[P_KIND + j] = kind if near else NOTHING
+        tile[P_BEGIN + j], tile[P_END + j] = begin, end
+
+
+(
+    R_X,
+    R_Y,
+    R_TARGET,
+    R_TIME,
+    R_LOW,
+    R_HIGH,
+    R_FINE,
+    R_HEAD,
+    R_STEP,
+    R_GOOD,
+    R_SINCE,
+    R_INVERSE,
+) = (STRIDE * k for k in range(12))
+"""Of every root: column and row; the rim distance that is met; when, ns after the block's begin,
+and the limits of that; how long a step of the search may be after which it is good; a packed event
+at the block's begin (52 bits, which a float64 holds); the step of the path; whether the time is
+good; when that step begins and one over its length."""
+R_C = 12 * STRIDE
+"""First of the step's twelve coefficients."""
+WAIT_FIELDS = 24
+STEP_FIELDS = 14
+(
+    R_BEGIN,
+    R_END,
+    R_LAST,
+    R_LEVEL,
+    R_RISE,
+    R_LANE,
+    R_SCALE_A,
+    R_SCALE_B,
+    R_NEXT,
+) = (STRIDE * k for k in range(24, 33))
+"""Of every pixel that fires: distances at both ends of the piece; rim distance of the last event
+before; reference level; what an event adds to it; lane in the pixels' tile; slopes of time over
+distance at both ends; rim distance of the next event."""
+FIRE_FIELDS = 33
+_ROUNDS = 6
+_TICK = float(1 << 25)  # a nanosecond in a packed event
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def begin_piece(fire, n, segment):  # type: ignore[no-untyped-def]
+    """What does not change from one threshold to the next: limits, and slopes at both ends."""
+    a, b = segment.begin, segment.end
+    for j in range(n):
+        fire[R_LOW + j], fire[R_HIGH + j], fire[R_FINE + j] = a, b, segment.fine
+    x0, y0, r0 = segment.x0, segment.y0, segment.r0
+    x1, y1, r1 = segment.x1, segment.y1, segment.r1
+    vx0, vy0, vr0 = segment.vx0, segment.vy0, segment.vr0
+    vx1, vy1, vr1 = segment.vx1, segment.vy1, segment.vr1
+    for j in range(n):
+        x, y, begin, end = (
+            fire[R_X + j],
+            fire[R_Y + j],
+            fire[R_BEGIN + j],
+            fire[R_END + j],
+        )
+        rise = end - begin
+        away = begin + r0
+        slope = -((x - x0) * vx0 + (y - y0) * vy0) - vr0 * away
+        fire[R_SCALE_A + j] = rise * away / slope if slope * rise > 0.0 else b - a
+        away = end + r1
+        slope = -((x - x1) * vx1 + (y - y1) * vy1) - vr1 * away
+        fire[R_SCALE_B + j] = rise * away / slope if slope * rise > 0.0 else b - a
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def guess(fire, n, segment, pace):  # type: ignore[no-untyped-def]
+    """First guesses of time, and of the step in which it lies.
+
+    Args:
+        pace: one over the length of the piece's first step, 1/ns.
+    """
+    a, b, k0 = segment.begin, segment.end, segment.k0
+    length, final = b - a, segment.k1 - 1.0
+    for j in range(n):
+        s = (fire[R_TARGET + j] - fire[R_BEGIN + j]) / (fire[R_END + j] - fire[R_BEGIN + j])
+        # a target that was met before the piece, by rounding, is met at its begin
+        s = s if s > 0.0 else 0.0
+        u = 1.0 - s
+        t = a + s * (
+            s * (3.0 - 2.0 * s) * length
+            + u * (u * fire[R_SCALE_A + j] - s * fire[R_SCALE_B + j])
+        )  # fmt: skip
+        t = min(max(t, a), b)
+        fire[R_TIME + j] = t
+        fire[R_STEP + j] = np.floor(min(k0 + (t - a) * pace, final))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
+    """After an event at TARGET: the new reference level, and the rim distance of the next event.
+
+    As `edges.rim_of`, with a logarithm that has no branches.
+    """
+    rounding = 1e-9 * contrast
+    scale = (1.0 - 2.0 * TAIL) / contrast
+    for j in range(n):
+        level = fire[R_LEVEL + j] + fire[R_RISE + j]
+        fire[R_LEVEL + j] = level
+        level += fire[R_RISE + j]
+        share = TAIL + min(max(level, 0.0), contrast) * scale
+        log = logarithm((1.0 - share) / share)
+        low = CUT * edge if level >= -rounding else FAR
+        high = -CUT * edge if level <= contrast + rounding else -FAR
+        rim = edge * log
+        rim = high if level >= contrast - rounding else rim
+        fire[R_NEXT + j] = low if level <= rounding else rim
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
+    """What `fetch` needs of each step, side by side: `steps` (r, STEP_FIELDS), written."""
+    for k in range(n):
+        steps[k, 0], steps[k, 1] = since[k], inverse[k]
+        for c in range(12):
+            steps[k, 2 + c] = curve[c, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fetch(roots, n, since, until, steps):  # type: ignore[no-untyped-def]
+    """Find the step in which each time lies, and fetch what is known of it."""
+    for j in range(n):
+        k, t = np.uint64(roots[R_STEP + j]), roots[R_TIME + j]
+        while t > until[k]:
+            k += np.uint64(1)
+        while t < since[k]:
+            k -= np.uint64(1)
+        roots[R_STEP + j] = k
+        for c in range(STEP_FIELDS):
+            roots[R_SINCE + STRIDE * c + j] = steps[k, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def refine(roots, n):  # type: ignore[no-untyped-def]
+    """One step of Chebyshev's method; where SINCE was, the packed event stands then."""
+    for j in range(n):
+        t, target = roots[R_TIME + j], roots[R_TARGET + j]
+        inverse = roots[R_INVERSE + j]
+        tau = t - roots[R_SINCE + j]
+        s = tau * inverse
+        b, c, d = (
+            roots[R_C + STRIDE + j],
+            roots[R_C + 2 * STRIDE + j],
+            roots[R_C + 3 * STRIDE + j],
+        )
+        dx = roots[R_X + j] - (roots[R_C + j] + tau * (b + s * (c + s * d)))
+        vx = b + s * (2.0 * c + 3.0 * s * d)
+        ax = 2.0 * c + 6.0 * s * d
+        b, c, d = (
+            roots[R_C + 5 * STRIDE + j],
+            roots[R_C + 6 * STRIDE + j],
+            roots[R_C + 7 * STRIDE + j],
+        )
+        dy = roots[R_Y + j] - (roots[R_C + 4 * STRIDE + j] + tau * (b + s * (c + s * d)))
+        vy = b + s * (2.0 * c + 3.0 * s * d)
+        ay = 2.0 * c + 6.0 * s * d
+        b, c, d = (
+            roots[R_C + 9 * STRIDE + j],
+            roots[R_C + 10 * STRIDE + j],
+            roots[R_C + 11 * STRIDE + j],
+        )
+        r = roots[R_C + 8 * STRIDE + j] + tau * (b + s * (c + s * d))
+        vr = b + s * (2.0 * c + 3.0 * s * d)
+        ar = 2.0 * c + 6.0 * s * d
+        away = np.sqrt(dx * dx + dy * dy)
+        per_away = 1.0 / away
+        toward = (dx * vx + dy * vy) * per_away
+        slope = -toward - vr
+        per_slope = 1.0 / slope
+        step = (target - (away - r)) * per_slope
+        bend = (vx * vx + vy * vy - toward * toward) * per_away
+        bend -= ((dx * ax + dy * ay) * per_away + ar) * inverse
+        share = -0.5 * bend * per_slope * step
+        low, high, fine = roots[R_LOW + j], roots[R_HIGH + j], roots[R_FINE + j]
+        new = t + step * (1.0 + share)
+        inside = (new - roots[R_SINCE + j]) * inverse
+        # the next error is that of a cubic method; a longer step must not leave the path's step
+        good = (share * share * abs(step) <= 3e-4 * fine) & (
+            (abs(step) <= fine) | ((abs(step) <= 20.0 * fine) & (inside >= 0.0) & (inside <= 1.0))
+        )
+        new = new if new > low else low
+        new = new if new < high else high
+        roots[R_TIME + j] = new
+        roots[R_GOOD + j] = 1.0 if good else 0.0
+        roots[R_SINCE + j] = roots[R_HEAD + j] + np.floor(new) * _TICK
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def finish(wait, n, since, until, steps, inverse, curve, out, count):  # type: ignore[no-untyped-def]
+    """More steps for the n roots that wait, until all of them are events.
+
+    Returns:
+        how many events `out` holds now.
+    """
+    for _ in range(_ROUNDS):
+        fetch(wait, n, since, until, steps)
+        refine(wait, n)
+        left = 0
+        for j in range(n):
+            if wait[R_GOOD + j] > 0.0:
+                out[count] = np.int64(wait[R_SINCE + j])
+                count += 1
+            else:
+                move(wait, j, wait, left)
+                left += 1
+        n = left
+        if n == 0:
+            return count
+    for j in range(n):
+        t = solve(
+            wait[R_X + j], wait[R_Y + j], wait[R_TARGET + j], np.int64(wait[R_HEAD + j]) & 1 > 0,
+            wait[R_LOW + j], wait[R_HIGH + j], wait[R_TIME + j], np.int64(wait[R_STEP + j]),
+            wait[R_FINE + j], since, until, inverse, curve,
+        )  # fmt: skip
+        out[count] = np.int64(wait[R_HEAD + j] + np.floor(t) * _TICK)
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def move(source, j, target, k):  # type: ignore[no-untyped-def]
+    """Let lane k of `target` hold the root in lane j of `source`."""
+    for field in range(9):
+        target[STRIDE * field + k] = source[STRIDE * field + j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def events_of_pixels(  # type: ignore[no-untyped-def]
-    pixels, count, pieces, first, since, until, inverse, curve, steps, tree, threshold,
+    pixels, count, segments, first, since, until, inverse, curve, steps, tree, threshold,
     contrast, edge, origin, stack, tile, fire, wait, state, gaps, out, n,
 ):  # fmt: skip
     """Events of pixels over some blocks.
 
     Args:
         pixels: column << 12 | row, the first `count` of them.
-        pieces: of the blocks, in order, see `pieces`.
+        segments: of the blocks, in order, see `marker_path.SEGMENT`.
         first: first row of each block, and the last row of all, (blocks + 1,).
         since, until: when each step begins and ends, ns after the begin of its block.
         inverse, curve: see `marker_path.fit_block`.
@@ -45,89 +347,89 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
         threshold, state: of all pixels, (height, width) and (height, width, 4); written.
         origin: ns to add to every time.
         stack: scratch, (160, 3).
-        tile, fire, wait: scratch, tiles of the fields in `pixel_lanes` and `roots`.
+        tile, fire, wait: scratch, tiles of the fields above.
         gaps: distance of each pixel from the rim at the end, px; written.
-        out: packed events as in `sorting`, written from `n` on.
+        out: packed events as in `readout`, written from `n` on.
 
     Returns:
         how many events `out` holds now.
     """
-    reach, amount = CUT * edge, pieces.shape[0]
+    reach, amount = CUT * edge, segments.shape[0]
     waiting = 0
     active = np.empty(LANES + 1, np.int64)
     for index in range(amount):
         # a tree's node 0, which it has no use for, says whether there is one
-        tree[4 * first[int(pieces[index, of.BLOCK])], 0] = 0.0
+        tree[4 * first[segments[index].block], 0] = 0.0
     for at in range(0, count, LANES):
         size = min(count - at, LANES)
         for j in range(size):
             pixel = pixels[at + j]
             x, y = pixel >> 12, pixel & 4095
-            tile[lanes.X + j], tile[lanes.Y + j] = x, y
-            tile[lanes.ON + j], tile[lanes.OFF + j] = (
-                state[y, x, edges.ON],
-                state[y, x, edges.OFF],
+            tile[P_X + j], tile[P_Y + j] = x, y
+            tile[P_ON + j], tile[P_OFF + j] = (
+                state[y, x, ON],
+                state[y, x, OFF],
             )
-            tile[lanes.LAST + j] = state[y, x, edges.LAST]
-            tile[lanes.LEVEL + j] = state[y, x, edges.LEVEL]
-            tile[lanes.STEP + j] = threshold[y, x]
-            tile[lanes.CODE + j] = x << 13 | y << 1
-        place_pixels(tile, size, pieces[0, of.X0], pieces[0, of.Y0], pieces[0, of.R0])
+            tile[P_LAST + j] = state[y, x, LAST]
+            tile[P_LEVEL + j] = state[y, x, LEVEL]
+            tile[P_STEP + j] = threshold[y, x]
+            tile[P_CODE + j] = x << 13 | y << 1
+        place_pixels(tile, size, segments[0].x0, segments[0].y0, segments[0].r0)
         for number in range(amount):
-            piece = pieces[number]
-            classify(tile, size, piece, reach)
-            head = (piece[of.ZERO] + origin) * float(1 << 25)
+            segment = segments[number]
+            classify(tile, size, segment, reach)
+            head = (segment.zero + origin) * float(1 << 25)
             firing = 0
             busy = 0
             for j in range(size):
                 active[busy] = j
-                busy += tile[lanes.KIND + j] != NOTHING
+                busy += tile[P_KIND + j] != NOTHING
             for index in range(busy):
                 j = active[index]
-                kind = tile[lanes.KIND + j]
+                kind = tile[P_KIND + j]
                 if kind == DOUBT:
-                    block = int(piece[of.BLOCK])
+                    block = segment.block
                     begin, final = first[block], first[block + 1]
                     if tree[4 * begin, 0] == 0.0:
                         bound_rates(curve, begin, final, 4 * begin, tree)
                         tree[4 * begin, 0] = 1.0
                     on, off, last, level, n = events_of_piece(
-                        tile[lanes.X + j], tile[lanes.Y + j], tile[lanes.ON + j],
-                        tile[lanes.OFF + j], tile[lanes.LAST + j], tile[lanes.LEVEL + j],
-                        tile[lanes.STEP + j], tile[lanes.BEGIN + j], piece, 4 * begin, begin, final,
+                        tile[P_X + j], tile[P_Y + j], tile[P_ON + j],
+                        tile[P_OFF + j], tile[P_LAST + j], tile[P_LEVEL + j],
+                        tile[P_STEP + j], tile[P_BEGIN + j], segment, 4 * begin, begin, final,
                         since, until, inverse, curve, tree, contrast, edge,
-                        np.int64(head + tile[lanes.CODE + j]), stack, out, n,
+                        np.int64(head + tile[P_CODE + j]), stack, out, n,
                     )  # fmt: skip
-                    tile[lanes.ON + j], tile[lanes.OFF + j] = on, off
-                    tile[lanes.LAST + j], tile[lanes.LEVEL + j] = last, level
+                    tile[P_ON + j], tile[P_OFF + j] = on, off
+                    tile[P_LAST + j], tile[P_LEVEL + j] = last, level
                     continue
                 falls = kind == COMES
-                fire[roots.X + firing] = tile[lanes.X + j]
-                fire[roots.Y + firing] = tile[lanes.Y + j]
-                fire[roots.BEGIN + firing] = tile[lanes.BEGIN + j]
-                fire[roots.END + firing] = tile[lanes.END + j]
-                fire[roots.TARGET + firing] = tile[(lanes.ON if falls else lanes.OFF) + j]
-                fire[roots.LAST + firing] = tile[lanes.LAST + j]
-                fire[roots.LEVEL + firing] = tile[lanes.LEVEL + j]
-                step = tile[lanes.STEP + j]
-                fire[roots.RISE + firing] = step if falls else -step
-                fire[roots.HEAD + firing] = head + tile[lanes.CODE + j] + falls
-                fire[roots.LANE + firing] = j
+                fire[R_X + firing] = tile[P_X + j]
+                fire[R_Y + firing] = tile[P_Y + j]
+                fire[R_BEGIN + firing] = tile[P_BEGIN + j]
+                fire[R_END + firing] = tile[P_END + j]
+                fire[R_TARGET + firing] = tile[(P_ON if falls else P_OFF) + j]
+                fire[R_LAST + firing] = tile[P_LAST + j]
+                fire[R_LEVEL + firing] = tile[P_LEVEL + j]
+                step = tile[P_STEP + j]
+                fire[R_RISE + firing] = step if falls else -step
+                fire[R_HEAD + firing] = head + tile[P_CODE + j] + falls
+                fire[R_LANE + firing] = j
                 firing += 1
             if firing == 0:
                 continue
-            begin_piece(fire, firing, piece)
-            pace = inverse[int(piece[of.K0])]
+            begin_piece(fire, firing, segment)
+            pace = inverse[segment.k0]
             while firing > 0:
-                guess(fire, firing, piece, pace)
+                guess(fire, firing, segment, pace)
                 fetch(fire, firing, since, until, steps)
                 refine(fire, firing)
                 if waiting + firing > LANES:
                     n = finish(wait, waiting, since, until, steps, inverse, curve, out, n)
                     waiting = 0
                 for j in range(firing):
-                    if fire[roots.GOOD + j] > 0.0:
-                        out[n] = np.int64(fire[roots.SINCE + j])
+                    if fire[R_GOOD + j] > 0.0:
+                        out[n] = np.int64(fire[R_SINCE + j])
                         n += 1
                     else:
                         move(fire, j, wait, waiting)
@@ -137,13 +439,13 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
         for j in range(size):
             pixel = pixels[at + j]
             x, y = pixel >> 12, pixel & 4095
-            state[y, x, edges.ON], state[y, x, edges.OFF] = (
-                tile[lanes.ON + j],
-                tile[lanes.OFF + j],
+            state[y, x, ON], state[y, x, OFF] = (
+                tile[P_ON + j],
+                tile[P_OFF + j],
             )
-            state[y, x, edges.LAST] = tile[lanes.LAST + j]
-            state[y, x, edges.LEVEL] = tile[lanes.LEVEL + j]
-            gaps[at + j] = tile[lanes.END + j]
+            state[y, x, LAST] = tile[P_LAST + j]
+            state[y, x, LEVEL] = tile[P_LEVEL + j]
+            gaps[at + j] = tile[P_END + j]
     if waiting > 0:
         n = finish(wait, waiting, since, until, steps, inverse, curve, out, n)
     return n
@@ -158,23 +460,23 @@ def settle(tile, fire, n):  # type: ignore[no-untyped-def]
     """
     left = 0
     for j in range(n):
-        target, following = fire[roots.TARGET + j], fire[roots.NEXT + j]
-        end, comes = fire[roots.END + j], fire[roots.RISE + j] > 0.0
+        target, following = fire[R_TARGET + j], fire[R_NEXT + j]
+        end, comes = fire[R_END + j], fire[R_RISE + j] > 0.0
         if (following >= end) if comes else (following <= end):
             for field in (
-                roots.X, roots.Y, roots.HEAD, roots.BEGIN, roots.END, roots.LEVEL, roots.RISE,
-                roots.LANE, roots.SCALE_A, roots.SCALE_B,
+                R_X, R_Y, R_HEAD, R_BEGIN, R_END, R_LEVEL, R_RISE,
+                R_LANE, R_SCALE_A, R_SCALE_B,
             ):  # fmt: skip
                 fire[field + left] = fire[field + j]
-            fire[roots.LAST + left], fire[roots.TARGET + left] = target, following
+            fire[R_LAST + left], fire[R_TARGET + left] = target, following
             left += 1
         else:
-            lane = int(fire[roots.LANE + j])
-            before = fire[roots.LAST + j]
-            tile[lanes.ON + lane] = following if comes else before
-            tile[lanes.OFF + lane] = before if comes else following
-            tile[lanes.LAST + lane], tile[lanes.LEVEL + lane] = (
+            lane = int(fire[R_LANE + j])
+            before = fire[R_LAST + j]
+            tile[P_ON + lane] = following if comes else before
+            tile[P_OFF + lane] = before if comes else following
+            tile[P_LAST + lane], tile[P_LEVEL + lane] = (
                 target,
-                fire[roots.LEVEL + j],
+                fire[R_LEVEL + j],
             )
     return left

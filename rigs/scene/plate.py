@@ -16,22 +16,28 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sliplab.rigs.scene.column import relaxing
-from sliplab.rigs.scene.contact import move_tips, record
-from sliplab.rigs.scene.lanes import respond
-from sliplab.rigs.scene.rows import END_FORCE_Y, KICK, LANES, SHARE, TABLE, block_of, gather, spread
+from sliplab.rigs.scene.contact import move_tips, record, respond
+from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import (
     ACROSS,
     BASE_X,
     BASE_Y,
+    END_FORCE_Y,
     FORCE_Y,
     GAP,
     INDENTATION,
+    KICK,
+    LANES,
     LAYOUT_X,
     LAYOUT_Y,
     MODE,
+    SHARE,
     STUCK,
+    TABLE,
     Law,
+    block_of,
+    gather,
+    spread,
 )
 
 _ITERATIONS = 200

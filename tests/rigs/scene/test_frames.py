@@ -2,10 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from sliplab.analysis.labels.plate import PlateTracker
-from sliplab.rigs.scene.exposure import Way
-from sliplab.rigs.scene.frames import FrameOptics, PlateView
+from sliplab.rigs.scene.frames import (
+    Exposures,
+    FrameOptics,
+    PlateView,
+    Reflections,
+    Way,
+    draw_reflections,
+    expose,
+    moved,
+)
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
 
 SKIN = make_skin(SkinGeometry(), 1)
@@ -198,3 +207,116 @@ def test_a_marker_below_the_picture_is_no_trouble() -> None:
     assert np.array_equal(draw(optics, SKIN.layout_mm, -60.0), draw(optics, SKIN.layout_mm, None))
     edge = draw(optics, SKIN.layout_mm, -37.0)
     assert edge[-1, -200:].max() > 150
+
+
+PX_PER_MM = 20.0
+EXPOSURE_NS = 2_000_000
+
+
+def seen(x_mm, mid_ns: list[int], plate_mm=None) -> Exposures:  # type: ignore[no-untyped-def]
+    """Two tips, of which the second stands; places given as functions of the time in ms."""
+
+    def look(t_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ms = t_ns / 1e6
+        places = np.zeros((len(ms), 2, 2))
+        places[:, 0, 0] = x_mm(ms)
+        places[:, 1] = 5.0
+        return places, np.zeros(len(ms)) if plate_mm is None else plate_mm(ms)
+
+    return expose(look, np.array(mid_ns, np.int64), EXPOSURE_NS, PX_PER_MM)
+
+
+MOTIONS = {
+    "slow slide": lambda ms: 1.6e-3 * ms,
+    "fast slide": lambda ms: 0.7 * ms,
+    "fall": lambda ms: 0.5 * 9.81e-3 * ms**2,
+    "kink": lambda ms: 0.06 * np.maximum(ms - 9.4, 0.0),
+    "late kink": lambda ms: 0.3 * np.maximum(ms - 10.93, 0.0),
+    "small kink": lambda ms: 0.004 * np.maximum(ms - 9.7, 0.0),
+    "there and back": lambda ms: 0.05 * np.abs(ms - 10.2),
+    "standing": lambda ms: 0.0 * ms,
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_the_mean_is_the_mean_over_the_exposure(name: str) -> None:
+    motion = MOTIONS[name]
+    found = seen(motion, [10_000_000])
+    corners = [9.4, 9.7, 10.2, 10.93]
+    mean = quad(motion, 9.0, 11.0, points=corners, epsabs=1e-12)[0] / 2.0
+    assert abs(found.tips_mm[0, 0, 0] - mean) * PX_PER_MM < 0.003
+    assert found.tips_mm[0, 1].tolist() == [5.0, 5.0]
+
+
+def test_only_what_moves_a_tenth_of_a_pixel_has_a_way() -> None:
+    # at 1.6 mm/s 0.064 px in 2 ms; at 3 mm/s 0.12 px
+    assert not seen(lambda ms: 1.6e-3 * ms, [10_000_000, 20_000_000]).ways
+    found = seen(lambda ms: np.where(ms < 15, 0.0, 3e-3 * (ms - 15)), [10_000_000, 20_000_000])
+    assert list(found.ways) == [1]
+    assert len(found.ways[1].tips_mm) == 32
+    path = PX_PER_MM * found.ways[1].tips_mm
+    assert moved(path).tolist() == [True, False]
+
+
+def test_a_falling_plate_alone_is_a_way_too() -> None:
+    found = seen(MOTIONS["standing"], [10_000_000], lambda ms: -0.5 * ms)
+    assert found.plate_mm[0] == pytest.approx(-5.0, abs=1e-9)
+    # 20 px in steps of a quarter
+    assert len(found.ways[0].plate_mm) == 80
+    assert not moved(PX_PER_MM * found.ways[0].tips_mm).any()
+
+
+def test_no_frames_are_no_exposures() -> None:
+    found = seen(MOTIONS["fall"], [])
+    assert found.tips_mm.shape == (0, 2, 2)
+    assert not found.ways
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_exposures_seen_together_are_those_seen_one_by_one(name: str) -> None:
+    mids = [5_000_000, 8_000_000, 10_000_000, 13_000_000, 40_000_000]
+    together = seen(MOTIONS[name], mids, lambda ms: -0.01 * ms)
+    for index, mid in enumerate(mids):
+        alone = seen(MOTIONS[name], [mid], lambda ms: -0.01 * ms)
+        assert np.array_equal(together.tips_mm[index], alone.tips_mm[0])
+        assert together.plate_mm[index] == alone.plate_mm[0]
+        assert (index in together.ways) == (0 in alone.ways)
+        if index in together.ways:
+            assert np.array_equal(together.ways[index].tips_mm, alone.ways[0].tips_mm)
+
+
+NOTHING = np.empty((2, 0, 2))
+
+
+def test_they_belong_to_the_trial_and_are_soft() -> None:
+    some = Reflections(count=6, level=20.0)
+    light = draw_reflections(some, 400, 300, 20.0, seed=5).astype(int)
+    assert light.shape == (300, 400)
+    assert 10 <= light.max() <= 20
+    assert light.min() == 0
+    # soft: a Gaussian of 7 px or more rises by at most 0.61 / 7 of its height a pixel, six overlap
+    assert np.abs(np.diff(light, axis=0)).max() <= 6
+    assert np.array_equal(light, draw_reflections(some, 400, 300, 20.0, seed=5))
+    assert not np.array_equal(light, draw_reflections(some, 400, 300, 20.0, seed=6))
+
+
+@pytest.mark.parametrize("reflections", [Reflections(), Reflections(count=3, level=0.0)])
+def test_switched_off_they_change_nothing(reflections: Reflections) -> None:
+    plain, with_none = (np.empty((2, 200, 200), np.uint8) for _ in range(2))
+    tips = np.zeros((2, 1, 2))
+    PlateView(FrameOptics(), 200, 200).draw(plain, tips, None, np.arange(2), 1)
+    optics = FrameOptics(reflections=reflections)
+    PlateView(optics, 200, 200).draw(with_none, tips, None, np.arange(2), 1)
+    assert np.array_equal(plain, with_none)
+
+
+def test_every_picture_of_a_trial_shows_the_same_ones_and_white_stays_white() -> None:
+    optics = FrameOptics(reflections=Reflections(count=8, level=90.0), noise=0.0)
+    images = np.empty((2, 300, 300), np.uint8)
+    view = PlateView(optics, 300, 300)
+    view.draw(images, NOTHING, None, np.arange(2), 1)
+    assert np.array_equal(images[0], images[1])
+    assert images.max() > 25 + 40
+    view.draw(images, np.zeros((2, 1, 2)), None, np.arange(2), 1)
+    assert images.max() <= 255
+    assert images[0, 150, 150] >= 200

@@ -8,23 +8,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from sliplab.rigs.scene.column import relaxing
+from sliplab.rigs.scene.contact import respond, settle, tip_step
 from sliplab.rigs.scene.friction import friction_knots
-from sliplab.rigs.scene.lanes import respond, settle
-from sliplab.rigs.scene.rows import DEEP, LANES, ROWS, TABLE, TO_X, TO_Y, block_of, gather, spread
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
+from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import (
+    DEEP,
     FREE,
     GAP,
+    LANES,
     LAYOUT_X,
     LAYOUT_Y,
+    ROWS,
     SLIDING,
     STUCK,
+    TABLE,
+    TO_X,
+    TO_Y,
     Springs,
+    block_of,
+    gather,
     make_springs,
     new_tips,
+    spread,
 )
-from sliplab.rigs.scene.tip import tip_step
 from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
 
 SWITCHES = {

@@ -14,11 +14,23 @@ from scipy.optimize import brentq
 
 from sliplab.rigs.scene.crossings import events_of_piece
 from sliplab.rigs.scene.edges import CUT, dark_pixels, rim_of, see_discs
-from sliplab.rigs.scene.marker_path import bound_rates, fit_blocks, inner_weights, slope_weights
-from sliplab.rigs.scene.pieces import BLOCK, FIELDS, R0, X0, Y0, ZERO, cut_block
-from sliplab.rigs.scene.pixel_lanes import PIXEL_FIELDS, STRIDE
-from sliplab.rigs.scene.pixels import events_of_pixels
-from sliplab.rigs.scene.roots import FIRE_FIELDS, STEP_FIELDS, WAIT_FIELDS, pack_steps
+from sliplab.rigs.scene.marker_path import (
+    SEGMENT,
+    bound_rates,
+    cut_block,
+    fit_blocks,
+    inner_weights,
+    slope_weights,
+)
+from sliplab.rigs.scene.pixels import (
+    FIRE_FIELDS,
+    PIXEL_FIELDS,
+    STEP_FIELDS,
+    STRIDE,
+    WAIT_FIELDS,
+    events_of_pixels,
+    pack_steps,
+)
 
 CONTRAST, EDGE, RADIUS = 2.08, 0.8, 8.0
 HEIGHT, WIDTH, STEPS = 40, 44, 8
@@ -34,7 +46,7 @@ class Look:
     until: np.ndarray
     inverse: np.ndarray
     curve: np.ndarray
-    pieces: np.ndarray
+    segments: np.ndarray
     threshold: np.ndarray
     state: np.ndarray
 
@@ -62,9 +74,9 @@ def look(seed: int, px: float, smooth: float) -> Look:
     t = np.arange(total + 1) * float(NS)
     first = np.arange(4) * STEPS
     inverse, weights, inner = np.empty(total + 1), np.empty((4, 2 * total)), np.empty((3, total))
-    curve, pieces, spread = (
+    curve, segments, spread = (
         np.empty((12, total + 1)),
-        np.empty((total, FIELDS)),
+        np.empty(total, SEGMENT),
         np.empty((4, total)),
     )
     for block in range(3):
@@ -76,13 +88,13 @@ def look(seed: int, px: float, smooth: float) -> Look:
     for block in range(3):
         amount = cut_block(
             first[block], first[block + 1], block, t[first[block]], CUT * EDGE, since, since + NS,
-            curve, spread, pieces, amount,
+            curve, spread, segments, amount,
         )  # fmt: skip
     threshold = 0.2 + 0.03 * rng.uniform(-3, 3, (HEIGHT, WIDTH))
     state = dark_pixels(threshold, CONTRAST, EDGE)
     disc = path[:, :, 0]
     see_discs(disc, CONTRAST, EDGE, threshold, state, np.tile([np.inf, -np.inf] * 2, (1, 1)))
-    return Look(first, since, since + NS, inverse, curve, pieces[:amount], threshold, state)
+    return Look(first, since, since + NS, inverse, curve, segments[:amount], threshold, state)
 
 
 def side_by_side(a: Look, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +105,7 @@ def side_by_side(a: Look, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gaps, out = np.empty(len(pixels)), np.empty(400_000, np.int64)
     scratch = [np.empty(STRIDE * count) for count in (PIXEL_FIELDS, FIRE_FIELDS, WAIT_FIELDS)]
     n = events_of_pixels(
-        pixels, len(pixels), a.pieces, a.first, a.since, a.until, a.inverse, a.curve, steps, tree,
+        pixels, len(pixels), a.segments, a.first, a.since, a.until, a.inverse, a.curve, steps, tree,
         a.threshold, CONTRAST, EDGE, 0, np.empty((160, 3)), *scratch, state, gaps, out, 0,
     )  # fmt: skip
     return np.sort(out[:n]), gaps
@@ -105,7 +117,7 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
     for block in range(3):
         bound_rates(a.curve, a.first[block], a.first[block + 1], 4 * a.first[block], tree)
     n = search_all(
-        a.pieces, a.first, a.since, a.until, a.inverse, a.curve, tree, a.threshold, state, stack,
+        a.segments, a.first, a.since, a.until, a.inverse, a.curve, tree, a.threshold, state, stack,
         out,
     )  # fmt: skip
     return np.sort(out[:n])
@@ -113,19 +125,19 @@ def one_by_one(a: Look, state: np.ndarray) -> np.ndarray:
 
 @njit
 def search_all(  # type: ignore[no-untyped-def]
-    pieces, first, since, until, inverse, curve, tree, threshold, state, stack, out
+    segments, first, since, until, inverse, curve, tree, threshold, state, stack, out
 ):
     """How many events the exact search finds, pixel by pixel and piece by piece."""
     n = 0
     for y in range(HEIGHT):
         for x in range(WIDTH):
             on, off, last_one, level = state[y, x]
-            for piece in pieces:
-                begin = int(first[int(piece[BLOCK])])
-                gap = np.hypot(x - piece[X0], y - piece[Y0]) - piece[R0]
-                head = int(piece[ZERO]) << 25 | x << 13 | y << 1
+            for segment in segments:
+                begin = int(first[segment.block])
+                gap = np.hypot(x - segment.x0, y - segment.y0) - segment.r0
+                head = int(segment.zero) << 25 | x << 13 | y << 1
                 on, off, last_one, level, n = events_of_piece(
-                    float(x), float(y), on, off, last_one, level, threshold[y, x], gap, piece,
+                    float(x), float(y), on, off, last_one, level, threshold[y, x], gap, segment,
                     4 * begin, begin, begin + STEPS, since, until, inverse, curve, tree, CONTRAST,
                     EDGE, head, stack, out, n,
                 )  # fmt: skip

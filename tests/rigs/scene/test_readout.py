@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from sliplab.rigs.mock.settings import EventCamera
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
-from sliplab.rigs.scene.readout import Scans
-from sliplab.rigs.scene.sorting import sort_packed
+from sliplab.rigs.scene.readout import Scans, sort_packed
 
 ONE = np.zeros((1, 2))
 BUSY = {"width": 160, "height": 120, "noise_hz": 5.0, "hot_hz": 900.0, "refractory_us": 50.0}

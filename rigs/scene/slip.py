@@ -2,8 +2,8 @@
 
 The unknowns are the slip and the bend, the equations that spring and base together are as long as
 the stretch that is left, and that the force lies on the friction cone at the end of the slip. One
-Newton step for both, shared by the tip that is computed alone (`rigs.scene.tip`) and by those
-computed side by side (`rigs.scene.sliding_lanes`), so that both give the same bits. No branches,
+Newton step for both, shared by the tip that is computed alone (`rigs.scene.contact`) and by those
+computed side by side (`rigs.scene.contact`), so that both give the same bits. No branches,
 for the latter. Where it does not get there, because friction has a kink at rest or falls more
 steeply than the spring pulls, `slid_surely` does, slowly.
 
@@ -15,9 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sliplab.rigs.scene.column import CLOSE, ITERATIONS, bend_for, column
+from sliplab.rigs.scene.branchless import logarithm
 from sliplab.rigs.scene.friction import KNOT_MM, grip_at
-from sliplab.rigs.scene.smooth import logarithm
 
 PASSES = 8
 """Newton steps that are tried; two do while rows are close."""
@@ -315,3 +314,75 @@ def foreseen(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyp
     weight, lag = (weight, lag) if known else (1.0, 0.0)
     slides = (2.0 * speed - earlier) * slid_s if known and even else -1.0
     return weight * per_s, lag, slides
+
+
+_LEAST_STIFFNESS = 0.05
+ITERATIONS = 60
+CLOSE = 1e-7
+"""A change of the bend, over the bend, after which Newton's next one would be rounding."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-untyped-def]
+    """Tangential and normal force of a bent column, and their slopes over the bend.
+
+    N = pressed - pressing * shortening * bent^2, not negative.
+    """
+    loss = pressing * shortening * bent
+    normal = pressed - loss * bent
+    normal_slope = -2.0 * loss
+    if normal <= 0.0:
+        normal, normal_slope = 0.0, 0.0
+    stiffness = bending - 2.0 * shortening * normal
+    slope = stiffness - 2.0 * shortening * bent * normal_slope
+    if stiffness < _LEAST_STIFFNESS * bending:
+        stiffness = slope = _LEAST_STIFFNESS * bending
+    return stiffness * bent, normal, slope, normal_slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def first_bend(stretch, guess, bending, shortening, compliance):  # type: ignore[no-untyped-def]
+    """Where the search for a bend begins: its solution, if the papilla is not shortened."""
+    straight = stretch / (1.0 + compliance * bending)
+    return straight if shortening == 0.0 else min(guess, stretch)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def bend_step(bent, low, high, stretch, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+    """One guarded Newton step towards the bend at a stretch.
+
+    Returns:
+        the bend, the bracket round it, and whether that is it.
+    """
+    force, _, slope, _ = column(bent, bending, shortening, pressed, pressing)
+    miss = bent + compliance * force - stretch
+    found = abs(miss) <= 1e-14 * stretch
+    low, high = (low, bent) if miss > 0.0 else (bent, high)
+    after = bent - miss / (1.0 + compliance * slope)
+    after = after if low <= after <= high else 0.5 * (low + high)
+    near = abs(after - bent) <= CLOSE * stretch
+    return (bent if found else after), low, high, found or near
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bend_for(stretch, guess, bending, shortening, compliance, pressed, pressing):  # type: ignore[no-untyped-def]
+    """The bend of a papilla whose tip is `stretch` mm from under its base."""
+    low, high = 0.0, stretch
+    bent = first_bend(stretch, guess, bending, shortening, compliance)
+    for _ in range(ITERATIONS):
+        bent, low, high, found = bend_step(
+            bent, low, high, stretch, bending, shortening, compliance, pressed, pressing
+        )
+        if found:
+            break
+    return bent
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def relaxing(h, relaxation_s):  # type: ignore[no-untyped-def]
+    """Decay of the relaxing branch over `h` s, and its gain for a linear motion in that time.
+
+    q' = -q / tau + k x' with x' constant gives q+ = q e^(-h/tau) + k tau (1 - e^(-h/tau)) dx / h.
+    """
+    share = h / relaxation_s
+    return np.exp(-share), -np.expm1(-share) / share

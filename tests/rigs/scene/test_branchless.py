@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from sliplab.rigs.scene.smooth import decayed, logarithm
+from sliplab.rigs.scene.branchless import decayed, logarithm
 
 EPS = float(np.finfo(np.float64).eps)
 
