@@ -11,13 +11,14 @@ search judges by `is_false_early` and `is_late`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sliplab.analysis.detectors.detection import Found
+from sliplab.storage.schema.label import TrialLabel
 
 Summary = dict[str, float | int | None]
 
@@ -51,17 +52,15 @@ class TrueSlip:
             raise ValueError(f"end {self.end_ns} ns is before gross onset {self.gross_ns} ns")
 
 
-def true_slip(label: Mapping[str, Any]) -> TrueSlip | None:
-    """The slip that a label tells of; None where it lacks an onset.
+def true_slip(label: TrialLabel) -> TrueSlip | None:
+    """Return the slip of a labelled trial; None where the label lacks an onset.
 
-    Args:
-        label: with ``incipient_ns``, ``gross_ns`` and ``end_ns``. A person may have set the gross
-            onset after the end: the slip then ends as it begins.
+    A reviewer may have set the gross onset after the end: the slip then ends as it begins.
     """
-    incipient, gross = label["incipient_ns"], label["gross_ns"]
+    incipient, gross = label.incipient_ns, label.gross_ns
     if incipient is None or gross is None:
         return None
-    return TrueSlip(incipient, gross, max(label["end_ns"], gross))
+    return TrueSlip(incipient, gross, max(label.end_ns, gross))
 
 
 def is_false_early(found_ns: Any, onset_ns: Any, tolerance_ns: Any) -> Any:

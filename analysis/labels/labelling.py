@@ -7,7 +7,7 @@ paper's rule and the change points are both kept; the protocol says which of the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +19,18 @@ from sliplab.analysis.labels.places import Places, places_of
 from sliplab.analysis.labels.rest import Reference, offsets
 from sliplab.analysis.labels.slip_times import SlipTimes, slip_times
 from sliplab.protocols.settings import Labelling
+from sliplab.storage.schema.label import (
+    ChangePoints,
+    OnsetDoubts,
+    Rule,
+    RuleOnsets,
+    TrialLabel,
+)
 from sliplab.storage.trials.recording import Recording
 
 F64 = npt.NDArray[np.float64]
 VERSION = 5
 
-Results = tuple[dict[str, Any], dict[str, Any]]
-"""A result's JSON and its arrays."""
 LOST_SHARE = 0.05
 """A marker that is lost in more of the frames than this is named in the flags."""
 HOLD_SLIP_PX = 1.0
@@ -64,7 +69,7 @@ class Label:
             not seen to rest.
     """
 
-    rule: Literal["paper", "change_point"]
+    rule: Rule
     reference: Reference
     references: dict[Reference, Counted]
     slips: SlipTimes
@@ -145,44 +150,44 @@ class Label:
             found.append("the plate is seen askew: displacements are in its plane")
         return found
 
-    def as_json(self) -> dict[str, Any]:
-        """What is kept as JSON: an onset in doubt is none, and its reason stands beside it."""
+    def document(self) -> TrialLabel:
+        """Return the label as it is kept: an onset in doubt is none, its reason beside it."""
         onsets, doubts = self.onsets, self.doubts
-        return {
-            "rule": self.rule,
-            "reference": self.reference,
-            "incipient_ns": None if doubts.incipient else onsets.incipient_ns,
+        return TrialLabel(
+            rule=self.rule,
+            reference=self.reference,
+            incipient_ns=None if doubts.incipient else onsets.incipient_ns,
             # without the first slip nothing is made of the second
-            "gross_ns": None if doubts.incipient or doubts.gross else onsets.gross_ns,
-            "end_ns": self.end_ns,
-            "doubts": _doubts_json(doubts),
-            "first_marker": onsets.first_marker,
-            "per_marker_ns": onsets.per_marker_ns.tolist(),
-            "paper": _onsets_json(self.paper, self.paper_doubts),
-            "references": {
-                name: _onsets_json(counted.onsets, counted.doubts)
+            gross_ns=None if doubts.incipient or doubts.gross else onsets.gross_ns,
+            end_ns=self.end_ns,
+            doubts=_doubts(doubts),
+            first_marker=onsets.first_marker,
+            per_marker_ns=onsets.per_marker_ns.tolist(),
+            paper=RuleOnsets(**_onsets(self.paper, self.paper_doubts)),
+            references={
+                name: RuleOnsets(**_onsets(counted.onsets, counted.doubts))
                 for name, counted in self.references.items()
             },
-            "change_point": {
-                **_onsets_json(self.slips.onsets, self.slip_doubts),
-                "low_ns": self.slips.low_ns.tolist(),
-                "high_ns": self.slips.high_ns.tolist(),
-            },
-            "hold_slip_px": [
+            change_point=ChangePoints(
+                **_onsets(self.slips.onsets, self.slip_doubts),
+                low_ns=self.slips.low_ns.tolist(),
+                high_ns=self.slips.high_ns.tolist(),
+            ),
+            hold_slip_px=tuple(
                 None if np.isnan(px) else round(px, 3) for px in self.hold_slip_px.tolist()
-            ],
-            "markers_lost": self.markers_lost,
-            "plate_lost": self.places.plate_lost,
-            "camera_moved_px": round(self.camera.largest_px, 3),
-            "flags": self.flags(),
-            "quality": np.round(self.quality(), 3).tolist(),
-            "source": self.source,
-        }
+            ),
+            markers_lost=self.markers_lost,
+            plate_lost=self.places.plate_lost,
+            camera_moved_px=round(self.camera.largest_px, 3),
+            flags=tuple(self.flags()),
+            quality=np.round(self.quality(), 3).tolist(),
+            source=self.source,
+        )
 
-    def as_arrays(self) -> dict[str, Any]:
-        """What is kept as arrays; displacements to a thousandth of a pixel."""
+    def as_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the arrays that are kept; displacements to a thousandth of a pixel."""
         places = self.places
-        arrays = {
+        arrays: dict[str, npt.NDArray[Any]] = {
             "frame_ns": self.frame_ns,
             "displacement_px": _thousandths(self.displacement_px),
             "xy_px": _thousandths(places.xy),
@@ -197,10 +202,12 @@ class Label:
         return arrays
 
 
-def label_results(recording: Recording, settings: Labelling) -> Results:
-    """A trial's label as it is kept: JSON and arrays."""
+def label_results(
+    recording: Recording, settings: Labelling
+) -> tuple[TrialLabel, dict[str, npt.NDArray[Any]]]:
+    """Label a trial; return the document and the arrays that are kept."""
     label = label_recording(recording, settings)
-    return label.as_json(), label.as_arrays()
+    return label.document(), label.as_arrays()
 
 
 def label_recording(recording: Recording, settings: Labelling) -> Label:
@@ -316,16 +323,16 @@ def _thousandths(values: F64) -> npt.NDArray[np.float32]:
     return np.round(values, 3).astype(np.float32)
 
 
-def _doubts_json(doubts: Doubts) -> dict[str, str | None]:
+def _doubts(doubts: Doubts) -> OnsetDoubts:
     """A gross onset after an incipient one that is not known is not known either."""
-    return {"incipient": doubts.incipient, "gross": doubts.gross or doubts.incipient}
+    return OnsetDoubts(incipient=doubts.incipient, gross=doubts.gross or doubts.incipient)
 
 
-def _onsets_json(onsets: Onsets, doubts: Doubts) -> dict[str, Any]:
+def _onsets(onsets: Onsets, doubts: Doubts) -> dict[str, Any]:
     return {
         "incipient_ns": onsets.incipient_ns,
         "gross_ns": onsets.gross_ns,
         "first_marker": onsets.first_marker,
         "per_marker_ns": onsets.per_marker_ns.tolist(),
-        "doubts": _doubts_json(doubts),
+        "doubts": _doubts(doubts),
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ from sliplab.analysis.windows.samples import choose_windows, consecutive_windows
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.analysis.windows.windows import list_events
 from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.array_file import Arrays, map_arrays, write_arrays
 from sliplab.storage.trials.recording import Recording
 
@@ -130,7 +131,7 @@ def recorded_span(recording: Recording) -> tuple[int, int]:
 
 def trial_samples(
     recording: Recording,
-    label: dict[str, Any],
+    label: TrialLabel,
     trial: TrialId,
     windows: Windows,
     samples: Samples,
@@ -139,7 +140,7 @@ def trial_samples(
     """The samples of one trial by the paper's rule.
 
     Args:
-        label: the trial's label (`incipient_ns`, `gross_ns`).
+        label: the trial's, for its onsets.
         trial: what the samples carry.
         seed: of the random windows within incipient slip.
     """
@@ -147,8 +148,8 @@ def trial_samples(
     chosen = choose_windows(
         start,
         end,
-        label["incipient_ns"],
-        label["gross_ns"],
+        label.incipient_ns,
+        label.gross_ns,
         windows.length_ms * 1_000_000,
         samples.per_class,
         seed,

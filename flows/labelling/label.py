@@ -8,14 +8,13 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.labels import labelling
 from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
 from sliplab.protocols.settings import Labelling
+from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
-
-STEP = "labels"
 
 
 def label_key(recording: Recording, settings: Labelling) -> str:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.label import STEP as LABELS
+from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
-KINDS = ("incipient", "gross")
 REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
 """The step of `flows.labelling.label_check`, and where its own store stands."""
-_TRUTH = {
+_TRUTH: dict[Rule, dict[Kind, str]] = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},
 }
@@ -28,8 +28,9 @@ def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     rules = {item.settings.labelling.rule for item in campaigns}
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for rule, kind, label, truth in _cases(store, campaigns):
-        if label["rule"] == rule and label[f"{kind}_ns"] is not None and truth is not None:
-            errors[kind].append((label[f"{kind}_ns"] - truth) / 1e6)
+        onset = label.at_ns(kind)
+        if label.rule == rule and onset is not None and truth is not None:
+            errors[kind].append((onset - truth) / 1e6)
     return {"rule": "+".join(sorted(rules)), **{k: spread(v) for k, v in errors.items()}}
 
 
@@ -43,24 +44,25 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         name: {kind: [] for kind in KINDS} for name in ("paper", "change_point", "apart")
     }
     for rule, kind, label, truth in _cases(store, campaigns):
-        mine = _known(label, rule, kind)
+        mine = label.by_rule(rule).known_ns(kind)
         if mine is not None and truth is not None:
             found[rule][kind].append((mine - truth) / 1e6)
-        other = _known(label, "change_point", kind)
+        other = label.by_rule("change_point").known_ns(kind)
         if rule == "paper" and mine is not None and other is not None:
             found["apart"][kind].append((mine - other) / 1e6)
     errors, inside = [], []
     for item in campaigns:
         labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            truth = recording.simulation_truth()
-            if truth is None or "slip_per_papilla_ns" not in truth:
+            papillae = (recording.simulation_truth() or {}).get("slip_per_papilla_ns")
+            if papillae is None:
                 continue
-            slips = labels.read(trial.id)["change_point"]
+            slips = labels.load(trial.id, TrialLabel).change_point
+            if slips is None:
+                continue
             for at, low, high, true in zip(
-                slips["per_marker_ns"], slips["low_ns"], slips["high_ns"],
-                truth["slip_per_papilla_ns"], strict=True,
-            ):  # fmt: skip
+                slips.per_marker_ns, slips.low_ns, slips.high_ns, papillae, strict=True
+            ):
                 if at != -1 and true is not None:
                     errors.append((at - true) / 1e6)
                     inside.append(low <= true <= high)
@@ -81,17 +83,17 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
     found = {}
     for item in campaigns:
         labels = Derived.of(store, LABELS, item.name)
-        known = [label for trial, _ in item.trials for label in (labels.read(trial.id),)]
-        known = [label for label in known if "references" in label]
+        known = [labels.load(trial.id, TrialLabel) for trial, _ in item.trials]
+        known = [label for label in known if label.references is not None]
         if not known:
             continue
-        most = [max((px for px in label["hold_slip_px"] if px is not None), default=0.0)
+        most = [max((px for px in label.hold_slip_px if px is not None), default=0.0)
                 for label in known]  # fmt: skip
         limit = item.settings.labelling.hold_slip_px
         apart: dict[str, list[float]] = {kind: [] for kind in KINDS}
         for label in known:
             for kind in KINDS:
-                start, end = (label["references"][at][f"{kind}_ns"] for at in REFERENCES)
+                start, end = ((label.references or {})[at].at_ns(kind) for at in REFERENCES)
                 if start is not None and end is not None:
                     apart[kind].append((end - start) / 1e6)
         found[item.name] = {
@@ -111,7 +113,7 @@ def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, l
     """
     found: dict[str, dict[str, list[float]]] = {}
     for rule, kind, label, truth in _cases(store, campaigns):
-        mine = _known(label, rule, kind)
+        mine = label.by_rule(rule).known_ns(kind)
         if mine is not None and truth is not None:
             kinds = found.setdefault(rule, {name: [] for name in KINDS})
             kinds[kind].append(abs(mine - truth) / 1e6)
@@ -129,24 +131,19 @@ def spread(values: list[float]) -> dict[str, Any]:
     }
 
 
-def _known(label: dict[str, Any], rule: str, kind: str) -> int | None:
-    """A rule's onset, if it is not in doubt."""
-    found = label[rule]
-    at = None if found["doubts"][kind] is not None else found[f"{kind}_ns"]
-    return None if at is None else int(at)
-
-
-def _cases(store: Store, campaigns: list[Collected]) -> Any:
+def _cases(
+    store: Store, campaigns: list[Collected]
+) -> Iterator[tuple[Rule, Kind, TrialLabel, int | None]]:
     """Rule, kind, label and the time that is true of them, or None."""
     for item in campaigns:
         labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
             truth = recording.simulation_truth()
-            label = labels.read(trial.id)
+            label = labels.load(trial.id, TrialLabel)
             centre = recording.record.geometry.centre
             for rule, keys in _TRUTH.items():
                 known = truth
-                if truth is not None and rule == "paper" and label.get("reference") == "hold_start":
+                if truth is not None and rule == "paper" and label.reference == "hold_start":
                     known = truth.get("from_hold", truth)  # older records have the motion's
                 for kind in KINDS:
                     true = None if known is None else known.get(keys[kind])

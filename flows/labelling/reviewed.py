@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.labelling.label import label_key
 from sliplab.flows.running import console
-from sliplab.storage.streams import Json
+from sliplab.storage.schema.label import LABELS, OnsetDoubts, TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Decision, last
@@ -48,7 +48,7 @@ class Labels:
     def fresh(self, item: Collected, recording: Recording) -> bool:
         """Whether a trial has its automatic label."""
         name = recording.folder.name
-        return Derived.of(self.store, STEP, item.name).fresh(name, _automatic(item, recording))
+        return Derived.of(self.store, LABELS, item.name).fresh(name, _automatic(item, recording))
 
     def key(self, item: Collected, recording: Recording) -> str:
         """The key of a trial's label: the automatic one's where no decision changes it.
@@ -62,19 +62,20 @@ class Labels:
             return automatic
         return make_key("reviewed", VERSION, automatic, [decision.verdict, vars(decision.new)])
 
-    def read(self, item: Collected, recording: Recording) -> Json:
+    def read(self, item: Collected, recording: Recording) -> TrialLabel:
         """A trial's label; a rejected one has no onsets.
 
         Raises:
             FileNotFoundError: it was never labelled.
             StoreError: its decision is damaged.
         """
-        label = Derived.of(self.store, STEP, item.name).read(recording.folder.name)
+        label = Derived.of(self.store, LABELS, item.name).load(recording.folder.name, TrialLabel)
         decision = self._applied(item, recording)
         if decision is None or decision.verdict == "accept":
             return label
         doubt = f"rejected: {decision.why}" if decision.verdict == "reject" else None
-        return {**label, **vars(decision.new), "doubts": {"incipient": doubt, "gross": doubt}}
+        doubts = OnsetDoubts(incipient=doubt, gross=doubt)
+        return label.model_copy(update={**vars(decision.new), "doubts": doubts})
 
     def states(self, campaigns: list[Collected]) -> dict[State, int] | None:
         """How many trials there are of each state; None where no decision is asked for."""

@@ -39,6 +39,7 @@ from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -88,7 +89,7 @@ class _Judging:
     """Inputs of a trial's counts besides the trial."""
 
     network: OtherNetwork
-    label: Json | None
+    label: TrialLabel | None
     """Of a trial whose windows are samples, too."""
     samples: Samples
     seed: int

@@ -7,7 +7,7 @@ recording or a setting changed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.windows import dataset
@@ -17,6 +17,7 @@ from sliplab.flows.running.parallel_map import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import Samples, Windows
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 
@@ -36,7 +37,7 @@ TrialRef = tuple[Collected, Trial, Recording]
 class _Wanted:
     """What a trial's samples depend on besides the trial: see `dataset.trial_samples`."""
 
-    label: dict[str, Any]
+    label: TrialLabel
     trial: TrialId
     windows: Windows
     samples: Samples

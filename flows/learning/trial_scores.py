@@ -19,6 +19,7 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.label import TrialLabel
 
 Json = dict[str, Any]
 
@@ -26,7 +27,7 @@ Json = dict[str, Any]
 def score_row(
     item: Collected,
     trial: Trial,
-    label: Json,
+    label: TrialLabel,
     counts: npt.NDArray[Any],
     end_ns: npt.NDArray[Any],
     settings: Detection,
@@ -48,8 +49,8 @@ def score_row(
         "experiment": item.experiment,
         "trial": trial.id,
         "condition": item.plan.describe(trial),
-        "incipient_ns": label["incipient_ns"],
-        "gross_ns": label["gross_ns"],
+        "incipient_ns": label.incipient_ns,
+        "gross_ns": label.gross_ns,
         "end_ns": None if slip is None else slip.end_ns,
         "detected_incipient_ns": detections.incipient_ns,
         "detected_gross_ns": detections.gross_ns,

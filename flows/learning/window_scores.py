@@ -114,7 +114,7 @@ def _phases(
         item, _, recording = known[k]
         label = labels.read(item, recording)
         start, end = recorded_span(recording)
-        edges = [start, label["incipient_ns"], label["gross_ns"], end]
+        edges = [start, label.incipient_ns, label.gross_ns, end]
         there = trial == k
         moving |= there & (middle >= recording.step(recording.motion_phase)[0])
         for phase, (begin, over) in enumerate(itertools.pairwise(edges)):

@@ -13,10 +13,10 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Figure, Section, Table, number
 from sliplab.flows.collecting.reference_watch import hold_rate
-from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
 from sliplab.protocols import Trial
 from sliplab.protocols.factors import Level
+from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.schema.trial import Gate
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -211,7 +211,8 @@ def reference_rows(store: Store, item: Collected) -> list[Json]:
 
 
 def _measured(labels: Derived, trial: Trial, recording: Recording) -> Json:
-    onset = labels.read(trial.id)["incipient_ns"] if labels.key(trial.id) is not None else None
+    known = labels.key(trial.id) is not None
+    onset = labels.load(trial.id, TrialLabel).incipient_ns if known else None
     begin = recording.step(recording.motion_phase)[0]
     return {
         "hold_events_per_s": hold_rate(recording),

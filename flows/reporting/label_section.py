@@ -8,9 +8,9 @@ from typing import Any
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.figures.trials import label_uncertainty
 from sliplab.analysis.report.page import Figure, Section, Table, number, percent
-from sliplab.flows.labelling.label import STEP as LABELS
-from sliplab.flows.labelling.label_errors import KINDS, distances
+from sliplab.flows.labelling.label_errors import distances
 from sliplab.flows.reporting.results import source_text
+from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -96,19 +96,22 @@ def _figure(store: Store, campaigns: list[Collected], simulated: bool) -> Figure
     for item in campaigns:
         labels = Derived.of(store, LABELS, item.name)
         for trial, recording in item.trials:
-            found = labels.read(trial.id)["change_point"]
+            found = labels.load(trial.id, TrialLabel).change_point
+            if found is None:
+                continue
             centre = recording.record.geometry.centre
-            for kind, marker in (("incipient", found["first_marker"]), ("gross", centre)):
-                if found["doubts"][kind] is None and found[f"{kind}_ns"] is not None:
-                    width = found["high_ns"][marker] - found["low_ns"][marker]
+            for kind in KINDS:
+                marker = found.first_marker if kind == "incipient" else centre
+                if found.known_ns(kind) is not None and marker is not None:
+                    width = found.high_ns[marker] - found.low_ns[marker]
                     widths[kind].append(width / 1e6)
     data: dict[str, list[float]] = {
         f"{rule}, {kind}: distance from the truth (ms)": values
         for rule, kinds in errors.items()
         for kind, values in kinds.items()
     }
-    for kind, values in widths.items():
-        data[f"change point, {kind}: width of the 95 % interval (ms)"] = values
+    for name, values in widths.items():
+        data[f"change point, {name}: width of the 95 % interval (ms)"] = values
     seen = (
         "Left: how many trials' labels lie within so much of the truth, each rule against its own "
         "(the crossing of 2 pixels, the start of the slip). Right: how"
@@ -129,12 +132,12 @@ _RULES = {"paper": "paper's rule", "change_point": "change point"}
 def _doubted(store: Store, campaigns: list[Collected]) -> list[Table]:
     """Why labels of the ruling rule lack an onset."""
     causes = Counter(
-        (item.name, kind, str(label["doubts"][kind]))
+        (item.name, kind, doubt)
         for item in campaigns
         for trial, _ in item.trials
-        for label in (Derived.of(store, LABELS, item.name).read(trial.id),)
+        for label in (Derived.of(store, LABELS, item.name).load(trial.id, TrialLabel),)
         for kind in KINDS
-        if label["doubts"][kind] is not None
+        if (doubt := label.doubts.of(kind)) is not None
     )
     if not causes:
         return []

@@ -14,8 +14,8 @@ from sliplab.analysis.report.page import Figure, Section
 from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
-from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.reporting import results
+from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import State, state_of
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.streams import Json
+from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import IMPORTED, Store
@@ -72,20 +72,20 @@ class Row:
         return self.severity > 0
 
 
-def doubts_of(label: Json) -> list[tuple[int, str]]:
+def doubts_of(label: TrialLabel) -> list[tuple[int, str]]:
     """Reasons to doubt a label, with their severity, gravest first."""
     found: list[tuple[int, str]] = []
-    doubts = label.get("doubts") or {}
-    for kind, nothing in (("incipient", "no slip was found"), ("gross", "no gross slip was found")):
-        if doubts.get(kind):
-            found.append((_GRAVE, f"{kind}: {doubts[kind]}"))
-        elif label.get(f"{kind}_ns") is None:
+    for kind in KINDS:
+        if doubt := label.doubts.of(kind):
+            found.append((_GRAVE, f"{kind}: {doubt}"))
+        elif label.at_ns(kind) is None:
+            nothing = "no slip was found" if kind == "incipient" else "no gross slip was found"
             found.append((_ODD, nothing))
-    found += [(_ODD, str(text)) for text in label.get("flags") or ()]
-    if label.get("markers_lost"):
-        found.append((_SLIGHT, f"{label['markers_lost']} times a marker was not seen"))
-    if label.get("plate_lost"):
-        found.append((_SLIGHT, f"the plate's marker was not seen in {label['plate_lost']} frames"))
+    found += [(_ODD, text) for text in label.flags]
+    if label.markers_lost:
+        found.append((_SLIGHT, f"{label.markers_lost} times a marker was not seen"))
+    if label.plate_lost:
+        found.append((_SLIGHT, f"the plate's marker was not seen in {label.plate_lost} frames"))
     return sorted(dict.fromkeys(found), key=lambda item: -item[0])
 
 
@@ -97,14 +97,14 @@ def row_of(store: Store, item: Collected, trial: str, order: int) -> Row:
     """
     recording = item.campaign.recording(trial)
     key = label_key(recording, item.settings.labelling)
-    try:
-        label = Derived.of(store, STEP, item.name).read(trial)
-    except (OSError, ValueError):
-        label = {}
     state: LabelState = "missing"
     doubts: list[tuple[int, str]] = []
-    if label:
-        state = "fresh" if label.get("key") == key else "stale"
+    try:
+        label = Derived.of(store, LABELS, item.name).load(trial, TrialLabel)
+    except (OSError, StoreError):
+        pass  # there is none, or it is damaged and has to be made again
+    else:
+        state = "fresh" if label.key == key else "stale"
         doubts = doubts_of(label)
     decision, problem = None, ""
     try:
@@ -184,7 +184,7 @@ class TrialList:
         """What changes when a row does: folders' times, and how many decisions there are."""
         seen, counts = [], {}
         for campaign in self.store.campaigns():
-            derived = (Derived.of(self.store, step, campaign.name) for step in (STEP, "sync"))
+            derived = (Derived.of(self.store, step, campaign.name) for step in (LABELS, "sync"))
             folders = (campaign.folder / "trials", *(step.folder for step in derived))
             times = [path.stat().st_mtime_ns if path.is_dir() else 0 for path in folders]
             protocol = campaign.protocol_file

@@ -163,7 +163,7 @@ class TimePlots:
         self.moved.title.text = "simulated" if shown.recording.simulated else ""
         moved = shown.displacement_px
         count = moved.shape[1]
-        first = shown.label.get("first_marker")
+        first = None if shown.label is None else shown.label.first_marker
         order = sorted(range(count), key=lambda i: (i == shown.centre, i == first))
         self._markers.data = {
             "xs": [shown.frame_s] * count,
@@ -254,12 +254,13 @@ def _rounded(time_s: float) -> int:
 
 def _crossings(shown: Shown) -> dict[str, Any]:
     """When each marker slips by the label, with its interval where the label has one."""
-    times = np.asarray(shown.label.get("per_marker_ns") or [], np.float64)
+    label = shown.label
+    times = np.asarray(() if label is None else label.per_marker_ns, np.float64)
     there = times >= 0
     low = high = times
-    bounds = shown.label.get("change_point") or {}
-    if shown.label.get("rule") == "change_point" and bounds.get("low_ns"):
-        low, high = (np.asarray(bounds[name], np.float64) for name in ("low_ns", "high_ns"))
+    if label is not None and label.rule == "change_point" and label.change_point is not None:
+        bounds = label.change_point
+        low, high = (np.asarray(bound, np.float64) for bound in (bounds.low_ns, bounds.high_ns))
     height = np.full(int(there.sum()), shown.threshold_px)
     return {
         "x": times[there] / 1e9, "y": height, "low": low[there] / 1e9, "high": high[there] / 1e9

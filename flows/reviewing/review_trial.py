@@ -10,9 +10,9 @@ import numpy as np
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.windows.dataset import recorded_span
-from sliplab.flows.labelling.label import STEP
 from sliplab.flows.reviewing.review_list import Row
-from sliplab.storage.streams import F64, I64, U8, Json
+from sliplab.storage.schema.label import LABELS, TrialLabel
+from sliplab.storage.streams import F64, I64, U8
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.review import Onsets
@@ -28,7 +28,7 @@ class Shown:
     """A trial that is looked at. Times are seconds on the trial's time line unless they say ns.
 
     Attributes:
-        label: its label, empty where it has none; label_key: the label's own key.
+        label: its label, None where it has none; label_key: the label's own key.
         frame_ns: (n,) int64; displacement_px: (n, m), NaN where unknown; both empty without label.
         xy_px: (n, m, 2) places of the markers, NaN where lost; None where they were not kept.
         plate_px: (n, 2) the same of the plate's marker; None without.
@@ -39,7 +39,7 @@ class Shown:
     row: Row
     item: Collected
     recording: Recording
-    label: Json
+    label: TrialLabel | None
     frame_ns: I64
     displacement_px: F64
     xy_px: F64 | None
@@ -53,7 +53,7 @@ class Shown:
     @property
     def label_key(self) -> str:
         """The key of the label that is shown; empty without one."""
-        return str(self.label.get("key", ""))
+        return "" if self.label is None else self.label.key
 
     @property
     def centre(self) -> int:
@@ -73,13 +73,15 @@ class Shown:
     @property
     def onsets(self) -> Onsets:
         """The label's onsets."""
-        return Onsets(self.label.get("incipient_ns"), self.label.get("gross_ns"))
+        if self.label is None:
+            return Onsets()
+        return Onsets(self.label.incipient_ns, self.label.gross_ns)
 
     @property
     def suggested(self) -> Onsets:
         """Onsets that the seen markers give, also where the label calls them doubtful."""
         known = self.onsets
-        times = self.label.get("per_marker_ns") or []
+        times = () if self.label is None else self.label.per_marker_ns
         slipped = [time for time in times if time >= 0]
         incipient = known.incipient_ns
         if incipient is None:
@@ -121,11 +123,11 @@ def load(store: Store, item: Collected, row: Row) -> Shown:
         StoreError: the trial is damaged.
     """
     recording = item.campaign.recording(row.trial)
-    derived = Derived.of(store, STEP, item.name)
-    label: Json = {}
+    derived = Derived.of(store, LABELS, item.name)
+    label: TrialLabel | None = None
     arrays: dict[str, Any] = {}
     if row.label != "missing":
-        label, arrays = derived.read(row.trial), derived.arrays(row.trial)
+        label, arrays = derived.load(row.trial, TrialLabel), derived.arrays(row.trial)
     frame_ns = np.asarray(arrays.get("frame_ns", recording.frame_times()), np.int64)
     moved = np.asarray(arrays.get("displacement_px", np.empty((len(frame_ns), 0))), np.float64)
     places, plate = arrays.get("xy_px"), arrays.get("plate_px")

@@ -77,13 +77,13 @@ def flags(shown: Shown) -> str:
         mark = "" if gate.passed else " class='doubt'"
         limit = "" if gate.limit is None else f" (limit {gate.limit:g})"
         cells.append((f"<td{mark}>{escape(name)}</td>", f"{_plain(gate.value)}{limit}"))
-    label = shown.label
+    label = {} if shown.label is None else shown.label.to_json()
     for name in ("source", "rule", "reference", "markers_lost", "plate_lost", "camera_moved_px"):
         if label.get(name) is not None:
             cells.append((f"<td>{name}</td>", escape(_plain(label[name]))))
-    if label.get("quality"):
-        worst = min(label["quality"])
-        which = label["quality"].index(worst)
+    if shown.label is not None and shown.label.quality:
+        worst = min(shown.label.quality)
+        which = shown.label.quality.index(worst)
         cells.append(("<td>worst marker</td>", f"{which}, quality {worst:.2f} of 1"))
     cells.append(("<td>clocks</td>", "fitted again" if shown.recording.refitted else "as recorded"))
     body = "".join(f"<tr>{name}<td>{value}</td></tr>" for name, value in cells)

@@ -24,11 +24,11 @@ import numpy as np
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
-from sliplab.flows.labelling.label import STEP as LABELS
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of
 from sliplab.flows.reviewing.review_trial import event_rate
-from sliplab.storage.streams import I64, EventChunk, Json
+from sliplab.storage.schema.label import LABELS, TrialLabel
+from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -91,7 +91,7 @@ def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
     derived = Derived.of(subject.store, LABELS, subject.item.name)
     key = label_key(recording, subject.item.settings.labelling)
     fresh = derived.fresh(subject.trial, key)
-    label = derived.read(subject.trial) if fresh else {}
+    label = derived.load(subject.trial, TrialLabel) if fresh else None
     arrays = derived.arrays(subject.trial) if fresh else {}
     condition = ", ".join(f"{name} {text}" for name, text in recording.record.condition.items())
     kind = "**simulated**" if recording.simulated else "recorded"
@@ -229,9 +229,9 @@ def _pulses(to: _Columns, subject: Subject) -> None:
         to.scalars(path, seen[name], np.full(len(seen[name]), float(height)), f"pulses_{title}")
 
 
-def _onsets(to: _Columns, subject: Subject, label: Json, key: str) -> None:
+def _onsets(to: _Columns, subject: Subject, label: TrialLabel | None, key: str) -> None:
     recording = subject.recording
-    known = {"label": label}
+    known: dict[str, Any] = {"label": {} if label is None else dict(label)}
     decision = review.last(subject.store, subject.item.name, subject.trial)
     if decision is not None and state_of(decision, key) in {"accepted", "adjusted"}:
         known["review"] = vars(decision.new)

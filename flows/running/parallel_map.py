@@ -25,7 +25,9 @@ from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, Pickled, run
 from sliplab.flows.running.run_records import timed
 from sliplab.storage.remote.mirror import place_of, reach
+from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.trial import SyncResult
+from sliplab.storage.streams import Json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
@@ -236,7 +238,7 @@ def keep_trials(
     """As `run_trials`, inside a flow that runs already."""
     with console.bar(f"{title} (trials)", len(work)) as bar:
 
-        def keep(number: int, result: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        def keep(number: int, result: tuple[Json | Document, dict[str, Any]]) -> None:
             item = work[number]
             name = item.recording.folder.name
             Derived.of(store, step, item.campaign).write(name, item.key, *result)

@@ -25,7 +25,7 @@ from sliplab.flows.searching.detector_tradeoff_grid import Setting
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Samples
-from sliplab.storage.streams import Json
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import StoreError
 
@@ -57,7 +57,7 @@ class Used:
     item: Collected
     trial: Trial
     recording: Recording
-    label: Json
+    label: TrialLabel
     label_key: str
 
     @property

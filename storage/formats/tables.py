@@ -11,10 +11,9 @@ import pandas as pd
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes
+from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
-
-LABELS = "labels"
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:

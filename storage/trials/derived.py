@@ -55,14 +55,17 @@ class Derived:
         """Whether `name` was made with `key`."""
         return self.key(name) == key
 
-    def write(self, name: str, key: str, data: Json, arrays: dict[str, Any] | None = None) -> None:
+    def write(
+        self, name: str, key: str, data: Json | Document, arrays: dict[str, Any] | None = None
+    ) -> None:
         """Keep a result; the JSON with its key is written last and decides."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if arrays is not None:
             buffer = io.BytesIO()
             np.savez_compressed(buffer, **arrays)
             write_bytes(self.arrays_path(name), buffer.getvalue())
-        write_json(self.folder / f"{safe_name(name)}.json", {"key": key, **data})
+        plain = data.to_json() if isinstance(data, Document) else data
+        write_json(self.folder / f"{safe_name(name)}.json", {**plain, "key": key})
 
     def read(self, name: str) -> Json:
         """A result's JSON.

@@ -17,6 +17,7 @@ from sliplab.analysis.detectors.latency import (
     true_slip,
 )
 from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.label import TrialLabel
 
 MS = 1_000_000
 TOLERANCE = 30 * MS
@@ -164,8 +165,8 @@ def test_wrong_input_is_named() -> None:
 
 
 def test_a_label_tells_of_a_slip() -> None:
-    label = {"incipient_ns": 4, "gross_ns": 6, "end_ns": 9}
+    label = TrialLabel(incipient_ns=4, gross_ns=6, end_ns=9)
     assert true_slip(label) == TrueSlip(4, 6, 9)
-    assert true_slip({**label, "gross_ns": None}) is None
+    assert true_slip(label.model_copy(update={"gross_ns": None})) is None
     # a person set the onset after the plate's rest
-    assert true_slip({**label, "gross_ns": 11}) == TrueSlip(4, 11, 11)
+    assert true_slip(label.model_copy(update={"gross_ns": 11})) == TrueSlip(4, 11, 11)

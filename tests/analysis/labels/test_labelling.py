@@ -55,7 +55,7 @@ def label(seen: Places, **settings: Any) -> Label:
 
 def crossing(label: Label, reference: str) -> float:
     """The incipient onset counted from a reference, frames."""
-    found: int = label.as_json()["references"][reference]["incipient_ns"]
+    found: int = label.document().to_json()["references"][reference]["incipient_ns"]
     return found / FRAME_NS
 
 
@@ -66,7 +66,7 @@ def test_a_slip_in_the_hold_counts_from_its_start_and_is_hidden_from_its_end(pla
     assert crossing(found, "hold_start") == pytest.approx(101, abs=1)
     # and counted from the hold's end 0.45 px a frame from frame 230 on
     assert crossing(found, "hold_end") == pytest.approx(235, abs=1)
-    kept = found.as_json()
+    kept = found.document().to_json()
     assert kept["reference"] == "hold_start"
     assert kept["paper"]["incipient_ns"] == kept["references"]["hold_start"]["incipient_ns"]
     assert kept["hold_slip_px"][3] == pytest.approx(4.0, abs=0.02)
@@ -81,7 +81,7 @@ def test_a_setting_says_from_where_the_ruling_onsets_count() -> None:
     slipped = places(1.2)
     for reference, frame in (("hold_start", 232), ("hold_end", 235)):
         found = label(slipped, reference=reference, hold_slip_px=None)
-        kept = found.as_json()
+        kept = found.document().to_json()
         assert kept["reference"] == reference
         assert kept["doubts"]["incipient"] is None
         assert kept["incipient_ns"] / FRAME_NS == pytest.approx(frame, abs=1)
@@ -92,14 +92,14 @@ def test_a_setting_says_from_where_the_ruling_onsets_count() -> None:
 
 def test_the_limit_of_a_slip_in_the_hold_is_a_setting() -> None:
     slipped = places(1.2)
-    assert label(slipped).as_json()["doubts"]["incipient"] is not None
-    assert label(slipped, hold_slip_px=1.25).as_json()["doubts"]["incipient"] is None
-    assert label(places(4.0), hold_slip_px=None).as_json()["incipient_ns"] is not None
+    assert label(slipped).document().doubts.incipient is not None
+    assert label(slipped, hold_slip_px=1.25).document().doubts.incipient is None
+    assert label(places(4.0), hold_slip_px=None).document().incipient_ns is not None
 
 
 @pytest.mark.parametrize("plate", [True, False])
 def test_after_a_still_hold_both_references_agree(plate: bool) -> None:
-    kept = label(places(0.0, plate=plate, noise=0.0)).as_json()
+    kept = label(places(0.0, plate=plate, noise=0.0)).document().to_json()
     first, last = (kept["references"][name] for name in ("hold_start", "hold_end"))
     assert first == last
     assert first["per_marker_ns"] == kept["per_marker_ns"]
@@ -113,7 +113,7 @@ def test_a_marker_hidden_at_one_end_of_the_hold_counts_from_the_other(hidden: sl
     seen = places()
     xy, sigma = seen.xy.copy(), seen.sigma.copy()
     xy[hidden, 3], sigma[hidden, 3] = np.nan, np.nan
-    found = label(replace(seen, xy=xy, sigma=sigma)).as_json()
+    found = label(replace(seen, xy=xy, sigma=sigma)).document().to_json()
     assert found["doubts"] == {"incipient": None, "gross": None}
     assert found["hold_slip_px"][3] is None
     assert found["incipient_ns"] == pytest.approx((START + 35) * FRAME_NS, abs=FRAME_NS)
@@ -123,16 +123,16 @@ def test_a_camera_knocked_in_the_hold_is_no_slip() -> None:
     seen = places(plate=False)
     xy = seen.xy.copy()
     xy[90:] += np.array([2.5, 1.0])
-    found = label(replace(seen, xy=xy)).as_json()
+    found = label(replace(seen, xy=xy)).document().to_json()
     assert max(found["hold_slip_px"]) < 0.1
     assert found["incipient_ns"] == pytest.approx((START + 35) * FRAME_NS, abs=FRAME_NS)
 
 
 def test_change_points_do_not_depend_on_the_reference() -> None:
     first, last = (
-        label(places(0.5), reference=name).as_json() for name in ("hold_start", "hold_end")
+        label(places(0.5), reference=name).document() for name in ("hold_start", "hold_end")
     )
-    assert first["change_point"] == last["change_point"]
+    assert first.change_point == last.change_point
 
 
 def test_a_recording_without_a_hold_has_no_reference() -> None:

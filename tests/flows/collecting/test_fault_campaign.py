@@ -114,7 +114,7 @@ def _suffer(
         row = Row(_shown(fault), arm, "taken again at once", "; ".join(causes))
     else:
         (recording,) = [each for each in campaign.recordings() if each.trial_id in made]
-        doubts = label_recording(recording, Labelling()).as_json()["doubts"]
+        doubts = label_recording(recording, Labelling()).document().doubts.to_json()
         told = "; ".join(sorted({str(why) for why in doubts.values() if why is not None}))
         row = Row(_shown(fault), arm, "good", f"label: {told}" if told else "nothing")
     return row, campaign, made

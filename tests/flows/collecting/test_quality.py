@@ -69,7 +69,7 @@ def test_without_its_gate_or_with_a_video_the_label_doubts_the_trial(tmp_path: P
     without = take(tmp_path / "without", data)
     for recording in (with_video, without):
         assert "hold_slip_px" not in recording.record.quality.gates
-        kept = label_recording(recording, Labelling()).as_json()
+        kept = label_recording(recording, Labelling()).document().to_json()
         assert kept["incipient_ns"] is kept["gross_ns"] is None
         assert "px in the hold" in kept["doubts"]["incipient"]
         assert kept["references"]["hold_start"]["incipient_ns"] is not None

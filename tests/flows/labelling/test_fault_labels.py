@@ -9,6 +9,7 @@ import pytest
 
 from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.protocols.settings import Labelling
+from sliplab.storage.schema.label import OnsetDoubts
 from sliplab.storage.trials.recording import Recording
 from tests.flows.collecting.test_session import session, take_all
 from tests.flows.conftest import tiny, tiny_gravity
@@ -33,7 +34,7 @@ def one_slide(
 
 def errors_ms(label: Label, recording: Recording) -> dict[str, float | None]:
     """Onsets as kept, less the truth; None where the label has none."""
-    truth, kept = recording.simulation_truth(), label.as_json()
+    truth, kept = recording.simulation_truth(), label.document().to_json()
     assert truth is not None
     return {
         name: None if kept[name] is None else (kept[name] - truth[name]) / 1e6
@@ -53,7 +54,7 @@ def first_slip_s(sound: tuple[Label, Recording]) -> float:
 
 
 def test_a_sound_trial_leaves_no_doubt(sound: tuple[Label, Recording]) -> None:
-    assert sound[0].as_json()["doubts"] == {"incipient": None, "gross": None}
+    assert sound[0].document().doubts == OnsetDoubts(incipient=None, gross=None)
     errors = errors_ms(*sound)
     assert all(value is not None and abs(value) <= 30 for value in errors.values())
 
@@ -67,7 +68,7 @@ def test_no_lost_marker_makes_a_label_wrong(
     first = sound[0].onsets.first_marker
     fault = {"kind": kind, "papilla": first, "at_s": first_slip_s(sound) - lead_s}
     label, recording = one_slide(tmp_path, [fault])
-    kept, errors = label.as_json(), errors_ms(label, recording)
+    kept, errors = label.document().to_json(), errors_ms(label, recording)
     if lead_s > 0 and (kind == "papilla_torn" or lead_s < 0.3):
         assert kept["incipient_ns"] is kept["gross_ns"] is None
         assert kept["doubts"]["incipient"].startswith(f"marker {first} could not be followed")
@@ -84,7 +85,7 @@ def test_without_the_centre_gross_slip_is_unknown(
     assert gross is not None
     fault = {"kind": kind, "papilla": 0, "at_s": gross / 1e9 - 0.2}
     label, recording = one_slide(tmp_path, [fault])
-    kept = label.as_json()
+    kept = label.document().to_json()
     assert kept["gross_ns"] is None
     assert kept["doubts"]["gross"].startswith("the centre marker could not be followed from")
     assert kept["doubts"]["incipient"] is None
@@ -99,8 +100,9 @@ def test_a_marker_hidden_on_video_is_not_taken_for_another(
     first = sound[0].onsets.first_marker
     fault = {"kind": "marker_occluded", "papilla": first, "at_s": first_slip_s(sound) - 0.2}
     label, _ = one_slide(tmp_path, [fault], "3 mm", "video")
-    assert label.as_json()["incipient_ns"] is None
-    assert label.as_json()["doubts"]["incipient"].startswith(f"marker {first} could not be")
+    kept = label.document()
+    assert kept.incipient_ns is None
+    assert str(kept.doubts.incipient).startswith(f"marker {first} could not be")
 
 
 def one_fall(folder: Path, faults: list[dict[str, Any]]) -> tuple[Label, Recording]:
@@ -118,13 +120,13 @@ def test_a_plate_that_is_stuck_gives_no_gross_slip(tmp_path: Path) -> None:
     truth = recording.simulation_truth()
     assert truth is not None
     assert truth["gross_ns"] is None
-    assert label.as_json()["gross_ns"] is None
+    assert label.document().gross_ns is None
     assert label.doubts.gross is None  # it is known that there was none
 
 
 def test_an_occluded_plate_leaves_a_right_label_or_none(tmp_path: Path) -> None:
     sound = one_fall(tmp_path / "sound", [])
-    assert sound[0].as_json()["doubts"] == {"incipient": None, "gross": None}
+    assert sound[0].document().doubts == OnsetDoubts(incipient=None, gross=None)
     assert all(v is not None and abs(v) <= 30 for v in errors_ms(*sound).values())
     first = first_slip_s(sound)
     # hidden for 0.3 s once it moves: back before the first slip, or not

@@ -84,7 +84,7 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
     for level in ("video", "tracks"):
         recording, frame_bytes = take(tmp_path / level, data, level=level)
         found = label(recording, data)
-        assert recording.frame_source == found.source == found.as_json()["source"] == level
+        assert recording.frame_source == found.source == found.document().source == level
         assert found.displacement_px.shape == (len(found.frame_ns), 19)
         assert found.places.plate_lost == 0
         # the first frame over the threshold: up to a frame late, early by noise only; where a plate
@@ -114,7 +114,7 @@ def test_tracks_label_as_the_video_does(make: Any, tmp_path: Path) -> None:
         assert abs(a - b) / 1e6 <= 1.05 * FRAME_MS
     assert abs(video.end_ns - tracks.end_ns) / 1e6 <= 1.05 * FRAME_MS
     recording, found = recordings[1], tracks
-    assert found.as_json()["end_ns"] == found.end_ns
+    assert found.document().end_ns == found.end_ns
     if make is kinematic:
         assert found.end_ns == recording.step("slide")[1]
     else:

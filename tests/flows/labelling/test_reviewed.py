@@ -16,6 +16,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.formats.find import trials_in
 from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
@@ -56,19 +57,19 @@ def test_decisions_count_only_when_asked(made: Reviewable) -> None:
     plain, reviewed = Labels(made.store), Labels(made.store, reviewed=True)
     for trial in made.ids[:5]:
         found = plain.read(made.item, recording(made, trial))
-        assert found == {"key": made.keys[trial], **label()}
+        assert found.to_json() == {"key": made.keys[trial], **label()}
         assert plain.key(made.item, recording(made, trial)) == made.keys[trial]
     assert plain.states([made.item]) is None
     assert plain.report_states([made.item]) == {}
 
     found = reviewed.read(made.item, recording(made, one))
-    assert (found["incipient_ns"], found["gross_ns"]) == (NEW.incipient_ns, NEW.gross_ns)
-    assert found["per_marker_ns"] == label()["per_marker_ns"]
+    assert (found.incipient_ns, found.gross_ns) == (NEW.incipient_ns, NEW.gross_ns)
+    assert list(found.per_marker_ns) == label()["per_marker_ns"]
     found = reviewed.read(made.item, recording(made, two))
-    assert (found["incipient_ns"], found["gross_ns"]) == (None, None)
-    assert found["doubts"]["incipient"] == "rejected: because"
+    assert (found.incipient_ns, found.gross_ns) == (None, None)
+    assert found.doubts.incipient == "rejected: because"
     for trial in made.ids[2:5]:
-        assert reviewed.read(made.item, recording(made, trial))["gross_ns"] == label()["gross_ns"]
+        assert reviewed.read(made.item, recording(made, trial)).gross_ns == label()["gross_ns"]
         assert reviewed.key(made.item, recording(made, trial)) == made.keys[trial]
     assert reviewed.states([made.item]) == {
         "open": 9, "accepted": 1, "adjusted": 1, "rejected": 1, "stale": 0
@@ -97,7 +98,7 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     decide(made, trial, "adjust")
     labels = Labels(made.store, reviewed=True)
     found = labels.read(made.item, recording(made, trial))
-    assert found["incipient_ns"] == label()["incipient_ns"]
+    assert found.incipient_ns == label()["incipient_ns"]
     assert labels.report_states([made.item])["reviewed"]["stale"] == 1
     assert (
         "decisions on 1 trials were made on labels that have changed since"
@@ -162,9 +163,9 @@ def test_the_list_follows_the_store(made: Reviewable) -> None:
 
 
 def test_doubts_are_told_once_and_gravest_first() -> None:
-    data = {"incipient_ns": None, "gross_ns": None, "markers_lost": 2, "plate_lost": 1,
+    data = {"incipient_ns": None, "gross_ns": None, "end_ns": 1, "markers_lost": 2, "plate_lost": 1,
             "doubts": {"incipient": None, "gross": "hidden"}}  # fmt: skip
-    assert [text for _, text in doubts_of(data)] == [
+    assert [text for _, text in doubts_of(TrialLabel.model_validate(data))] == [
         "gross: hidden", "no slip was found", "2 times a marker was not seen",
         "the plate's marker was not seen in 1 frames",
     ]  # fmt: skip

@@ -67,7 +67,7 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
     for item, trial, recording in split_trials(campaigns, "test"):
         ours = int(np.count_nonzero(kept["trial"] == trials.index((item.name, trial.id))))
         assert ours == rows.get((item.name, trial.id), 0)
-        onset = labels.read(item, recording)["incipient_ns"]
+        onset = labels.read(item, recording).incipient_ns
         assert (onset is None) == (ours == 0)
 
 
@@ -95,7 +95,7 @@ def test_each_sample_says_its_trial(two: Store) -> None:
         length_ns = campaigns[0].settings.windows.length_ms * 1_000_000
         for item, trial, recording in split_trials(campaigns, split):
             index = samples.trials.index(TrialId(item.name, trial.id))
-            onset = labels.read(item, recording)["incipient_ns"]
+            onset = labels.read(item, recording).incipient_ns
             still = samples.start_ns[(samples.trial == index) & (samples.y == 0)]
             if onset is None:
                 assert not len(still)
