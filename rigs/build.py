@@ -17,8 +17,7 @@ from sliplab.rigs.core.capabilities import (
     Simulation,
 )
 from sliplab.rigs.core.host_clock import HostClock
-from sliplab.rigs.core.operators import ConsoleOperator
-from sliplab.rigs.core.people import PersonAtPlate
+from sliplab.rigs.core.operators import ConsoleOperator, PersonAtPlate
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.devices.basler.settings import BaslerSettings
@@ -128,7 +127,7 @@ def _real_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 
 def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
-    """Real drivers; stand-ins in a process of their own show the simulated scene."""
+    """Real drivers; fakes in a process of their own show the simulated scene."""
     from sliplab.rigs.loopback.client import Loopback
 
     with ExitStack() as undo:
@@ -141,13 +140,13 @@ def _loopback_rig(file: RigFile, devices: DeviceSettings) -> Rig:
 
 
 def loopback_rig(file: RigFile, stage: Loopback) -> Rig:
-    """Real drivers on stand-ins that somebody else began, and ends.
+    """Real drivers on fakes that somebody else began, and ends.
 
     Args:
         file: of the kind `loopback`, with the arm and the scene that `stage` shows.
 
     Raises:
-        RigError: a stand-in is not there.
+        RigError: a fake is not there.
     """
     from sliplab.rigs.devices.basler.fake_live import LiveBasler
 

@@ -28,8 +28,7 @@ from sliplab.protocols.yaml_file import (
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.mock.promises import check_promises
-from sliplab.rigs.mock.settings import MockSettings
+from sliplab.rigs.mock.settings import MockSettings, check_promises
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 
 SCALE_ERROR = 0.005

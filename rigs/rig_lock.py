@@ -28,7 +28,7 @@ _FOLDER = Path("/tmp/sliplab-rigs")
 def lock_names(file: RigFile) -> dict[str, str]:
     """What is locked, by the name of its lock file; nothing on simulated rigs.
 
-    Each simulated rig has devices, or stand-ins, of its own.
+    Each simulated rig has devices, or fakes, of its own.
     """
     if file.simulated or file.devices is None:
         return {}

@@ -1,6 +1,6 @@
 """What a device must be able to do to be part of a rig: capabilities, not base classes.
 
-A driver, a stand-in on the wire and a simulated device are all the same to the rig if they can
+A driver, a fake on the wire and a simulated device are all the same to the rig if they can
 do what is written here. Every call returns within a bounded time or raises a `RigError`; nothing
 here waits for a motion to end. Time passes only in `Clock.wait`, so a simulated rig runs as fast
 as it can while the code around it stays the same.

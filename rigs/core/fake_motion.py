@@ -1,6 +1,6 @@
-"""Where a stand-in's tool centre point is: straight lines at constant speed, with real ramps.
+"""Where a fake's tool centre point is: straight lines at constant speed, with real ramps.
 
-A stand-in asks a `Motion` and nothing else, so a simulated scene can take the place of this one
+A fake asks a `Motion` and nothing else, so a simulated scene can take the place of this one
 and see the same moves.
 """
 
@@ -113,7 +113,7 @@ class Line:
 
 
 class StraightMotion:
-    """The `Motion` of a stand-in by itself. May be asked from any thread.
+    """The `Motion` of a fake by itself. May be asked from any thread.
 
     Args:
         on_line: told of every new way and since when it holds, s; in the thread that moves.
@@ -192,7 +192,7 @@ def _backwards(line: Line, gone: float, way: float) -> Pose:
 
 
 class CycleClock(Protocol):
-    """What a stand-in's controller counts its cycles by."""
+    """What a fake's controller counts its cycles by."""
 
     @property
     def rate(self) -> float:

@@ -17,7 +17,7 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
-from sliplab.rigs.core.stall_timer import STEP_S, Patience
+from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 
 KILL_S = 2.0
 """How long a child that was asked to end, or killed, may take to be gone, s."""
@@ -147,8 +147,8 @@ class LibraryProcess:
         """Whether there is an answer, after waiting for it."""
         if not self._patient:
             return self._pipe.poll(within_s)
-        patience = Patience()
-        while patience.waited_s(0) < within_s:
+        stall = StallTimer()
+        while stall.waited_s(0) < within_s:
             if self._pipe.poll(STEP_S):
                 return True
         return False

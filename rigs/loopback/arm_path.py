@@ -1,6 +1,6 @@
-"""The simulated world's arm path, where a stand-in's controller moves the arm.
+"""The simulated world's arm path, where a fake's controller moves the arm.
 
-A stand-in tells of every new line that its tool centre point follows; the world looks back on
+A fake tells of every new line that its tool centre point follows; the world looks back on
 them, ramps and all. True time runs on through all trials; the world counts from its trial's begin.
 """
 
@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
 from sliplab.rigs.core.fake_motion import STILL, Line, StraightMotion
-from sliplab.rigs.mock.geometry import ContactPlane
-from sliplab.rigs.mock.path import EVERY, ArmPath, Leg, stirred
+from sliplab.rigs.mock.path import EVERY, ArmPath, ContactPlane, Leg, stirred
 from sliplab.storage.clockmap import ClockMap
 
 F64 = npt.NDArray[np.float64]
@@ -34,8 +33,8 @@ class _Way:
     end: F64
 
 
-class MotionPath(ArmPath):
-    """An arm path that follows the tool centre point of a stand-in.
+class FakeArmPath(ArmPath):
+    """An arm path that follows the tool centre point of a fake.
 
     Args:
         plane: the true contact plane.
@@ -43,9 +42,9 @@ class MotionPath(ArmPath):
         controller: true time of all trials to the arm controller's clock, ns.
 
     Attributes:
-        motion: what the stand-in moves.
+        motion: what the fake moves.
         cut_ns: true time of the trial at which something in the world stopped the arm; None until
-            then. The stand-in has to stop too.
+            then. The fake has to stop too.
     """
 
     def __init__(self, plane: ContactPlane, pose: Pose, controller: ClockMap) -> None:
@@ -69,7 +68,7 @@ class MotionPath(ArmPath):
         """The ways go on; `begin` forgets them."""
 
     def follow(self, segments: Sequence[Segment], now_ns: int) -> list[Leg]:
-        """Nobody but the stand-in moves this arm.
+        """Nobody but the fake moves this arm.
 
         Raises:
             RigError: always.

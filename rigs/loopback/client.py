@@ -1,6 +1,6 @@
-"""The stand-ins of a loopback rig: a process of their own, and what the rig may ask of it.
+"""The fakes of a loopback rig: a process of their own, and what the rig may ask of it.
 
-Drivers and stand-ins in one process would wait for each other, and would share one Python; a real
+Drivers and fakes in one process would wait for each other, and would share one Python; a real
 rig does neither. Frames come back through a pipe of their own, for pylon's emulated camera lives in
 the drivers' process: `rigs.devices.basler.fake` puts them in place of its pictures.
 """
@@ -28,7 +28,7 @@ from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.streams import FrameChunk, Sink
 
 READY_S = 180.0
-"""The longest that the stand-ins take to begin: kernels may have to be compiled, s."""
+"""The longest that the fakes take to begin: kernels may have to be compiled, s."""
 ANSWER_S = 20.0
 """The longest that they take to answer, s."""
 TURN_S = 0.004
@@ -37,7 +37,7 @@ END_S = 5.0
 
 
 class Loopback:
-    """Stand-ins that run until `close`.
+    """Fakes that run until `close`.
 
     Also the `rigs.core.capabilities.Simulation`, `Plate` and `Operator` of the rig.
 
@@ -73,7 +73,7 @@ class Loopback:
         self._reader.start()
 
     def close(self) -> None:
-        """End the stand-ins, whatever they do; any number of times."""
+        """End the fakes, whatever they do; any number of times."""
         self._pipe.close()
         self._process.join(END_S)
         if self._process.is_alive():
@@ -82,7 +82,7 @@ class Loopback:
         self._frames.close()
 
     def reached_by(self, devices: DeviceSettings) -> DeviceSettings:
-        """Settings of drivers that reach these stand-ins."""
+        """Settings of drivers that reach these fakes."""
         events, triggers = self.event_ports
         source = NetworkStream(events_port=events, triggers_port=triggers)
         box = devices.sync_box or SyncBoxSettings(port=self.sync_port)
@@ -204,7 +204,7 @@ def _serve(
     """The process: it ends with its parent, and never waits for a library to be taken down."""
     from sliplab.rigs.loopback.simulation_server import SimulationServer
 
-    sys.setswitchinterval(0.0005)  # the stand-ins' threads answer while the scene computes
+    sys.setswitchinterval(0.0005)  # the fakes' threads answer while the scene computes
     status, server = 1, None
     try:
         server = SimulationServer(settings, timing, arm, frames.send)

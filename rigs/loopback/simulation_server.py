@@ -1,6 +1,6 @@
-"""One simulated scene on one real-time clock, behind stand-ins that speak the devices' wires.
+"""One simulated scene on one real-time clock, behind fakes that speak the devices' wires.
 
-What a stand-in sends is what the simulated devices of `rigs.mock` would have handed over: the same
+What a fake sends is what the simulated devices of `rigs.mock` would have handed over: the same
 world, the same noise, the same faults by name. Only the way to the host differs, so a trial looks
 the same through either. The world follows the host's monotonic clock a little behind it, so that a
 controller's move never lies in the world's past.
@@ -11,8 +11,9 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,25 +21,154 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_faults import Kind
-from sliplab.rigs.devices.dvxplorer.fake_live import LiveDvxplorer
+from sliplab.rigs.core.fake_motion import StraightMotion
+from sliplab.rigs.core.fakes import Kind
+from sliplab.rigs.core.pulse_code import code_bits
+from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.devices.settings import ArmSettings
-from sliplab.rigs.devices.sync_box.fake import PtySyncBox, Train
-from sliplab.rigs.loopback.arm_path import MotionPath
-from sliplab.rigs.loopback.fake_arms import StandingArm, standing_arm
-from sliplab.rigs.loopback.sync_level import SyncLevel
+from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
+from sliplab.rigs.devices.ur.settings import UrSettings
+from sliplab.rigs.loopback.arm_path import FakeArmPath
 from sliplab.rigs.mock.clocks import trial_clocks
 from sliplab.rigs.mock.devices import build_mock
 from sliplab.rigs.mock.event_camera import MockEventCamera
 from sliplab.rigs.mock.frame_camera import MockFrameCamera
-from sliplab.rigs.mock.geometry import ContactPlane
-from sliplab.rigs.mock.people import MockPlate, SimulatedOperator
+from sliplab.rigs.mock.operator import MockPlate, SimulatedOperator
+from sliplab.rigs.mock.path import ContactPlane
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.sync import MockSyncBox
 from sliplab.rigs.mock.truth import truth_of
 from sliplab.rigs.mock.world import World, start_pose
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import FrameChunk
+
+REACH_MM = 2_000.0
+"""Limits of the fake itself; those of the rig file are the driver's to hold."""
+
+
+class FakeArm(Protocol):
+    """A fake of an arm's controller."""
+
+    def start(self) -> None:
+        """Open its ports. Raises OSError."""
+
+    def happen(self, kind: Kind) -> None:
+        """Make something go wrong now."""
+
+    def restore(self) -> None:
+        """A person has put everything right."""
+
+    def pose(self) -> Pose:
+        """Where its tool centre point is now."""
+
+    def moving(self) -> bool:
+        """Whether it is on its way now."""
+
+    def close(self) -> None:
+        """Give its ports back."""
+
+
+@dataclass(frozen=True)
+class DrivenClock:
+    """A controller's clock that somebody else drives."""
+
+    seconds: Callable[[], float]
+    rate: float = 1.0
+
+    def now_s(self) -> float:
+        """The controller's time, s."""
+        return self.seconds()
+
+
+def fake_arm(
+    settings: ArmSettings,
+    motion: StraightMotion,
+    now_s: Callable[[], float],
+    sync: Callable[[float], bool],
+) -> FakeArm:
+    """A fake for the arm that `settings` describe, started.
+
+    Args:
+        motion: where its tool centre point is.
+        now_s: its controller's clock, s.
+        sync: level of the sync line at a time of that clock.
+
+    Raises:
+        OSError: a port is taken.
+    """
+    arm: FakeArm
+    clock = DrivenClock(now_s)
+    if isinstance(settings, UrSettings):
+        from sliplab.rigs.devices.ur.fake import FakeUr
+
+        bit = 1 << settings.sync_input
+        arm = FakeUr(
+            settings.host,
+            motion,
+            cycle_hz=settings.frequency_hz,
+            digital_inputs=lambda t_s: bit if sync(t_s) else 0,
+            reach_mm=REACH_MM,
+            clock=clock,
+        )
+    elif settings.driver == "abb":
+        from sliplab.rigs.devices.abb.fake import FakeAbb
+
+        arm = FakeAbb(
+            settings.host,
+            settings.rws_port,
+            ("127.0.0.1", settings.egm_port),
+            motion,
+            egm_point=settings.egm_point,
+            clock=clock,
+        )
+    else:
+        from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
+
+        arm = FakeRapidServer(settings.host, settings.port, motion=motion, clock=clock)
+    arm.start()
+    return arm
+
+
+PULSE_NS = 5_000_000
+"""Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
+_BITS = 1 << 12
+
+
+class SyncLevel:
+    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
+
+    Args:
+        box: true time of all trials to the box's clock, ns.
+    """
+
+    def __init__(self, box: ClockMap) -> None:
+        self._box = box
+        self._train: Train | None = None
+        self._bits = np.zeros(0, np.uint8)
+        self._ticks: int | None = None
+
+    def follow(self, train: Train | None, sent: int) -> None:
+        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
+        if train is None:
+            self._ticks = sent
+        else:
+            self._bits = np.zeros(0, np.uint8)
+            self._ticks, self._train = None, train
+
+    def high(self, total_ns: int) -> bool:
+        """Whether the line is high at a true time of all trials."""
+        train, ticks = self._train, self._ticks
+        if train is None:
+            return False
+        passed = self._box.to_reference(total_ns) - train.first_ns
+        period = 1e9 / train.rate_hz
+        tick = int(passed // period)
+        if tick < 0 or (ticks is not None and tick >= ticks):
+            return False
+        if tick >= len(self._bits):
+            self._bits = code_bits(train.seed, max(2 * tick, _BITS), train.code)
+        return bool(self._bits[tick]) and passed - tick * period < min(PULSE_NS, period / 2)
+
 
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
@@ -54,12 +184,12 @@ NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE
 
 
 class SimulationServer:
-    """The scene and its stand-ins; `turn` lets it follow the clock, from one thread.
+    """The scene and its fakes; `turn` lets it follow the clock, from one thread.
 
     Args:
         settings: the simulated scene and devices, with their faults.
         timing: which signals reach which device; frames by hardware trigger.
-        arm: settings of the arm's driver: a stand-in of its kind listens where it will look.
+        arm: settings of the arm's driver: a fake of its kind listens where it will look.
         on_frames: is given the frames of each turn.
     """
 
@@ -76,7 +206,7 @@ class SimulationServer:
         plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
         self._arm_clock = clocks.arm
         self._arm_by_host = arm.driver == "abb_socket"
-        self._path = MotionPath(plane, start_pose(settings), clocks.arm)
+        self._path = FakeArmPath(plane, start_pose(settings), clocks.arm)
         self.world = World(settings, self._path, run_on=True)
         self._box_clock = ClockMap.line(0, 0, clocks.sync_box_ppb)
         self._box = MockSyncBox(self.world)
@@ -91,15 +221,13 @@ class SimulationServer:
         self._sent: Counter[str] = Counter()
         self._stamps_us: list[I64] = []
         self._size = settings.event_camera.width, settings.event_camera.height
-        self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+        self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
         self.camera = LiveDvxplorer(self._size)
-        self.arm: StandingArm = standing_arm(
-            arm, self._path.motion, self._arm_now_s, self._arm_input
-        )
+        self.arm: FakeArm = fake_arm(arm, self._path.motion, self._arm_now_s, self._arm_input)
         self._events.start()
 
     def close(self) -> None:
-        """Take every stand-in away."""
+        """Take every fake away."""
         for part in (self.arm, self.camera, self.sync_box):
             part.close()
 
@@ -258,7 +386,7 @@ class SimulationServer:
 
         Args:
             device: ``arm``, ``sync_box`` or ``event_camera``.
-            kind: of the arm a value of `rigs.core.fake_faults.Kind`; of the sync box ``reset``,
+            kind: of the arm a value of `rigs.core.fakes.Kind`; of the sync box ``reset``,
                 ``silence`` or ``unplug``; of the event camera ``stall`` or ``unplug``.
 
         Raises:
@@ -299,7 +427,7 @@ class SimulationServer:
                 self._path.motion.move(clear, PENDANT_MM_S, PENDANT_MM_S2, now_s)
         elif device == "sync_box":
             self.sync_box.close()
-            self.sync_box = PtySyncBox(self._box_now_ns, on_train=self._on_train)
+            self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
         elif device == "event_camera":
             self.camera.close()
             self.camera = LiveDvxplorer(self._size)
@@ -311,7 +439,7 @@ class SimulationServer:
 def _rehearse(settings: MockSettings, timing: Timing) -> None:
     """Let a world like this one run for a moment: what has to be compiled or loaded is then there.
 
-    Compiling holds Python's lock for seconds, in which no stand-in would answer.
+    Compiling holds Python's lock for seconds, in which no fake would answer.
     """
     devices = build_mock(settings, timing)
     devices.arm.connect()

@@ -1,20 +1,149 @@
-"""Where the simulated arm is at any time: the legs that it was told to follow, and rest."""
+"""Where the arm is at any time: the true plate, the legs that it was told to follow, its deviation.
+
+Rotation vectors are in degrees; a state is xyz, rotation vector and the five numbers of the sensor
+over the true plate.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.rigs.core.capabilities import Pose, Segment
-from sliplab.rigs.mock.deviation import Deviation
-from sliplab.rigs.mock.geometry import ContactPlane
+from sliplab.rigs.mock.fault_settings import ArmOffPath
+from sliplab.rigs.mock.faults import NEVER, FaultBook
+from sliplab.rigs.mock.settings import Contact
 
 F64 = npt.NDArray[np.float64]
+
+
+@lru_cache(maxsize=64)
+def matrix(rotvec_deg: tuple[float, float, float]) -> F64:
+    """Rotation matrix of a rotation vector in degrees (Rodrigues), shape (3, 3), not to be changed.
+
+    Kept: a tool seldom turns.
+    """
+    vector = np.radians(np.asarray(rotvec_deg, np.float64))
+    angle = float(np.sqrt(vector @ vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+
+
+def rotvec_deg(rotation: F64) -> tuple[float, float, float]:
+    """Rotation vector of a matrix, degrees; for angles below 180."""
+    axis = np.array([
+        rotation[2, 1] - rotation[1, 2],
+        rotation[0, 2] - rotation[2, 0],
+        rotation[1, 0] - rotation[0, 1],
+    ])  # fmt: skip
+    sine = 0.5 * float(np.sqrt(axis @ axis))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(rotation)) - 1.0))
+    scale = 0.5 if sine < 1e-12 else 0.5 * angle / sine
+    x, y, z = np.degrees(axis * scale).tolist()
+    return x, y, z
+
+
+class ContactPlane:
+    """The true surface of the plate in the arm's base frame: x right, y up, z into the plate.
+
+    Right, up and into make a right-handed frame as the outside camera sees it, from behind.
+    """
+
+    def __init__(self, origin_mm: F64, rotation: F64, tip_mm: F64 | None = None) -> None:
+        """`tip_mm`: where the tip truly is from the reported tool centre point, in tool axes."""
+        self.origin_mm = origin_mm
+        self.rotation = rotation
+        self.tip_mm = np.zeros(3) if tip_mm is None else tip_mm
+
+    @classmethod
+    def from_settings(cls, contact: Contact, tip_mm: Sequence[float] = (0, 0, 0)) -> ContactPlane:
+        """The nominal plane, tilted about an axis in it and set back along its normal."""
+        nominal = matrix(contact.nominal_rotvec_deg)
+        azimuth = math.radians(contact.tilt_axis_deg)
+        tilt = matrix((
+            contact.tilt_deg * math.cos(azimuth), contact.tilt_deg * math.sin(azimuth), 0.0,
+        ))  # fmt: skip
+        rotation = nominal @ tilt
+        origin = np.asarray(contact.nominal_origin_mm) + contact.offset_mm * rotation[:, 2]
+        return cls(origin, rotation, np.asarray(tip_mm, np.float64))
+
+    def pose(self, x_mm: float, y_mm: float, depth_mm: float) -> Pose:
+        """The tool pose that puts the sensor squarely there."""
+        place = np.array([x_mm, y_mm, depth_mm]) - self.tip_mm
+        x, y, z = (self.origin_mm + self.rotation @ place).tolist()
+        return Pose((x, y, z), rotvec_deg(self.rotation))
+
+    def sensor(self, pose: Pose) -> F64:
+        """x, y, depth (mm) of the highest tip, and depth's slopes over the layout, shape (5,).
+
+        Turning about the plate's normal is left out: the skin looks much the same after it.
+        """
+        tool = self.rotation.T @ matrix(pose.rotvec_deg)
+        place = self.rotation.T @ (np.asarray(pose.xyz_mm) - self.origin_mm) + tool @ self.tip_mm
+        return np.array([*place, tool[2, 0], tool[2, 1]])
+
+    def turned_deg(self, pose: Pose) -> float:
+        """Angle between the tool's axes and the plate's."""
+        trace = float(np.trace(self.rotation.T @ matrix(pose.rotvec_deg)))
+        return math.degrees(math.acos(min(max(0.5 * (trace - 1.0), -1.0), 1.0)))
+
+
 I64 = npt.NDArray[np.int64]
+_LOOK_BACK_NS = 1_000_000
+_MOVING_MM = 1e-9
+_X, _Y = 6, 7
+"""Columns of an arm state (`rigs.mock.path`): the sensor's place on the plate."""
+
+
+class Deviation:
+    """How far the tool is from where it was told to be, as an arm state to be added."""
+
+    def __init__(
+        self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
+    ) -> None:
+        """`commanded`: from rising true times, ns, (n,) to states, (n, 11)."""
+        self._book, self._plane, self._commanded = book, plane, commanded
+        self._frozen_ns = NEVER
+
+    def __bool__(self) -> bool:
+        return bool(self._book.of(ArmOffPath))
+
+    def freeze(self, at_ns: int) -> None:
+        """The arm stopped: whatever pulled it aside pulls no further."""
+        self._frozen_ns = min(self._frozen_ns, at_ns)
+
+    def at(self, t_ns: I64) -> F64:
+        """Deviations at true times, (n, 11): place of the tool and of the sensor, mm."""
+        result = np.zeros((len(t_ns), 11))
+        for fault, begin, end in self._book.spans(ArmOffPath):
+            t = np.minimum(t_ns, self._frozen_ns)
+            way_mm = fault.mm * np.clip((t - begin) / (end - begin), 0.0, 1.0)
+            if way_mm.any():
+                aside = way_mm[:, None] * self._direction(fault, begin)
+                result[:, :3] += aside @ self._plane.rotation[:, :2].T
+                result[:, _X : _Y + 1] += aside
+        return result
+
+    def _direction(self, fault: ArmOffPath, at_ns: int) -> F64:
+        """Unit vector on the plate, (2,)."""
+        if fault.direction_deg is not None:
+            angle = math.radians(fault.direction_deg)
+            return np.array([math.cos(angle), math.sin(angle)])
+        # looking back: what lies ahead may still be changed
+        states = self._commanded(np.array([at_ns - _LOOK_BACK_NS, at_ns], np.int64))
+        x, y = (states[1] - states[0])[_X : _Y + 1].tolist()
+        length = math.hypot(x, y)
+        return np.array([0.0, 1.0]) if length < _MOVING_MM else np.array([-y, x]) / length
+
+
 TURN_DEG_PER_S = 30.0
 FADE_NS = 200_000_000
 """How long a tremor takes to build up and to die away."""

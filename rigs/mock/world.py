@@ -17,12 +17,10 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, RigError, Segment
 from sliplab.rigs.mock.clocks import TrialClocks, trial_clocks, with_faults
-from sliplab.rigs.mock.deviation import Deviation
 from sliplab.rigs.mock.fault_settings import PlateStuck
 from sliplab.rigs.mock.faults import FaultBook
-from sliplab.rigs.mock.geometry import ContactPlane
 from sliplab.rigs.mock.history import History
-from sliplab.rigs.mock.path import SENSOR, ArmPath, Leg
+from sliplab.rigs.mock.path import SENSOR, ArmPath, ContactPlane, Deviation, Leg
 from sliplab.rigs.mock.physics import Physics
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.skins import skin_of

@@ -1,4 +1,4 @@
-"""What tests of a loopback rig share: a short trial, a rig file, sessions on its stand-ins."""
+"""What tests of a loopback rig share: a short trial, a rig file, sessions on its fakes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def quick(
 
 
 def rig_yaml(folder: Path) -> Path:
-    """The shipped loopback rig with a stand-in arm at an address of its own, near the plate."""
+    """The shipped loopback rig with a fake arm at an address of its own, near the plate."""
     data = {
         "extends": str(ROOT / "rigs" / "loopback.yaml"),
         "name": "loopback",
@@ -74,7 +74,7 @@ def request_in(folder: Path, data: dict[str, Any], rig: Path) -> RunRequest:
 
 @contextmanager
 def stage_of(file: RigFile) -> Iterator[Loopback]:
-    """Stand-ins for a rig file, which outlive the rigs that are built on them."""
+    """Fakes for a rig file, which outlive the rigs that are built on them."""
     assert file.devices is not None
     stage = Loopback(file.scene, file.timing, file.devices.arm)
     try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sliplab.rigs.devices.dvxplorer.fake_live import LiveDvxplorer
+from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.devices.settings import DeviceSettings
 from sliplab.rigs.discovery import reach
 from tests.rigs.waiting import own_address

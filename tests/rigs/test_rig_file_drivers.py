@@ -1,4 +1,4 @@
-"""Rig files of drivers and of stand-ins: each kind has its own sections, and says what lacks."""
+"""Rig files of drivers and of fakes: each kind has its own sections, and says what lacks."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
         _set("devices", "frame_camera", "sync_line", to=1),
         "devices.frame_camera.sync_line", "must be another line than trigger_line",
     ),
-    "frames that no stand-in times so": (
+    "frames that no fake times so": (
         _set("timing", "frames", to="exposure line"),
         "timing.frames", "must be hardware trigger",
     ),

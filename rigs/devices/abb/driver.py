@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Sequence
 
+from sliplab.rigs.core.arm_driver import Run, SegmentWatch, has_left, is_at
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -24,10 +25,8 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.guard import Guard
-from sliplab.rigs.core.path_progress import Run
 from sliplab.rigs.core.pose import compose, distance_mm
 from sliplab.rigs.core.pose_stream import PoseStream, Sample
-from sliplab.rigs.core.segments import SegmentWatch, has_left, is_at
 from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
 from sliplab.rigs.devices.abb.program import PAUSE_S, motion_program
 from sliplab.rigs.devices.abb.rws import (

@@ -1,4 +1,4 @@
-"""A stand-in for an ABB IRC5 controller: Robot Web Services, motion programs, poses by EGM.
+"""A fake for an ABB IRC5 controller: Robot Web Services, motion programs, poses by EGM.
 
 HTTP with digest authentication and JSON on one port, as abb-robot-client 0.4.0 and
 abb-motion-program-exec 0.7.4 ask for it; EGM packets are sent to a UDP port from the first motion
@@ -12,22 +12,115 @@ from __future__ import annotations
 import argparse
 import contextlib
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl
 
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_faults import CLOCK_BACK_S, PACKETS_LOST, Fault, Kind, Stage
-from sliplab.rigs.core.fake_loop import START_S
 from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
-from sliplab.rigs.core.pose import compose, inverse, quaternion
+from sliplab.rigs.core.fakes import CLOCK_BACK_S, PACKETS_LOST, START_S, Fault, Kind, Stage
+from sliplab.rigs.core.pose import compose, from_quaternion, inverse, quaternion
 from sliplab.rigs.devices.abb.fake_http import HttpServer, Reply
-from sliplab.rigs.devices.abb.fake_program import MoveL, ProgramError, Wait, read_program
 from sliplab.rigs.devices.abb.watchdog import BEAT, ECHO, LIMIT
+
+FILE_VERSION = 10011
+_MOVE_L, _WAIT = 3, 5
+_WORK_OBJECT_BEFORE, _WORK_OBJECT_AFTER = 2, 14
+_LOAD = 11
+
+
+class ProgramError(ValueError):
+    """Not a motion program, or one with commands that are not known here."""
+
+
+@dataclass(frozen=True)
+class MoveL:
+    """One straight move."""
+
+    to: Pose
+    speed_mm_s: float
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Standing still for some seconds."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Program:
+    """A whole motion program without EGM commands."""
+
+    tool: Pose
+    tool_mass_kg: float
+    commands: tuple[MoveL | Wait, ...]
+
+
+class _Reader:
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    @property
+    def ended(self) -> bool:
+        return self._at >= len(self._data)
+
+    def numbers(self, count: int) -> tuple[float, ...]:
+        try:
+            values = struct.unpack_from(f"<{count}f", self._data, self._at)
+        except struct.error:
+            raise ProgramError("the file ends too soon") from None
+        self._at += 4 * count
+        return values
+
+    def number(self) -> float:
+        return self.numbers(1)[0]
+
+    def skip_text(self) -> None:
+        self.number()
+        self._at += 32
+
+    def pose(self) -> Pose:
+        values = self.numbers(7)
+        return from_quaternion(values[:3], values[3:])
+
+
+def read_program(data: bytes) -> Program:
+    """The motion program in a file's bytes. Raises ProgramError."""
+    reader = _Reader(data)
+    if reader.number() != FILE_VERSION:
+        raise ProgramError("another file version")
+    reader.number()  # the robot holds the tool
+    tool = reader.pose()
+    mass_kg = reader.numbers(_LOAD)[0]
+    reader.numbers(_WORK_OBJECT_BEFORE)
+    reader.skip_text()
+    reader.numbers(_WORK_OBJECT_AFTER + _LOAD)
+    reader.skip_text()
+    reader.number()  # sequence number
+    if reader.number() != 0:
+        raise ProgramError("EGM commands are not known here")
+    commands: list[MoveL | Wait] = []
+    while not reader.ended:
+        _, operation = reader.numbers(2)
+        if operation == _MOVE_L:
+            to = reader.pose()
+            reader.numbers(4 + 6)  # configuration, external axes
+            speed = reader.numbers(4)[0]
+            reader.numbers(7)  # zone: every point is a fine point here
+            commands.append(MoveL(to, speed))
+        elif operation == _WAIT:
+            commands.append(Wait(reader.number()))
+        else:
+            raise ProgramError(f"the command {operation:g} is not known here")
+    return Program(tool, mass_kg, tuple(commands))
+
 
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
@@ -45,8 +138,8 @@ _NO_AXIS = "9E+09"
 """What RAPID says of an external axis that is not there."""
 
 
-class AbbStandIn:
-    """One stand-in controller; `start` opens its port, `close` gives it back.
+class FakeAbb:
+    """One fake controller; `start` opens its port, `close` gives it back.
 
     Args:
         host: loopback address of its own.
@@ -122,7 +215,7 @@ class AbbStandIn:
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._unplugging: threading.Thread | None = None
 
-    def __enter__(self) -> AbbStandIn:
+    def __enter__(self) -> FakeAbb:
         self.start()
         return self
 
@@ -426,13 +519,13 @@ def _gone(one: Pose, other: Pose) -> float:
 
 
 def main() -> None:
-    """Run one stand-in until the process is ended."""
-    parser = argparse.ArgumentParser(description="A stand-in for an ABB IRC5 controller.")
+    """Run one fake until the process is ended."""
+    parser = argparse.ArgumentParser(description="A fake for an ABB IRC5 controller.")
     parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
     parser.add_argument("--port", type=int, default=8080, help="of its web services")
     parser.add_argument("--egm", type=int, default=6510, help="UDP port for its poses")
     arguments = parser.parse_args()
-    with AbbStandIn(arguments.host, arguments.port, ("127.0.0.1", arguments.egm)):
+    with FakeAbb(arguments.host, arguments.port, ("127.0.0.1", arguments.egm)):
         threading.Event().wait()
 
 

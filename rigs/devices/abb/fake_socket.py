@@ -1,4 +1,4 @@
-"""A stand-in for the small RAPID socket server on an ABB controller (port 5000).
+"""A fake for the small RAPID socket server on an ABB controller (port 5000).
 
 One client at a time; a second one is taken by the network and not answered until the first has
 left. A fly-by move is answered inside its zone, so that the next one can run on from it without a
@@ -15,9 +15,8 @@ import time
 from collections.abc import Sequence
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
-from sliplab.rigs.core.fake_loop import Connections, LoopThread
 from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, StraightMotion
+from sliplab.rigs.core.fakes import Connections, Fault, Kind, LoopThread, Stage
 from sliplab.rigs.core.pose import distance_mm, from_quaternion, quaternion
 from sliplab.rigs.devices.abb.rapid_socket import ARGUMENTS, Command
 
@@ -29,8 +28,8 @@ _POLL_S = 0.001
 _DONE, _REFUSED = b"\x00\x01", b"\x00\x00"
 
 
-class RapidStandIn:
-    """One stand-in; `start` opens its port, `close` gives it back.
+class FakeRapidServer:
+    """One fake; `start` opens its port, `close` gives it back.
 
     Args:
         host: loopback address of its own.
@@ -67,7 +66,7 @@ class RapidStandIn:
         self._thread: LoopThread | None = None
         self._turn: asyncio.Lock | None = None
 
-    def __enter__(self) -> RapidStandIn:
+    def __enter__(self) -> FakeRapidServer:
         self.start()
         return self
 

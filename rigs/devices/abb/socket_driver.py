@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
+from sliplab.rigs.core.arm_driver import Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -27,7 +28,6 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.guard import Guard
-from sliplab.rigs.core.path_progress import Run
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
 from sliplab.rigs.core.pose_stream import PoseStream, Sample
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health

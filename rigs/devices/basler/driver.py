@@ -18,9 +18,17 @@ from sliplab.rigs.core.capabilities import DeviceHealth, RigError
 from sliplab.rigs.devices.basler.frame_time import Abilities, choose
 from sliplab.rigs.devices.basler.grabbing import Grab, GrabCounts, GrabSettings
 from sliplab.rigs.devices.basler.health import basler_health
-from sliplab.rigs.devices.basler.nodes import DEVICE, Nodes, centre_region, has_latch, latch_clock
+from sliplab.rigs.devices.basler.nodes import (
+    DEVICE,
+    Nodes,
+    centre_region,
+    check_rate,
+    has_latch,
+    latch_clock,
+    read_back,
+    write_settings,
+)
 from sliplab.rigs.devices.basler.settings import BaslerSettings
-from sliplab.rigs.devices.basler.setup import check_rate, read_back, write_settings
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 TRIGGER_READY_MS = 1000
@@ -322,5 +330,5 @@ class BaslerCamera:
 
     @property
     def device(self) -> Any:
-        """pypylon's `InstantCamera`, for what only a stand-in or a person at a prompt asks."""
+        """pypylon's `InstantCamera`, for what only a fake or a person at a prompt asks."""
         return self._device

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.stall_timer import Patience
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.devices.basler.frame_time import Stamping
 from sliplab.rigs.devices.basler.nodes import DEVICE
 from sliplab.storage.streams import U8
@@ -126,7 +126,7 @@ class Grab:
         self._shortest_ns: int | None = None
         self._before: tuple[int, int] | None = None
         self._asked_ns = time.monotonic_ns()
-        self._patience = Patience()
+        self._stall = StallTimer()
         self._silent_ns = 0
         self._heard = False
         self._stopping = threading.Event()
@@ -146,7 +146,7 @@ class Grab:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
             silent_ns = self._silent_ns
-            hung_s = self._patience.waited_s(self._asked_ns)
+            hung_s = self._stall.waited_s(self._asked_ns)
             limit = self._settings.stall_ns if self._heard else self._settings.first_ns
             if hung_s > HANG_S:
                 return RigError(DEVICE, f"pylon has not answered for {hung_s:.1f} s")

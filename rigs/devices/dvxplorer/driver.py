@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
-from sliplab.rigs.core.stall_timer import Patience
+from sliplab.rigs.core.host_clock import StallTimer
 from sliplab.rigs.devices.dvxplorer.process import EventProcess
 from sliplab.rigs.devices.dvxplorer.settings import DvxplorerSettings
 from sliplab.rigs.devices.dvxplorer.source import DEVICE, Look
@@ -114,7 +114,7 @@ class DvxplorerCamera:
         self._counts = EventCounts()
         self._fault: RigError | None = None
         self._asked_ns = time.monotonic_ns()
-        self._patience = Patience()
+        self._stall = StallTimer()
         self._silent_ns = 0
 
     @property
@@ -217,7 +217,7 @@ class DvxplorerCamera:
         if self._fault is not None:
             raise self._fault
         silent_s = self._silent_ns / 1e9
-        hung_s = self._patience.waited_s(self._asked_ns)
+        hung_s = self._stall.waited_s(self._asked_ns)
         if self._keep and hung_s > HANG_S:
             raise RigError(DEVICE, f"dv-processing has not answered for {hung_s:.1f} s")
         if self._keep and silent_s > self.settings.stall_s:

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.rigs.devices.dvxplorer.fake_server import DvServer
 from sliplab.rigs.devices.dvxplorer.fake_stream import (
+    DvServer,
     events_header,
     events_packet,
     triggers_header,

@@ -1,4 +1,4 @@
-"""dv's network streams, byte by byte: what dv-processing's reader takes for a camera's.
+"""dv's network streams, byte by byte, served to whoever connects: a DVXplorer's on the network.
 
 The library's own writer (2.0.4) cannot stand in for a camera here: each of its threads asks its
 sockets without ever resting and takes a core, and events go in one by one, at 0.7 million a second.
@@ -9,10 +9,14 @@ length in front (`storage.formats.dv_buffers`).
 
 from __future__ import annotations
 
+import socket
 import struct
+import threading
+from collections import deque
+from contextlib import suppress
 
 from sliplab.storage.formats.dv_buffers import events_buffer, header_buffer, triggers_buffer
-from sliplab.storage.streams import I64, EventChunk
+from sliplab.storage.streams import I64, EventChunk, PulseChunk
 
 RISING_EDGE = 1
 """`EXTERNAL_SIGNAL_RISING_EDGE` of dv-processing's `TriggerType`."""
@@ -61,3 +65,170 @@ def triggers_packet(t_us: I64, kind: int = RISING_EDGE) -> bytes:
 def _packet(buffer: bytes) -> bytes:
     """Stream 0, length, and what comes."""
     return struct.pack("<ii", 0, len(buffer)) + buffer
+
+
+MOST_WAITING = 256 << 20
+"""Bytes that may wait for a client to take them; then the stream breaks, as a camera's would."""
+SEND_S = 10.0
+"""A client that has taken nothing for so long is cut off, s."""
+JOIN_S = 2.0
+
+
+class DvServer:
+    """Serves a stream on a free loopback port until `close`.
+
+    Args:
+        header: sent to each client first.
+
+    Attributes:
+        port: where it listens.
+    """
+
+    def __init__(self, header: bytes) -> None:
+        self._header = header
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._clients: list[socket.socket] = []
+        self._waiting: deque[bytes] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._threads = [
+            threading.Thread(target=work, name=f"dv stream {self.port}", daemon=True)
+            for work in (self._accept, self._send)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        with self._changed:
+            return len(self._clients)
+
+    @property
+    def waiting(self) -> int:
+        """Packets that have not left yet."""
+        with self._changed:
+            return len(self._waiting)
+
+    def send(self, packet: bytes) -> None:
+        """Hand a packet to every client that is there; returns at once."""
+        with self._changed:
+            if self._closing or not self._clients:
+                return
+            self._waiting.append(packet)
+            self._bytes += len(packet)
+            if self._bytes > MOST_WAITING:
+                self._cut()
+            self._changed.notify_all()
+
+    def wait_for_client(self, within_s: float) -> bool:
+        """Whether somebody is connected, after waiting for it."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self._clients), within_s)
+
+    def drain(self, within_s: float) -> bool:
+        """Whether everything has left, after waiting for it."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._waiting, within_s)
+
+    def close(self) -> None:
+        """Cut every client and give the port back; any number of times."""
+        with self._changed:
+            self._closing = True
+            self._cut()
+            self._changed.notify_all()
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        for thread in self._threads:
+            thread.join(JOIN_S)
+
+    def _cut(self) -> None:
+        for client in self._clients:
+            with suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+            client.close()
+        self._clients = []
+        self._waiting.clear()
+        self._bytes = 0
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            client.settimeout(SEND_S)
+            with suppress(OSError):
+                client.sendall(self._header)
+                with self._changed:
+                    if self._closing:
+                        client.close()
+                        return
+                    self._clients.append(client)
+                    self._changed.notify_all()
+
+    def _send(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closing)
+                if self._closing:
+                    return
+                packet, clients = self._waiting[0], list(self._clients)
+            for client in clients:
+                try:
+                    client.sendall(packet)
+                except OSError:
+                    with self._changed:
+                        if client in self._clients:
+                            self._clients.remove(client)
+                    client.close()
+            with self._changed:
+                if self._waiting and self._waiting[0] is packet:
+                    self._waiting.popleft()
+                    self._bytes -= len(packet)
+                self._changed.notify_all()
+
+
+NAME = "stand-in"
+
+
+class LiveDvxplorer:
+    """An event camera whose data come from elsewhere in this process.
+
+    Args:
+        size: columns and rows.
+
+    Attributes:
+        ports: of events and of triggers.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._events = DvServer(events_header(size, NAME))
+        self._triggers = DvServer(triggers_header(NAME))
+        self.ports = self._events.port, self._triggers.port
+        self._silent = False
+
+    def send(self, chunk: EventChunk, pulses: PulseChunk) -> None:
+        """Send events, and rising edges of its input; nothing while it is stalled."""
+        if self._silent:
+            return
+        if len(chunk):
+            self._events.send(events_packet(chunk))
+        if len(pulses.t_ns):
+            self._triggers.send(triggers_packet(pulses.t_ns // 1000))
+
+    def stall(self) -> None:
+        """Send nothing from now on; the connections stay."""
+        self._silent = True
+
+    def resume(self) -> None:
+        """Send again what comes from now on; what a stall kept back is lost."""
+        self._silent = False
+
+    def close(self) -> None:
+        """The cable is pulled: connections break. Any number of times."""
+        self._events.close()
+        self._triggers.close()

@@ -18,11 +18,11 @@ from typing import get_args
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.pulse_code import SEEDS
+from sliplab.rigs.devices.sync_box.driver import Bits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
-from sliplab.rigs.devices.sync_box.train import Bits
 
 TURN_S = 0.001
-"""How often the stand-in looks what is due."""
+"""How often the fake looks what is due."""
 LEAD_US = 2000
 """From GO to tick 0."""
 JOIN_S = 2.0
@@ -55,7 +55,7 @@ class Train:
     code: Code
 
 
-class PtySyncBox:
+class FakeSyncBox:
     """A sync box to open at `port`. A context manager: its thread ends with it.
 
     Args:
@@ -90,7 +90,7 @@ class PtySyncBox:
         self._thread = threading.Thread(target=self._work, name="pty sync box", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> PtySyncBox:
+    def __enter__(self) -> FakeSyncBox:
         return self
 
     def __exit__(self, *error: object) -> None:

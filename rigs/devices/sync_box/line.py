@@ -1,6 +1,6 @@
 """How the sync box and the host write lines to each other; docs/sync-box.md has the protocol.
 
-The driver and the stand-in on a pty share this file; the firmware has it in C (firmware/line.c).
+The driver and the fake on a pty share this file; the firmware has it in C (firmware/line.c).
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from sliplab.rigs.core.arm_driver import Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
@@ -29,15 +30,13 @@ from sliplab.rigs.core.capabilities import (
     Segment,
 )
 from sliplab.rigs.core.guard import Guard
-from sliplab.rigs.core.path_progress import Run
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
 from sliplab.rigs.core.pose_stream import PoseStream, Sample
 from sliplab.rigs.devices.ur import ports as ur_ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
 from sliplab.rigs.devices.ur.ports import ur_health
-from sliplab.rigs.devices.ur.rtde import Packet, RtdeError, RtdeReader
+from sliplab.rigs.devices.ur.rtde import OUTPUTS, Packet, RtdeError, RtdeReader, UrStatus, status_of
 from sliplab.rigs.devices.ur.settings import UrSettings
-from sliplab.rigs.devices.ur.status import OUTPUTS, UrStatus, status_of
 from sliplab.storage.streams import Json, PoseChunk, PulseChunk
 
 ANSWER_S = 3.0

@@ -1,4 +1,4 @@
-"""A stand-in for a Universal Robots e-Series controller on its three ports.
+"""A fake for a Universal Robots e-Series controller on its three ports.
 
 30004 RTDE, 29999 dashboard, 30003 scripts; the ports are fixed by the clients, so every robot has
 a loopback address of its own (127.0.0.2, .3, ...). ur_rtde 1.6.5's control, receive and dashboard
@@ -15,13 +15,12 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_faults import PACKETS_LOST, Fault, Kind, Stage
-from sliplab.rigs.core.fake_loop import Connections, LoopThread
 from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
+from sliplab.rigs.core.fakes import PACKETS_LOST, Connections, Fault, Kind, LoopThread, Stage
 from sliplab.rigs.devices.ur.fake_program import Safety, UrProgram
-from sliplab.rigs.devices.ur.fake_rtde import Client, send
 from sliplab.rigs.devices.ur.rtde import (
     DATA,
     GET_VERSION,
@@ -31,8 +30,125 @@ from sliplab.rigs.devices.ur.rtde import (
     SETUP_INPUTS,
     SETUP_OUTPUTS,
     START,
+    TYPES,
 )
 from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
+
+_UINT32 = {"robot_status_bits", "safety_status_bits", "runtime_state"}
+_INT32 = {"robot_mode", "safety_mode"}
+_UINT64 = {"actual_digital_input_bits", "actual_digital_output_bits"}
+_SCALARS = {
+    "timestamp", "actual_execution_time", "speed_scaling", "target_speed_fraction",
+    "actual_momentum", "actual_main_voltage", "actual_robot_voltage", "actual_robot_current",
+    "payload",
+}  # fmt: skip
+_VECTORS = {
+    "joint_mode": "VECTOR6INT32",
+    "payload_cog": "VECTOR3D",
+    "actual_tool_accelerometer": "VECTOR3D",
+    **dict.fromkeys(
+        (
+            "actual_TCP_force", "actual_TCP_pose", "actual_TCP_speed", "actual_current",
+            "actual_joint_voltage", "actual_q", "actual_qd", "ft_raw_wrench",
+            "joint_control_output", "joint_temperatures", "payload_inertia", "target_TCP_pose",
+            "target_TCP_speed", "target_current", "target_moment", "target_q", "target_qd",
+            "target_qdd", "external_force_torque",
+        ),
+        "VECTOR6D",
+    ),
+}  # fmt: skip
+_UNKNOWN, _IN_USE = "NOT_FOUND", "IN_USE"
+"""The controller's answers, in place of a type."""
+_LAYOUT = TYPES | {"VECTOR3D": "3d", "VECTOR6INT32": "6i"}
+_COUNT = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6}
+
+
+@dataclass(eq=False)
+class Client:
+    """One RTDE connection."""
+
+    writer: asyncio.StreamWriter
+    every: int = 1
+    """One packet in so many controller cycles."""
+    streaming: bool = False
+    _names: list[str] = field(default_factory=list)
+    _kinds: list[str] = field(default_factory=list)
+    _readers: list[Callable[[float], int | float | list[float]]] = field(default_factory=list)
+    _layout: struct.Struct = field(default_factory=lambda: struct.Struct(">"))
+    _recipes: dict[int, list[str]] = field(default_factory=dict)
+
+    def ask_outputs(self, body: bytes, cycle_hz: int) -> bytes:
+        """The answer to a request for outputs: recipe 1, or 0 if one is unknown, and types."""
+        (hz,) = struct.unpack_from(">d", body)
+        self._names = [name for name in body[8:].decode().split(",") if name]
+        self._kinds, self._readers = [_kind(name) for name in self._names], []
+        if _UNKNOWN in self._kinds:
+            kinds, self._names, self._kinds = self._kinds, [], []
+            return b"\x00" + ",".join(kinds).encode()
+        self.every = max(1, round(cycle_hz / hz))
+        self._layout = struct.Struct(">" + "".join(_LAYOUT[kind] for kind in self._kinds))
+        return b"\x01" + ",".join(self._kinds).encode()
+
+    def ask_inputs(self, body: bytes, others: Sequence[Client]) -> bytes:
+        """The answer to a request for inputs.
+
+        An input belongs to the client that asked for it first, for as long as it stays.
+        """
+        names = [name for name in body.decode().split(",") if name]
+        taken = {name for other in others for recipe in other._recipes.values() for name in recipe}
+        kinds = [_IN_USE if name in taken else _kind(name) for name in names]
+        if {_IN_USE, _UNKNOWN} & set(kinds):
+            return b"\x00" + ",".join(kinds).encode()
+        recipe = len(self._recipes) + 1
+        self._recipes[recipe] = names
+        return bytes([recipe]) + ",".join(kinds).encode()
+
+    def take(self, program: UrProgram, body: bytes) -> None:
+        """Write one packet's inputs into the program."""
+        names = self._recipes.get(body[0], [])
+        if not all("register" in name for name in names):
+            return  # an external force, which nothing here feels
+        values = struct.unpack(">" + "".join(TYPES[_kind(name)] for name in names), body[1:])
+        # The command last: its parameters must be there when it is seen.
+        for name, value in sorted(zip(names, values, strict=True), key=_command_last):
+            program.write(name, value)
+
+    def packet(self, program: UrProgram, t_s: float) -> bytes:
+        """The body of one packet of outputs."""
+        if len(self._readers) != len(self._names):
+            self._readers = [program.reader(name) for name in self._names]
+        flat: list[int | float] = []
+        for read, kind in zip(self._readers, self._kinds, strict=True):
+            value = read(t_s)
+            if kind in _COUNT:
+                flat.extend(value if isinstance(value, list) else [0] * _COUNT[kind])
+            else:
+                assert not isinstance(value, list)
+                flat.append(value)
+        return b"\x01" + self._layout.pack(*flat)
+
+
+def send(writer: asyncio.StreamWriter, command: int, body: bytes) -> None:
+    """Send one RTDE package, unless the client has left."""
+    if not writer.is_closing():
+        writer.write(HEADER.pack(HEADER.size + len(body), command) + body)
+
+
+def _command_last(pair: tuple[str, int | float]) -> bool:
+    return pair[0] == "input_int_register_0"
+
+
+def _kind(name: str) -> str:
+    if "_int_register_" in name or name in _INT32:
+        return "INT32"
+    if "_double_register_" in name or name in _SCALARS or name.startswith("standard_analog"):
+        return "DOUBLE"
+    if name in _UINT32:
+        return "UINT32"
+    if name in _UINT64:
+        return "UINT64"
+    return _VECTORS.get(name, _UNKNOWN)
+
 
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 VERSION = (5, 11, 1, 108318)
@@ -41,11 +157,11 @@ HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
 _STALL_S = 0.02
-"""A stand-in that was kept from running this long must not blame its client for it."""
+"""A fake that was kept from running this long must not blame its client for it."""
 
 
-class UrStandIn:
-    """One stand-in robot; `start` opens its ports, `close` gives them back.
+class FakeUr:
+    """One fake robot; `start` opens its ports, `close` gives them back.
 
     Args:
         host: loopback address of its own.
@@ -85,7 +201,7 @@ class UrStandIn:
         self._unsent = 0
         self._thread: LoopThread | None = None
 
-    def __enter__(self) -> UrStandIn:
+    def __enter__(self) -> FakeUr:
         self.start()
         return self
 
@@ -169,7 +285,7 @@ class UrStandIn:
             self._cut_off = True
             self._connections.cut()
         else:
-            raise ValueError(f"{kind.value} is not simulated by this stand-in")
+            raise ValueError(f"{kind.value} is not simulated by this fake")
 
     def _listen(self) -> None:
         for port, talk in (
@@ -288,12 +404,12 @@ def _whole_script(text: str) -> str | None:
 
 
 def main() -> None:
-    """Run one stand-in until the process is ended."""
-    parser = argparse.ArgumentParser(description="A stand-in for a Universal Robots controller.")
+    """Run one fake until the process is ended."""
+    parser = argparse.ArgumentParser(description="A fake for a Universal Robots controller.")
     parser.add_argument("host", help="loopback address of its own, such as 127.0.0.2")
     parser.add_argument("--rate", type=float, default=1.0, help="controller seconds a second")
     arguments = parser.parse_args()
-    with UrStandIn(arguments.host, rate=arguments.rate):
+    with FakeUr(arguments.host, rate=arguments.rate):
         threading.Event().wait()
 
 

@@ -1,4 +1,4 @@
-"""The inside of a stand-in Universal Robots controller: safety, registers, the control program.
+"""The inside of a fake Universal Robots controller: safety, registers, the control program.
 
 Facts come from ur_rtde 1.6.5 (`scripts/rtde_control.script` in its source distribution) and the
 RTDE guide of the maker: input_int_register_0 holds a command, output_int_register_0 says 1 ready or
@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_faults import CLOCK_BACK_S, Fault, Kind, Stage
 from sliplab.rigs.core.fake_motion import Motion
+from sliplab.rigs.core.fakes import CLOCK_BACK_S, Fault, Kind, Stage
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, from_ur, to_ur
 
 READY, DONE = 1, 2
@@ -48,7 +48,7 @@ class UrProgram:
     Args:
         motion: where the tool centre point is.
         reach_mm: poses further than this from the base are not within the safety limits.
-        joints_deg: what the joints are said to be; a stand-in has no joints.
+        joints_deg: what the joints are said to be; a fake has no joints.
         digital_inputs: levels of the digital inputs by controller time.
         cut: what to do for the faults that concern the link.
         rate: controller seconds a host second; the watchdog watches the host, in its seconds.
@@ -140,7 +140,7 @@ class UrProgram:
             self.doubles_in[index] = float(value)
 
     def forgive(self, seconds: float) -> None:
-        """The stand-in itself stood still for `seconds` of controller time and heard nobody."""
+        """The fake itself stood still for `seconds` of controller time and heard nobody."""
         self._written_s += seconds
 
     def script(self, text: str) -> None:

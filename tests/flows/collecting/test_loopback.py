@@ -36,7 +36,7 @@ LABELS_AGREE_MS = 20.0
 
 @dataclass(frozen=True)
 class Taken:
-    """One committed trial, what its stand-ins sent, and the trial that the mock made of it."""
+    """One committed trial, what its fakes sent, and the trial that the mock made of it."""
 
     recording: Recording
     by_mock: Recording

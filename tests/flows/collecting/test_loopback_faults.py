@@ -45,7 +45,7 @@ WATCHING_S = 30.0
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Loopback, RunRequest]]:
-    """Stand-ins for all tests here, and the campaign of which each takes the next trial."""
+    """Fakes for all tests here, and the campaign of which each takes the next trial."""
     folder = tmp_path_factory.mktemp("faults")
     data = quick(LENGTH_MM, SPEED_MM_S, repetitions=len(CASES) + 2)
     run_request = request_in(folder / "begin", data, rig_yaml(folder))

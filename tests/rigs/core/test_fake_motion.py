@@ -1,4 +1,4 @@
-"""A stand-in's tool centre point goes straight, at constant speed, and stops on its line."""
+"""A fake's tool centre point goes straight, at constant speed, and stops on its line."""
 
 from __future__ import annotations
 

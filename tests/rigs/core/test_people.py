@@ -8,7 +8,7 @@ import pytest
 
 from sliplab.rigs.core.capabilities import Clock, Operator, Plate, RigError
 from sliplab.rigs.core.host_clock import HostClock
-from sliplab.rigs.core.people import PersonAtPlate, mass_of
+from sliplab.rigs.core.operators import PersonAtPlate, mass_of
 
 
 class Person:

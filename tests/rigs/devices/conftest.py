@@ -17,17 +17,17 @@ from abb_robot_client._egm_protobuf import egm_pb2
 from sliplab.rigs.core.capabilities import Arm, ArmFault, Pose
 from sliplab.rigs.core.pose import distance_mm, quaternion
 from sliplab.rigs.devices.abb.driver import AbbArm
-from sliplab.rigs.devices.abb.fake import AbbStandIn
+from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.basler.fake import emulate
 from sliplab.rigs.devices.ur.driver import UrArm
-from sliplab.rigs.devices.ur.fake import UrStandIn
+from sliplab.rigs.devices.ur.fake import FakeUr
 from sliplab.rigs.devices.ur.settings import UrSettings
 from tests.rigs.waiting import own_address, until
 
-MakeRobot = Callable[..., UrStandIn]
+MakeRobot = Callable[..., FakeUr]
 MakeArm = Callable[..., UrArm]
-MakeAbb = Callable[..., tuple[AbbArm, AbbStandIn]]
+MakeAbb = Callable[..., tuple[AbbArm, FakeAbb]]
 ABB_PORT, EGM_PORT = 8080, 6510
 LIMIT_S, LOOK_S = 60.0, 0.002
 LIMITS: dict[str, Any] = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
@@ -40,21 +40,21 @@ def ur_settings(host: str, **more: Any) -> UrSettings:
 
 @pytest.fixture
 def robot_of() -> Iterator[MakeRobot]:
-    """Makes stand-ins, which are closed after the test."""
+    """Makes fakes, which are closed after the test."""
     with ExitStack() as stack:
 
-        def make(**how: Any) -> UrStandIn:
-            return stack.enter_context(UrStandIn(own_address(), **{"cycle_hz": 125, **how}))
+        def make(**how: Any) -> FakeUr:
+            return stack.enter_context(FakeUr(own_address(), **{"cycle_hz": 125, **how}))
 
         yield make
 
 
 @pytest.fixture
 def arm_on() -> Iterator[MakeArm]:
-    """Makes drivers of stand-ins, which are closed after the test."""
+    """Makes drivers of fakes, which are closed after the test."""
     with ExitStack() as stack:
 
-        def make(robot: UrStandIn, connected: bool = True, **settings: Any) -> UrArm:
+        def make(robot: FakeUr, connected: bool = True, **settings: Any) -> UrArm:
             arm = UrArm(ur_settings(robot.host, **settings))
             stack.callback(arm.close)
             if connected:
@@ -78,7 +78,7 @@ def egm_message(number: int, t_s: float | None, pose: Pose) -> egm_pb2.EgmRobot:
 
 
 def mm_after_kill(program: str, settings: str, robot: Any, limit_s: float) -> float:
-    """How far a stand-in's arm goes at 40 mm/s once the program that moves it is killed (mm)."""
+    """How far a fake's arm goes at 40 mm/s once the program that moves it is killed (mm)."""
     with subprocess.Popen([sys.executable, "-c", program, settings]) as process:
         try:
             until(lambda: robot.pose().xyz_mm[1] > 5.0, 60.0)
@@ -114,12 +114,12 @@ def closed(arm: Arm) -> None:
 
 @pytest.fixture
 def abb_pair() -> Iterator[MakeAbb]:
-    """Makes an ABB stand-in and the driver on it; both are closed after the test."""
+    """Makes an ABB fake and the driver on it; both are closed after the test."""
     with ExitStack() as stack:
 
-        def make(connected: bool = True, arm: Any = None, **how: Any) -> tuple[AbbArm, AbbStandIn]:
+        def make(connected: bool = True, arm: Any = None, **how: Any) -> tuple[AbbArm, FakeAbb]:
             host = own_address()
-            robot = AbbStandIn(host, ABB_PORT, (host, EGM_PORT), **{"cycle_hz": 125, **how})
+            robot = FakeAbb(host, ABB_PORT, (host, EGM_PORT), **{"cycle_hz": 125, **how})
             stack.enter_context(robot)
             made = AbbArm(abb_settings(host, **(arm or {})))
             stack.callback(closed, made)

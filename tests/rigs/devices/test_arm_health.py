@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth
-from sliplab.rigs.core.fake_faults import Kind
+from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.devices.abb.driver import AbbArm
-from sliplab.rigs.devices.abb.fake import AbbStandIn
-from sliplab.rigs.devices.abb.fake_socket import INFO, RapidStandIn
+from sliplab.rigs.devices.abb.fake import FakeAbb
+from sliplab.rigs.devices.abb.fake_socket import INFO, FakeRapidServer
 from sliplab.rigs.devices.abb.settings import AbbSettings, AbbSocketSettings
 from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
 from sliplab.rigs.devices.ur.fake import VERSION
@@ -37,7 +37,7 @@ def test_a_universal_robot(robot_of: MakeRobot, arm_on: MakeArm) -> None:
 def test_an_abb_by_its_web_services() -> None:
     host = own_address()
     settings = AbbSettings(host=host, rws_port=8080, egm_bind=host, limits=LIMITS)  # type: ignore[arg-type]
-    with AbbStandIn(host, 8080, (host, settings.egm_port)) as robot:
+    with FakeAbb(host, 8080, (host, settings.egm_port)) as robot:
         arm = AbbArm(settings)
         with pytest.raises(ArmFault, match="cannot be asked"):
             arm.health()
@@ -58,7 +58,7 @@ def test_an_abb_by_its_web_services() -> None:
 
 def test_an_abb_behind_a_socket_server() -> None:
     host = own_address()
-    with RapidStandIn(host):
+    with FakeRapidServer(host):
         arm = AbbSocketArm(AbbSocketSettings(host=host, limits=LIMITS))  # type: ignore[arg-type]
         arm.connect()
         try:

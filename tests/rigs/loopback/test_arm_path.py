@@ -1,4 +1,4 @@
-"""A simulated arm that a stand-in's motion moves: the world sees the ramps that it drives."""
+"""A simulated arm that a fake's motion moves: the world sees the ramps that it drives."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplab.rigs.core.capabilities import Pose, RigError, Segment
-from sliplab.rigs.loopback.arm_path import MotionPath
-from sliplab.rigs.mock.geometry import ContactPlane
-from sliplab.rigs.mock.path import TOOL
+from sliplab.rigs.loopback.arm_path import FakeArmPath
+from sliplab.rigs.mock.path import TOOL, ContactPlane
 from sliplab.rigs.mock.settings import MockSettings
 from sliplab.storage.clockmap import ClockMap
 
@@ -22,21 +21,21 @@ AHEAD_NS = 7_000_000_000
 """What the controller's clock shows at the true time 0."""
 
 
-def path_of(ppb: int = 0) -> MotionPath:
-    return MotionPath(PLANE, HOME, ClockMap.line(0, AHEAD_NS, ppb))
+def path_of(ppb: int = 0) -> FakeArmPath:
+    return FakeArmPath(PLANE, HOME, ClockMap.line(0, AHEAD_NS, ppb))
 
 
 def away(x_mm: float, depth_mm: float = -5.0) -> Pose:
     return PLANE.pose(x_mm, 0.0, depth_mm)
 
 
-def gone_mm(path: MotionPath, *t_s: float) -> list[float]:
+def gone_mm(path: FakeArmPath, *t_s: float) -> list[float]:
     """How far from home at true times."""
     states = path.commanded(np.array([round(t * 1e9) for t in t_s], np.int64))
     return [math.dist(state[:3], HOME.xyz_mm) for state in states]
 
 
-def at(path: MotionPath, t_s: float) -> float:
+def at(path: FakeArmPath, t_s: float) -> float:
     """That true time on the controller's clock, s."""
     return AHEAD_NS / 1e9 + t_s
 

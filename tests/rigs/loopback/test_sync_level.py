@@ -10,9 +10,9 @@ import pytest
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.pulse_code import code_bits
 from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-from sliplab.rigs.devices.sync_box.fake import PtySyncBox, Train
+from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-from sliplab.rigs.loopback.sync_level import PULSE_NS, SyncLevel
+from sliplab.rigs.loopback.simulation_server import PULSE_NS, SyncLevel
 from sliplab.storage.clockmap import ClockMap
 from tests.rigs.waiting import until
 
@@ -68,7 +68,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
     def on_train(train: Train | None, sent: int) -> None:
         told.append((train, sent, time.monotonic_ns()))
 
-    with PtySyncBox(on_train=on_train) as wire:
+    with FakeSyncBox(on_train=on_train) as wire:
         box = SerialSyncBox(SyncBoxSettings(port=wire.port))
         box.start(200.0, 99, code)
         until(lambda: wire.pulses >= 20, 5.0)
@@ -91,7 +91,7 @@ def test_a_box_tells_of_its_trains_before_they_begin_and_of_their_end(code: Code
 @pytest.mark.realtime
 def test_an_unplugged_box_ticks_no_more() -> None:
     told: list[Train | None] = []
-    wire = PtySyncBox(on_train=lambda train, sent: told.append(train))
+    wire = FakeSyncBox(on_train=lambda train, sent: told.append(train))
     box = SerialSyncBox(SyncBoxSettings(port=wire.port))
     box.start(100.0, 5)
     wire.close()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.rigs.mock.free_run import FreeRun
 from sliplab.rigs.mock.settings import Clocks, FrameCamera, MockSettings
+from sliplab.rigs.mock.sync import FreeRun
 from sliplab.rigs.mock.world import World
 
 CASES: tuple[list[dict[str, Any]], ...] = (

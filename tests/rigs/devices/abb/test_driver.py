@@ -1,4 +1,4 @@
-"""The ABB driver on a stand-in through the real clients: slides, streams, faults, bounds."""
+"""The ABB driver on a fake through the real clients: slides, streams, faults, bounds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import Fault, Kind, Stage
 from sliplab.rigs.core.guard import WorkspaceError
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.abb import driver

@@ -1,4 +1,4 @@
-"""The stand-in reads what the real client writes, and refuses the rest."""
+"""The fake reads what the real client writes, and refuses the rest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from abb_motion_program_exec.commands.rapid_types import (
     tooldata,
 )
 
-from sliplab.rigs.devices.abb.fake_program import MoveL, ProgramError, Wait, read_program
+from sliplab.rigs.devices.abb.fake import MoveL, ProgramError, Wait, read_program
 
 LOAD = loaddata(0.4, [0, 0, 50], [1, 0, 0, 0], 0, 0, 0)
 SPEED = speeddata(1.6, 500, 5000, 1000)

@@ -1,4 +1,4 @@
-"""The driver of the RAPID socket server on its stand-in: what it can do, and what it cannot."""
+"""The driver of the RAPID socket server on its fake: what it can do, and what it cannot."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.abb import socket_driver as driver
-from sliplab.rigs.devices.abb.fake_socket import HOME, RapidStandIn
+from sliplab.rigs.devices.abb.fake_socket import HOME, FakeRapidServer
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
 from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.realtime
 
 BUSY_S = 3.0
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
-MakePair = Callable[..., tuple[AbbSocketArm, RapidStandIn]]
+MakePair = Callable[..., tuple[AbbSocketArm, FakeRapidServer]]
 
 
 def at(y_mm: float) -> Pose:
@@ -47,11 +47,11 @@ def settings(host: str, **more: Any) -> AbbSocketSettings:
 
 @pytest.fixture
 def pair() -> Iterator[MakePair]:
-    """Makes a stand-in and the driver on it; both are closed after the test."""
+    """Makes a fake and the driver on it; both are closed after the test."""
     with ExitStack() as stack:
 
-        def make(connected: bool = True, **how: Any) -> tuple[AbbSocketArm, RapidStandIn]:
-            robot = stack.enter_context(RapidStandIn(own_address(), **how))
+        def make(connected: bool = True, **how: Any) -> tuple[AbbSocketArm, FakeRapidServer]:
+            robot = stack.enter_context(FakeRapidServer(own_address(), **how))
             arm = AbbSocketArm(settings(robot.host))
             stack.callback(closed, arm)
             if connected:

@@ -1,4 +1,4 @@
-"""The module for a real controller and what the stand-in makes of it, held together."""
+"""The module for a real controller and what the fake makes of it, held together."""
 
 from __future__ import annotations
 

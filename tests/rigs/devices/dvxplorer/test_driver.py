@@ -1,4 +1,4 @@
-"""The real dv-processing against a stand-in in another process: what one sends, the other has."""
+"""The real dv-processing against a fake in another process: what one sends, the other has."""
 
 from __future__ import annotations
 

@@ -16,12 +16,11 @@ import serial
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import RigError, SyncBox
 from sliplab.rigs.core.pulse_code import code_bits
-from sliplab.rigs.devices.sync_box.driver import SerialSyncBox
-from sliplab.rigs.devices.sync_box.fake import PtySyncBox
+from sliplab.rigs.devices.sync_box.driver import SerialSyncBox, Train
+from sliplab.rigs.devices.sync_box.fake import FakeSyncBox
 from sliplab.rigs.devices.sync_box.line import LineReader, seal, unseal
 from sliplab.rigs.devices.sync_box.port import JOIN_S, TRIES, SyncBoxFault
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
-from sliplab.rigs.devices.sync_box.train import Train
 
 pytestmark = pytest.mark.realtime
 
@@ -33,19 +32,19 @@ SLACK_S = 0.5
 
 
 @pytest.fixture
-def wire() -> Iterator[PtySyncBox]:
-    with PtySyncBox(exposure_us=77) as wire:
+def wire() -> Iterator[FakeSyncBox]:
+    with FakeSyncBox(exposure_us=77) as wire:
         yield wire
 
 
 @pytest.fixture
-def box(wire: PtySyncBox) -> Iterator[SerialSyncBox]:
+def box(wire: FakeSyncBox) -> Iterator[SerialSyncBox]:
     box = SerialSyncBox(settings(wire))
     yield box
     box.close()
 
 
-def settings(wire: PtySyncBox) -> SyncBoxSettings:
+def settings(wire: FakeSyncBox) -> SyncBoxSettings:
     return SyncBoxSettings(port=wire.port, answer_s=ANSWER_S, boot_s=1.0, silence_s=SILENCE_S)
 
 
@@ -116,8 +115,8 @@ def test_exposures_are_stamped(box: SerialSyncBox) -> None:
     assert np.array_equal(exposures, np.arange(len(exposures)) * 5_000_000 + 77_000)
 
 
-def test_clock_reads_bracket_the_boxs_clock(wire: PtySyncBox, box: SerialSyncBox) -> None:
-    """The stand-in's clock is the host's own, so what it showed must lie between the two."""
+def test_clock_reads_bracket_the_boxs_clock(wire: FakeSyncBox, box: SerialSyncBox) -> None:
+    """The fake's clock is the host's own, so what it showed must lie between the two."""
     box.start(100.0, SEED)
     reads = [box.read_clock() for _ in range(50)]
     device = np.array([read.device_ns[0] for read in reads])
@@ -135,7 +134,7 @@ def test_before_the_first_start_the_clock_counts_from_power_on(box: SerialSyncBo
 def test_the_clock_may_be_anybodys() -> None:
     """A scene can drive it: nothing is sent until its time has come."""
     now = [5_000_000_000]
-    with PtySyncBox(lambda: now[0]) as wire:
+    with FakeSyncBox(lambda: now[0]) as wire:
         box = SerialSyncBox(settings(wire))
         box.start(10.0, 1, "regular")
         assert len(box.read_pulses()) == 0
@@ -148,7 +147,7 @@ def test_the_clock_may_be_anybodys() -> None:
 
 
 def test_a_reset_is_told_at_once_and_the_next_start_works(
-    wire: PtySyncBox, box: SerialSyncBox
+    wire: FakeSyncBox, box: SerialSyncBox
 ) -> None:
     box.start(100.0, SEED)
     pulses_of(box, 3)
@@ -161,14 +160,14 @@ def test_a_reset_is_told_at_once_and_the_next_start_works(
     assert pulses_of(box, 1)[0] == 0
 
 
-def test_a_reset_whose_word_is_lost_is_silence(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_a_reset_whose_word_is_lost_is_silence(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
     wire.corrupt(1)
     wire.reset()
     assert "no pulse reported" in fault_of(box.read_pulses, 0.16 + SILENCE_S)
 
 
-def test_a_clock_that_falls_back_is_a_reset(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_a_clock_that_falls_back_is_a_reset(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     threading.Event().wait(0.05)
     box.read_clock()
     wire.corrupt(1)
@@ -177,7 +176,7 @@ def test_a_clock_that_falls_back_is_a_reset(wire: PtySyncBox, box: SerialSyncBox
         box.read_clock()
 
 
-def test_silence_ends_a_train(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_silence_ends_a_train(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
     pulses_of(box, 3)
     wire.silence()
@@ -187,7 +186,9 @@ def test_silence_ends_a_train(wire: PtySyncBox, box: SerialSyncBox) -> None:
     assert pulses_of(box, 1)[0] == 0
 
 
-def test_a_host_that_was_busy_has_not_heard_a_silence(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_a_host_that_was_busy_has_not_heard_a_silence(
+    wire: FakeSyncBox, box: SerialSyncBox
+) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 3)
     port = box._port
@@ -200,14 +201,14 @@ def test_a_host_that_was_busy_has_not_heard_a_silence(wire: PtySyncBox, box: Ser
 
 
 @pytest.mark.parametrize("ask", ["read_clock", "stop"])
-def test_no_answer_is_a_fault(wire: PtySyncBox, box: SerialSyncBox, ask: str) -> None:
+def test_no_answer_is_a_fault(wire: FakeSyncBox, box: SerialSyncBox, ask: str) -> None:
     box.start(100.0, SEED)
     wire.silence()
     text = fault_of(getattr(box, ask), TRIES * ANSWER_S)
     assert "start the trial again" in text
 
 
-def test_one_garbled_answer_is_asked_for_again(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_one_garbled_answer_is_asked_for_again(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.connect()
     wire.corrupt(1)
     assert len(box.read_clock()) == 1
@@ -218,7 +219,7 @@ def test_one_garbled_answer_is_asked_for_again(wire: PtySyncBox, box: SerialSync
     assert len(box.read_clock()) == 1
 
 
-def test_a_garbled_answer_to_go_loses_no_pulse(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_a_garbled_answer_to_go_loses_no_pulse(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     say = wire._say
 
     def garble_go(body: str) -> None:
@@ -237,7 +238,7 @@ def test_a_garbled_answer_to_go_loses_no_pulse(wire: PtySyncBox, box: SerialSync
     assert box.losses.lines == 1
 
 
-def test_garbled_reports_are_missing_and_counted(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_garbled_reports_are_missing_and_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 3)
     wire.corrupt(40)
@@ -248,7 +249,7 @@ def test_garbled_reports_are_missing_and_counted(wire: PtySyncBox, box: SerialSy
     assert box.losses.told_by_box == 0
 
 
-def test_dropped_reports_are_counted(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_dropped_reports_are_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 3)
     wire.drop(40)
@@ -262,7 +263,7 @@ def test_dropped_reports_are_counted(wire: PtySyncBox, box: SerialSyncBox) -> No
     assert not box.losses, "a new train counts anew"
 
 
-def test_reports_missing_at_the_end_are_counted(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_reports_missing_at_the_end_are_counted(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(200.0, 1, "regular")
     pulses_of(box, 3)
     wire.drop(1 << 20)
@@ -272,7 +273,7 @@ def test_reports_missing_at_the_end_are_counted(wire: PtySyncBox, box: SerialSyn
 
 
 def test_what_nobody_reads_is_counted_and_not_kept(
-    wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
+    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.driver.MOST_WAITING", 5)
     box.start(1000.0, SEED)
@@ -287,7 +288,7 @@ def test_what_nobody_reads_is_counted_and_not_kept(
 
 
 def test_what_the_box_refuses_is_said(
-    wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
+    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.MOST_HZ", 50.0)
     with pytest.raises(SyncBoxFault, match="refuses ARM: rate must be"):
@@ -301,14 +302,14 @@ def test_what_the_box_refuses_is_said(
         seal("ARM 100 4294967295 0 lfsr"), seal("FLY"), seal("T?"), seal("T? x"),
     ],
 )  # fmt: skip
-def test_the_stand_in_survives_nonsense(wire: PtySyncBox, box: SerialSyncBox, line: bytes) -> None:
+def test_the_stand_in_survives_nonsense(wire: FakeSyncBox, box: SerialSyncBox, line: bytes) -> None:
     with serial.Serial(wire.port, timeout=1.0) as port:
         port.write(line)
         assert port.readline().startswith(b"E ")
     box.connect()
 
 
-def test_an_unplugged_box(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_an_unplugged_box(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     box.start(100.0, SEED)
     wire.close()
     assert "connection broke" in fault_of(box.read_pulses, 0.3)
@@ -321,13 +322,13 @@ def test_no_such_port() -> None:
         SerialSyncBox(SyncBoxSettings(port="/dev/nothing")).connect()
 
 
-def test_nobody_answers(wire: PtySyncBox, box: SerialSyncBox) -> None:
+def test_nobody_answers(wire: FakeSyncBox, box: SerialSyncBox) -> None:
     wire.silence()
     assert "no answer on" in fault_of(box.connect, 1.0 + ANSWER_S)
 
 
 def test_another_device_answers(
-    wire: PtySyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
+    wire: FakeSyncBox, box: SerialSyncBox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sliplab.rigs.devices.sync_box.fake.NAME", "sliplab-sync-box 99")
     with pytest.raises(SyncBoxFault, match="sliplab-sync-box 99"):
@@ -394,7 +395,7 @@ def test_a_foreign_device_that_chatters_without_end_is_no_sync_box(what: str) ->
 
 
 def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
-    wire: PtySyncBox, box: SerialSyncBox
+    wire: FakeSyncBox, box: SerialSyncBox
 ) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 5)
@@ -409,7 +410,7 @@ def test_chatter_in_the_middle_of_a_train_is_counted_and_ends_in_silence(
      "P -1 1 10000", "D x", "D -3", "D 1 2", "OK STOP -1", "T 1 1e3", "X 0 0x10"],
 )  # fmt: skip
 def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
-    wire: PtySyncBox, box: SerialSyncBox, line: str
+    wire: FakeSyncBox, box: SerialSyncBox, line: str
 ) -> None:
     box.start(200.0, SEED)
     pulses_of(box, 3)
@@ -426,7 +427,7 @@ def test_a_line_that_is_garbled_and_passes_its_checksum_changes_nothing(
 
 @pytest.mark.parametrize("us", ["999999999", "99999999999999", "99999999999999999999"])
 def test_a_garbled_exposure_far_ahead_costs_one(
-    wire: PtySyncBox, box: SerialSyncBox, us: str
+    wire: FakeSyncBox, box: SerialSyncBox, us: str
 ) -> None:
     """Believed, it would come after all that follow, and none of them could be."""
     say = wire._say
@@ -446,7 +447,7 @@ def test_a_garbled_exposure_far_ahead_costs_one(
 def test_a_clock_that_falls_back_in_a_train_ends_it(box: SerialSyncBox) -> None:
     """Of a board whose 32 bits of microseconds wrap after 71.6 min, say."""
     shift = [0]
-    with PtySyncBox(lambda: time.monotonic_ns() - shift[0]) as wire:
+    with FakeSyncBox(lambda: time.monotonic_ns() - shift[0]) as wire:
         box = SerialSyncBox(settings(wire))
         threading.Event().wait(0.3)
         box.start(200.0, SEED)

@@ -1,4 +1,4 @@
-"""The UR driver on a stand-in through the real ur_rtde: slides, streams, guards, stops."""
+"""The UR driver on a fake through the real ur_rtde: slides, streams, guards, stops."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
 from sliplab.rigs.devices.ur.driver import UrArm
 from sliplab.rigs.devices.ur.fake import HOME

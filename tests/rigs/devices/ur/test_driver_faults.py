@@ -19,7 +19,7 @@ from collections.abc import Callable
 import pytest
 
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
-from sliplab.rigs.core.fake_faults import PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.core.fakes import PACKETS_LOST, Fault, Kind, Stage
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.ur import control as ur_control
 from sliplab.rigs.devices.ur import driver

@@ -1,6 +1,6 @@
-"""The maker-independent client ur_rtde takes the stand-in for a real controller.
+"""The maker-independent client ur_rtde takes the fake for a real controller.
 
-The client runs in a process of its own: its constructors hold Python's global lock, so a stand-in
+The client runs in a process of its own: its constructors hold Python's global lock, so a fake
 in the same process could never answer them.
 """
 
@@ -14,9 +14,9 @@ from collections.abc import Iterator
 import pytest
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_faults import Kind
+from sliplab.rigs.core.fakes import Kind
 from sliplab.rigs.devices.ur import ports as ur_ports
-from sliplab.rigs.devices.ur.fake import HOME, UrStandIn
+from sliplab.rigs.devices.ur.fake import HOME, FakeUr
 from sliplab.rigs.devices.ur.rtde import RtdeError, RtdeReader
 from tests.rigs.waiting import own_address, until
 
@@ -33,12 +33,12 @@ said = {}
 
 
 @pytest.fixture
-def robot() -> Iterator[UrStandIn]:
-    with UrStandIn(own_address()) as stand_in:
+def robot() -> Iterator[FakeUr]:
+    with FakeUr(own_address()) as stand_in:
         yield stand_in
 
 
-def client(robot: UrStandIn, script: str) -> dict[str, object]:
+def client(robot: FakeUr, script: str) -> dict[str, object]:
     """What a script that speaks through the real client found out."""
     done = subprocess.run(
         [sys.executable, "-c", HEAD + script + "\nprint('SAID', json.dumps(said))", robot.host],
@@ -53,7 +53,7 @@ def client(robot: UrStandIn, script: str) -> dict[str, object]:
     return found
 
 
-def test_the_real_client_moves_stops_and_sets_things(robot: UrStandIn) -> None:
+def test_the_real_client_moves_stops_and_sets_things(robot: FakeUr) -> None:
     found = client(
         robot,
         """
@@ -81,7 +81,7 @@ said["far"] = control.isPoseWithinSafetyLimits([2.0, 0, 0, 0, 0, 0])
     assert robot.program.payload_kg == 0.5
 
 
-def test_registers_belong_to_the_first_client(robot: UrStandIn) -> None:
+def test_registers_belong_to_the_first_client(robot: FakeUr) -> None:
     found = client(
         robot,
         """
@@ -97,7 +97,7 @@ said["first"] = first.moveL(home, 0.1, 1.0)
     assert found["first"] is True
 
 
-def test_a_protective_stop_lasts_until_somebody_unlocks_it(robot: UrStandIn) -> None:
+def test_a_protective_stop_lasts_until_somebody_unlocks_it(robot: FakeUr) -> None:
     found = client(
         robot,
         """
@@ -113,7 +113,7 @@ said["refused"] = control.moveL(home, 0.1, 1.0)
     assert ur_ports.dashboard(robot.host, "safetystatus", 1.0) == "Safetystatus: NORMAL"
 
 
-def test_the_watchdog_ends_the_program_of_a_client_that_went_silent(robot: UrStandIn) -> None:
+def test_the_watchdog_ends_the_program_of_a_client_that_went_silent(robot: FakeUr) -> None:
     client(
         robot,
         """
@@ -130,7 +130,7 @@ os._exit(0)  # as if it had been killed
     assert robot.pose().xyz_mm[1] < 5.0
 
 
-def test_scripts_end_what_runs_and_may_stop_the_arm(robot: UrStandIn) -> None:
+def test_scripts_end_what_runs_and_may_stop_the_arm(robot: FakeUr) -> None:
     robot.motion.move(Pose((400.0, 50.0, 300.0), HOME.rotvec_deg), 10.0, 100.0, robot.clock.now_s())
     until(lambda: robot.pose().xyz_mm[1] > 1.0, 2.0)
     ur_ports.send_script(robot.host, "stopl(1.0)\n", 1.0)
@@ -138,7 +138,7 @@ def test_scripts_end_what_runs_and_may_stop_the_arm(robot: UrStandIn) -> None:
     assert robot.pose().xyz_mm[1] < 49.0
 
 
-def test_a_silent_controller_takes_connections_and_says_nothing(robot: UrStandIn) -> None:
+def test_a_silent_controller_takes_connections_and_says_nothing(robot: FakeUr) -> None:
     robot.happen(Kind.SILENCE)
     with pytest.raises(ur_ports.PortError):
         ur_ports.dashboard(robot.host, "running", 0.2)
@@ -146,7 +146,7 @@ def test_a_silent_controller_takes_connections_and_says_nothing(robot: UrStandIn
     assert ur_ports.dashboard(robot.host, "running", 1.0) == "Program running: false"
 
 
-def test_in_local_control_nothing_from_outside_runs(robot: UrStandIn) -> None:
+def test_in_local_control_nothing_from_outside_runs(robot: FakeUr) -> None:
     robot.set_remote(False)
     assert ur_ports.dashboard(robot.host, "is in remote control", 1.0) == "false"
     assert ur_ports.dashboard(robot.host, "stop", 1.0) != "Stopped"
@@ -170,7 +170,7 @@ def _answers(host: str) -> bool:
 
 
 @pytest.mark.parametrize("call", ["speedL([0.01, 0, 0, 0, 0, 0], 0.1, 0.1)", "zeroFtSensor()"])
-def test_a_command_that_is_not_simulated_fails(robot: UrStandIn, call: str) -> None:
+def test_a_command_that_is_not_simulated_fails(robot: FakeUr, call: str) -> None:
     found = client(
         robot,
         f"""
@@ -188,11 +188,11 @@ said["runs"] = control.isProgramRunning()
 
 
 @pytest.mark.parametrize("request_", ["play", "pause", "power on", "unlock protective stop"])
-def test_a_request_that_cannot_be_done_says_so(robot: UrStandIn, request_: str) -> None:
+def test_a_request_that_cannot_be_done_says_so(robot: FakeUr, request_: str) -> None:
     assert ur_ports.dashboard(robot.host, request_, 1.0) == f"Failed to execute: {request_}"
 
 
-def test_outputs_that_it_does_not_know_are_not_found(robot: UrStandIn) -> None:
+def test_outputs_that_it_does_not_know_are_not_found(robot: FakeUr) -> None:
     reader = RtdeReader(robot.host, 1.0, 1.0)
     with pytest.raises(RtdeError, match="does not know actual_mood"):
         reader.open(["timestamp", "actual_mood"], 125)
@@ -206,7 +206,7 @@ def test_outputs_that_it_does_not_know_are_not_found(robot: UrStandIn) -> None:
         (Kind.POWER_OFF, "NORMAL", "POWER_OFF"),
     ],
 )
-def test_it_says_what_state_it_is_in(robot: UrStandIn, kind: Kind, safety: str, mode: str) -> None:
+def test_it_says_what_state_it_is_in(robot: FakeUr, kind: Kind, safety: str, mode: str) -> None:
     robot.happen(kind)
     assert ur_ports.dashboard(robot.host, "safetystatus", 1.0) == f"Safetystatus: {safety}"
     assert ur_ports.dashboard(robot.host, "robotmode", 1.0) == f"Robotmode: {mode}"

@@ -17,7 +17,7 @@ from sliplab.rigs.core.capabilities import (
     Operator,
     SyncBox,
 )
-from sliplab.rigs.core.fake_faults import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import Fault, Kind, Stage
 from sliplab.rigs.core.plate_frame import PlateFrame
 from sliplab.rigs.core.rig import Rig
 from tests.rigs.devices.conftest import MakeArm, MakeRobot
