@@ -26,6 +26,7 @@ from sliplab.storage.schema.trial import Clocks, Counts, Gate
 from sliplab.storage.streams import F64, I64, PathSegment
 from sliplab.storage.trials.columns import TRACKS
 from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.writer import DATA
 
 UNVOUCHED_S = 0.3
@@ -134,6 +135,12 @@ def assess(
         pulses=len(streams.sync_pulses),
     )
     return Assessment(sync.record(), results, counts)
+
+
+def hold_rate(recording: Recording) -> float:
+    """Return events per second while the arm held still in contact, recorded part."""
+    start, end = recording.step("hold")
+    return len(recording.events(start, end)) / ((end - start) / 1e9)
 
 
 def _sync_gates(

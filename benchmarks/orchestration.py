@@ -1,6 +1,6 @@
 """What Prefect costs a collection a trial, beside a bare loop and Bluesky; catalogue and start-up.
 
-864 empty trials go through the task of `flows.collecting.collect`, 25 a task as on a mock rig
+864 empty trials go through the task of `flows.collect`, 25 a task as on a mock rig
 (`batched_ms`) and one a task as on a real one (`per_trial_ms`). Both are milliseconds a trial over
 the bare loop, until the server has kept every task run as completed, and with what an empty flow
 right behind takes longer than one after that. `bluesky_ms` is a run of the RunEngine a trial (open,
@@ -65,7 +65,7 @@ def _flows() -> Any:
     from prefect import flow
     from prefect.runtime import flow_run
 
-    from sliplab.flows.collecting.collect import take_trials
+    from sliplab.flows.collect import take_trials
 
     @flow(name="collect", validate_parameters=False, persist_result=False)
     def collect(wanted: Opaque[tuple[range, int, Any]]) -> str:
@@ -86,7 +86,7 @@ def _flows() -> Any:
 
 
 def _compare(trials: int, runs: int) -> Figures:
-    from sliplab.flows.collecting.collect import MOCK_BATCH
+    from sliplab.flows.collect import MOCK_BATCH
 
     collect, empty = _flows()
     every = range(trials)

@@ -454,7 +454,7 @@ def collect(
     )  # fmt: skip
     with stopping.signals(), extras.named("collect"):
         prepare_store(run_request.store)
-        from sliplab.flows.collecting.collect import collect as take
+        from sliplab.flows.collect import collect as take
 
         take(run_request)
     return open_store(run_request.store)

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling import label_check
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.label_check import check_labels

@@ -118,7 +118,7 @@ def collect(
     prepare_store(store)
     if run_request.wanted(Store(store).campaign(run_request.campaign)):
         orchestration.begin()  # starts beside all that is imported below
-    from sliplab.flows.collecting.collect import collect as run
+    from sliplab.flows.collect import collect as run
 
     result = run(run_request)
     if not result["taken"]:

@@ -16,7 +16,7 @@ from sliplab.flows.running import console
 from sliplab.flows.steps import prepare_store
 
 if TYPE_CHECKING:
-    from sliplab.flows.collecting.controlling import Outcome
+    from sliplab.flows.collecting.requests import Outcome
     from sliplab.storage.trials.control import Kind
 
 app = typer.Typer()
@@ -63,14 +63,14 @@ def stop(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Stop a running collection now, the arm first, as Ctrl-C in its terminal would."""
-    from sliplab.flows.collecting.halting import halt
+    from sliplab.flows.collecting.requests import halt
     from sliplab.storage.trials.store import Store
 
     opened = Store.open(store)
     halted = halt(store)  # before anything that takes long to load
-    from sliplab.flows.collecting import controlling
+    from sliplab.flows.collecting import requests
 
-    outcome = controlling.note_stop(opened, *halted, who=who, why=why, limit_s=wait)
+    outcome = requests.note_stop(opened, *halted, who=who, why=why, limit_s=wait)
     words = "nothing ran" if outcome.holder is None else "stopped: every committed trial is kept"
     _finish([outcome], as_json, words)
 
@@ -96,26 +96,26 @@ def again(
 
 
 def _request(store: Path, kind: Kind, who: str, why: str, wait: float) -> Outcome:
-    from sliplab.flows.collecting import controlling
+    from sliplab.flows.collecting import requests
     from sliplab.storage.trials.store import Store
 
-    return controlling.request(Store.open(store), kind, who=who, why=why, limit_s=wait)
+    return requests.ask(Store.open(store), kind, who=who, why=why, limit_s=wait)
 
 
 def _decide(
     store: Path, kind: Kind, trials: list[str], campaign: str | None, who: str, why: str,
     wait: float, as_json: bool,
 ) -> None:  # fmt: skip
-    from sliplab.flows.collecting import controlling
+    from sliplab.flows.collecting import requests
     from sliplab.protocols.errors import InputError
     from sliplab.storage.trials.store import Store
 
     if not why.strip():
         raise InputError("--why", "", why, "must say something: it is kept with the trial")
     opened = Store.open(store)
-    by_campaign = controlling.known_trials(opened, [campaign] if campaign else None, trials)
+    by_campaign = requests.known_trials(opened, [campaign] if campaign else None, trials)
     outcomes = [
-        controlling.request(opened, kind, who=who, why=why, campaign=name, trials=ids, limit_s=wait)
+        requests.ask(opened, kind, who=who, why=why, campaign=name, trials=ids, limit_s=wait)
         for name, ids in by_campaign.items()
     ]
     lines = [

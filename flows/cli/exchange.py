@@ -34,7 +34,7 @@ def import_(
     """
     from dataclasses import replace
 
-    from sliplab.flows.collecting.run_session import owned
+    from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.formats.find import KINDS, kind_of, trials_in
     from sliplab.storage.formats.import_trials import import_trials
     from sliplab.storage.names import safe_name
@@ -52,7 +52,7 @@ def import_(
     found = trials_in(where, kind)
     if simulated:
         found = (replace(trial, simulated=True) for trial in found)
-    with owned(opened):
+    with store_lock(opened):
         result = import_trials(opened, name, found, where, kind, lambda trial: console.say(trial))
     for text in result.get("warnings", ()):
         console.say(f"warning: {text}")

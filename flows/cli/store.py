@@ -108,9 +108,9 @@ def verify(
         problems = look(opened, lambda name: bar.advance(1, name))
     moved: list[str] = []
     if quarantine and any(item.trial for item in problems):
-        from sliplab.flows.collecting.run_session import owned
+        from sliplab.flows.collecting.requests import store_lock
 
-        with owned(opened):
+        with store_lock(opened):
             moved = set_aside(opened, problems)
         console.say(f"{len(moved)} damaged trials are in quarantine; `sliplab collect` takes them")
     if as_json:
@@ -196,7 +196,7 @@ def push(
 
     It may run while trials are taken. Keys and addresses of servers come from the environment.
     """
-    from sliplab.flows.collecting.halting import holder_of
+    from sliplab.flows.collecting.requests import holder_of
     from sliplab.flows.running import stopping
     from sliplab.storage.objects import Remote
     from sliplab.storage.remote.push import PushOptions

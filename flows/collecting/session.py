@@ -1,32 +1,41 @@
-"""One session at a rig: takes trials one after the other and commits the good ones.
+"""One session at a rig: locks, recovery after a crash, one trial after the other, the trial gate.
 
-The session knows nothing of Prefect; `flows.collecting.collect` decides in what pieces it is
-driven. What is done is what the store holds, so a session can die at any instruction and the next
-one goes on.
+`run_session` opens a session: it holds the store and the rig, cleans up what a crash left, and
+builds the rig. `Session` takes trials and commits the good ones; `TrialGate` decides between two
+trials whether the next one may begin. None of them knows Prefect: `flows.collect` decides in what
+batches trials are taken. What is done is what the store holds, so a session may die at any
+instruction and the next one goes on.
 """
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import socket
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from typing import Any
 
 from sliplab.analysis.quality import Assessment, Motion, assess
-from sliplab.flows.collecting.trial_gate import TrialGate
-from sliplab.flows.running import stopping
+from sliplab.flows.collecting.requests import CampaignStopped, carry_out, store_lock
+from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign, pending_trials
+from sliplab.flows.running import console, stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer
+from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested, TrialRun
 from sliplab.rigs.rig_file import RigFile
+from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.files import sweep_temporary
 from sliplab.storage.schema.trial import (
     Geometry,
     Provenance,
@@ -36,10 +45,108 @@ from sliplab.storage.schema.trial import (
     TrialRecord,
 )
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Campaign
+from sliplab.storage.trials import control, decisions
+from sliplab.storage.trials.control import Request
+from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.writer import TrialWriter
 
+PAUSE_LIMIT_S = 12 * 3600.0
+LOOK_S = 0.5
+"""How often a paused collection checks whether it may go on."""
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
+
+
+class WindowOver(CampaignStopped):
+    """The time window of the collection is over; the next collection goes on."""
+
+
+@dataclass(frozen=True)
+class RunSession:
+    """An open session and its work.
+
+    Attributes:
+        trials: those to take.
+        left_out: number of other trials that the store lacks and that were not asked for.
+    """
+
+    session: Session
+    gate: TrialGate
+    trials: list[Trial]
+    left_out: int = 0
+
+
+@contextmanager
+def run_session(run_request: RunRequest) -> Iterator[RunSession]:
+    """Open a session for a collection; the rig is closed when the block ends.
+
+    Raises:
+        Locked: somebody else collects into the store, or uses the rig.
+        StoreError: its disk is full, read-only or failing.
+        CampaignStopped: reference trials had drifted.
+    """
+    store = Store.create(run_request.store)
+    with store_lock(store, collects=run_request.campaign):
+        campaign = _recover(store, run_request)
+        gate = TrialGate(run_request, store, campaign)
+        gate.begin()
+        with held(run_request.rig, store.folder):
+            rig = build_rig(run_request.rig)
+            rig.should_stop = stopping.requested
+            trials = run_request.wanted(campaign)
+            left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
+            campaign.add_bench_record(_session_record(run_request))
+            session = Session(
+                run_request.plan, run_request.rig, rig, campaign, run_request.metadata.operator
+            )
+            session.gate, gate.fresh_start = gate, session.fresh_start
+            try:
+                yield RunSession(session, gate, trials, left_out)
+            finally:
+                rig.close()
+
+
+def refresh(run_request: RunRequest) -> Campaign:
+    """Recover the store and write the campaign's description, where there is nothing to take."""
+    store = Store.create(run_request.store)
+    with store_lock(store):
+        return _recover(store, run_request)
+
+
+def _recover(store: Store, run_request: RunRequest) -> Campaign:
+    """Clean up after a crash, and carry out open requests."""
+    clean_up(store)
+    campaign = describe_campaign(store, run_request)
+    campaign.sweep()
+    carry_out(store)
+    return campaign
+
+
+def clean_up(store: Store) -> None:
+    """Delete the temporary files that killed programs left outside the campaigns."""
+    sweep_temporary(store.folder)
+    sweep_temporary(store.folder / control.FOLDER)
+    derived = store.folder / "derived"
+    folders = [store.folder / "models", store.folder / "report", derived]
+    if derived.is_dir():
+        folders += [path for path in derived.rglob("*") if path.is_dir()]
+    for folder in folders:
+        sweep_temporary(folder)
+
+
+def _session_record(run_request: RunRequest) -> dict[str, Any]:
+    """Return the metadata of one session at the rig, as the store keeps it."""
+    began = datetime.now(UTC)
+    skin = run_request.rig.skin
+    return {
+        "began": began.isoformat(timespec="seconds"),
+        **asdict(run_request.metadata),
+        "rig": run_request.rig.name,
+        "sensor": run_request.rig.sensor,
+        "skin": skin.serial,
+        "calibration": run_request.rig.calibration.model_dump(mode="json", exclude_none=True),
+        "skin_age_days": None if skin.made is None else (began.date() - skin.made).days,
+        "simulated": run_request.rig.simulated,
+    }
 
 
 @dataclass
@@ -48,7 +155,8 @@ class Session:
 
     Attributes:
         on_trial: called after each trial with it and ``committed``, ``set aside`` or ``skipped``.
-        gate: the trial gate, asked before each attempt and notified of each trial, if there is one.
+        gate: asked before each attempt and notified after each trial, if there is one.
+        taken, retaken: attempts so far, and those of them that repeat one.
     """
 
     plan: Plan
@@ -65,12 +173,12 @@ class Session:
     _zero_slot: int | None = None
 
     def take(self, trials: list[Trial]) -> None:
-        """Take `trials`, with what has to be done before each.
+        """Take `trials`, and do before each what the protocol asks for.
 
         Raises:
             RigError: a device failed, or a person did not do what was asked.
             StoreError: the store's disk is full, read-only or failing.
-            CampaignStopped: something that is watched between trials ended the campaign.
+            CampaignStopped: the trial gate ended the campaign.
             KeyboardInterrupt: somebody asked to stop.
         """
         for trial in trials:
@@ -82,7 +190,7 @@ class Session:
             self._before = trial
 
     def fresh_start(self) -> None:
-        """Somebody may have been at the rig: look at plate, skin and depth zero anew."""
+        """Forget what was prepared: after a pause, plate, skin and depth zero may have changed."""
         self._before, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
@@ -97,7 +205,7 @@ class Session:
             self.gate.after(trial, outcome)
 
     def _prepare(self, trial: Trial) -> None:
-        """What the protocol wants before this trial, given what this session did already."""
+        """Do what the protocol asks for before this trial and this session has not done yet."""
         self._change_over(trial)
         for task in self.plan.tasks_before(trial):
             if task.kind == "clean":
@@ -112,7 +220,7 @@ class Session:
                     raise RigError("plate", f"{task.prompt}: the rig finds another mass mounted")
 
     def _warm_and_zero(self, trial: Trial) -> None:
-        """Warm the skin up and find depth zero, as far as that was not done yet."""
+        """Warm up the skin and find depth zero, unless that is done."""
         upkeep = self.plan.protocol.collection.maintenance
         if upkeep.warm_up is not None and not self._warm:
             warm_up = upkeep.warm_up
@@ -131,7 +239,7 @@ class Session:
                 self._zero_slot = slot
 
     def _mounted(self, trial: Trial) -> bool:
-        """Whether the plate that the trial needs hangs on the slider, to a gram."""
+        """Check that the plate that the trial needs hangs on the slider, to a gram."""
         mass = self.plan.mass_kg(trial)
         return mass is None or self.rig.plate is None or abs(self.rig.plate.mass_kg() - mass) < 1e-3
 
@@ -141,85 +249,70 @@ class Session:
 
     def _take(self, trial: Trial) -> None:
         """Take one trial until it passes its gates or its retakes are used up."""
-        collection = self.plan.protocol.collection
-        frame_px = self.rig_file.frame_px(self.plan)
-        attempt = self.campaign.attempts().get(trial.id, 0)
+        retakes = self.plan.protocol.collection.gates.retakes
+        number = self.campaign.attempts().get(trial.id, 0)
         failed = self.campaign.failed_attempts().get(trial.id, 0)
-        while True:
-            writer = self.campaign.begin(
-                trial.id,
-                frame_px,
-                collection.recording.sync_rate,
-                spool=self.rig_file.frame_camera.spool,
-            )
-            started = datetime.now(UTC)
-            try:
-                run = self.rig.run_trial(
-                    self.plan.program(trial),
-                    writer,
-                    hash_integer(trial.seed, attempt),
-                    frame_px,
-                    collection.recording.sync_rate,
-                )
-                folder = writer.seal()
-                found = assess(
-                    folder,
-                    _motion(run),
-                    collection.gates,
-                    self.rig.timing,
-                    collection.recording.sync_rate,
-                    self.rig.frames.mid_exposure_ns if frame_px is not None else None,
-                )
-            except BaseException as error:
-                self._abandon(writer, error)
-                raise
-            self.taken += 1
-            provenance = self._provenance(started)
-            if found.passed:
-                try:
-                    writer.commit(self._record(trial, attempt, run, found, frame_px), provenance)
-                except (OSError, RuntimeError) as error:
-                    self._abandon(writer, error)
-                    raise
-                self._over(trial, "committed")
-                return
-            self._reject(trial, attempt, writer, found, provenance, run, frame_px)
-            attempt += 1
+        while not self._attempt(trial, number):
+            number += 1
             failed += 1
-            if failed > collection.gates.retakes:
+            if failed > retakes:
                 self._over(trial, "set aside")
                 return
             if not self._may_take(trial):
                 return
-            self._change_over(trial)  # only after a pause is there anything to do
+            self._change_over(trial)  # needed only after a pause
             self._warm_and_zero(trial)
             self.retaken += 1
+        self._over(trial, "committed")
+
+    def _attempt(self, trial: Trial, number: int) -> bool:
+        """Record one attempt at a trial; commit it, or quarantine it if it fails a gate."""
+        collection = self.plan.protocol.collection
+        rate_hz = collection.recording.sync_rate
+        frame_px = self.rig_file.frame_px(self.plan)
+        mid_exposure_ns = None if frame_px is None else self.rig.frames.mid_exposure_ns
+        spool = self.rig_file.frame_camera.spool
+        writer = self.campaign.begin(trial.id, frame_px, rate_hz, spool=spool)
+        started = datetime.now(UTC)
+        try:
+            seed = hash_integer(trial.seed, number)
+            run = self.rig.run_trial(self.plan.program(trial), writer, seed, frame_px, rate_hz)
+            found = assess(
+                writer.seal(),
+                _motion(run),
+                collection.gates,
+                self.rig.timing,
+                rate_hz,
+                mid_exposure_ns,
+            )
+            record = self._record(trial, number, run, found, frame_px)
+            provenance = self._provenance(started)
+        except BaseException as error:
+            self._abandon(writer, error)
+            raise
+        self.taken += 1
+        if not found.passed:
+            cause = {"cause": f"gate: {found.causes}", "trial": trial.id, "attempt": number}
+            target = self.campaign.quarantine_path(trial.id)
+            writer.set_aside(target, record, provenance, cause)
+            return False
+        try:
+            writer.commit(record, provenance)
+        except (OSError, RuntimeError) as error:
+            self._abandon(writer, error)
+            raise
+        return True
 
     def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
-        """Put what there is of a trial aside, with its cause, if that can be written at all.
+        """Quarantine what was written of a trial, with the cause, as far as the disk allows.
 
-        What cannot be moved now is found and put aside when the campaign goes on.
+        What cannot be moved now is quarantined by the recovery of the next session.
         """
         with suppress(OSError, RuntimeError):
             writer.abandon()
         with suppress(OSError):
             if writer.folder.exists():
                 self.campaign.quarantine(writer.folder, _cause(error))
-
-    def _reject(
-        self,
-        trial: Trial,
-        attempt: int,
-        writer: TrialWriter,
-        found: Assessment,
-        provenance: Provenance,
-        run: TrialRun,
-        frame_px: tuple[int, int] | None,
-    ) -> None:
-        record = self._record(trial, attempt, run, found, frame_px)
-        target = self.campaign.quarantine_path(trial.id)
-        cause = {"cause": f"gate: {found.causes}", "trial": trial.id, "attempt": attempt}
-        writer.set_aside(target, record, provenance, cause)
 
     def _record(
         self,
@@ -229,7 +322,7 @@ class Session:
         found: Assessment,
         frame_px: tuple[int, int] | None,
     ) -> TrialRecord:
-        """The trial's record: everything that follows from protocol, seed and versions."""
+        """Return the trial's record: all that follows from protocol, seed and versions."""
         recorded = run.recorded_ns
         first, last = run.steps[0][0], run.steps[-1][0]
         given: dict[str, Any] = {}
@@ -283,7 +376,7 @@ class Session:
         )
 
     def _provenance(self, started: datetime) -> Provenance:
-        """When, where and with what: outside the checksums."""
+        """Return when, where and with what the trial was taken: outside the checksums."""
         return Provenance(
             started=started.isoformat(timespec="milliseconds"),
             ended=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -295,15 +388,154 @@ class Session:
         )
 
 
+class TrialGate:
+    """Decides between two trials whether the next may begin; notified after each.
+
+    It carries out requests from other terminals, and watches the time window, the disk and the
+    reference trials. Nothing is checked while the arm moves, and all of it before it moves again.
+
+    Attributes:
+        wait: waits some seconds, and answers stop requests.
+        on_pause: called with the seconds of a pause when it is over.
+        fresh_start: called after a pause: the rig may have changed.
+        clock: returns seconds since 1970; decides when the window ends.
+    """
+
+    def __init__(
+        self,
+        run_request: RunRequest,
+        store: Store,
+        campaign: Campaign,
+        disk: DiskWatch | None = None,
+    ) -> None:
+        self._run_request, self._store, self._campaign = run_request, store, campaign
+        self.disk = DiskWatch(run_request, campaign) if disk is None else disk
+        self._references = ReferenceWatch(run_request, campaign)
+        self.wait: Callable[[float], None] = stopping.wait
+        self.on_pause: Callable[[float], None] = lambda seconds: None
+        self.fresh_start: Callable[[], None] = lambda: None
+        self.clock: Callable[[], float] = time.time
+        self._seen: frozenset[str] = frozenset()
+        self._paused: Request | None = None
+        self._skipped = frozenset(decisions.skipped(campaign))
+        self._wanted: set[str] = set()
+
+    def begin(self) -> None:
+        """Check reference trials before the first trial.
+
+        Raises:
+            CampaignStopped: the last reference trial had drifted.
+        """
+        self._references.begin()
+
+    def may_take(self, trial: Trial) -> bool:
+        """Return whether to take `trial` now; waits while the store is paused.
+
+        Raises:
+            KeyboardInterrupt: somebody asked to stop.
+            CampaignStopped: the disk has no room for it, or a pause was not ended in time.
+            WindowOver: the trial does not fit into the window.
+        """
+        if self._look():
+            self._stand_still(trial)
+        if trial.id in self._skipped:
+            return False
+        self._check_window(trial)
+        self.disk.check(trial)
+        return True
+
+    def after(self, trial: Trial, outcome: str) -> None:
+        """Learn from a trial that is over.
+
+        Raises:
+            CampaignStopped: it was a reference trial, and drifted.
+        """
+        if outcome == "committed":
+            self.disk.learn(trial)
+            self._references.look(trial)
+
+    def more(self) -> list[Trial]:
+        """Return pending trials that were asked for again meanwhile, in the plan's order."""
+        self._look()
+        wanted, self._wanted = self._wanted, set()
+        if not wanted:
+            return []
+        return [t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in wanted]
+
+    def _look(self) -> Request | None:
+        """Carry out new requests; return the one by which the store is paused, if it is."""
+        names = self._names()
+        if names != self._seen:
+            self._seen = names  # before the answers are written: a request that comes now is seen
+            for request, answer in carry_out(self._store, running=True):
+                self._apply(request, answer)
+            self._paused = control.paused(self._store)
+        return self._paused
+
+    def _apply(self, request: Request, answer: Json) -> None:
+        """Apply an answered request to this session."""
+        if request.kind == "stop":
+            console.say(f"stopped: {request}")
+            stopping.stop()
+        if request.kind in {"pause", "resume"} or request.campaign != self._campaign.name:
+            return
+        self._skipped = frozenset(decisions.skipped(self._campaign))
+        if request.kind == "again":
+            self._wanted |= set(request.trials)
+        for trial, did in answer["did"].get("trials", {}).items():
+            console.say(f"{request.kind} {trial}: {did}")
+
+    def _check_window(self, trial: Trial) -> None:
+        """Check that the trial's planned time fits: the arm rests when people come."""
+        until = self._run_request.until
+        if until is None:
+            return
+        virtual = self._run_request.rig.in_virtual_time
+        planned = 0.0 if virtual else self._run_request.plan.seconds(trial)
+        if self.clock() + planned > until:
+            raise WindowOver(
+                f"the window of campaign {self._campaign.name} ends "
+                f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, too soon for "
+                f"{trial.id}; the next collection goes on"
+            )
+
+    def _stand_still(self, trial: Trial) -> None:
+        """Wait until the pause is over."""
+        console.say(
+            f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
+            "goes on"
+        )
+        waited = 0.0
+        while request := self._look():
+            self._check_window(trial)
+            if waited >= PAUSE_LIMIT_S:
+                raise CampaignStopped(
+                    f"{self._store.folder} was paused ({request}) for "
+                    f"{console.duration(PAUSE_LIMIT_S)} and nobody resumed it: `sliplab resume "
+                    f"{self._store.folder}`, then run the same command to go on"
+                )
+            self.wait(LOOK_S)
+            waited += LOOK_S
+        console.say("resumed")
+        self.on_pause(waited)
+        self.fresh_start()
+
+    def _names(self) -> frozenset[str]:
+        try:
+            return frozenset(os.listdir(self._store.folder / control.FOLDER))
+        except FileNotFoundError:
+            return frozenset()
+
+
 def _motion(run: TrialRun) -> Motion:
-    """Return what the quality of a trial is judged by."""
+    """Return what the assessment needs to know of a trial's motion."""
     moving = next(step for step, _ in run.steps if step.phase in {"slide", "retract"})
     return Motion(run.recorded_ns, (moving.start_ns, moving.end_ns), run.path)
 
 
 @cache
 def _installed() -> Json:
-    """What does not change while a program runs, and takes long to find out."""
+    """Return what does not change while a program runs; finding it takes long."""
     return {
         "system": platform.platform(),
         "python": platform.python_version(),
@@ -312,7 +544,7 @@ def _installed() -> Json:
 
 
 def _cause(error: BaseException) -> str:
-    """Why a trial ended early, for its quarantine."""
+    """Return why a trial ended early, for its quarantine."""
     # compiled code that a signal interrupts raises an error of its own
     if isinstance(error, (KeyboardInterrupt, StopRequested)) or stopping.requested():
         return "stopped by a person"

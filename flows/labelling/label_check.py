@@ -14,7 +14,7 @@ from typing import Any
 
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.labels import labelling
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.label_errors import CHECK, rules_compared
 from sliplab.flows.planning.run_request import RunRequest, make_request

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.quality import hold_rate
 from sliplab.analysis.report.figures import campaign as figures
 from sliplab.analysis.report.page import Figure, Section, Table, number
-from sliplab.flows.collecting.reference_watch import hold_rate
 from sliplab.flows.reporting import results
 from sliplab.protocols import Trial
 from sliplab.protocols.factors import Level

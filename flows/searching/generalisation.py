@@ -24,7 +24,7 @@ from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import choose_model

@@ -23,7 +23,7 @@ from sliplab.analysis.labels import labelling
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.windows import dataset
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning import evaluate
 from sliplab.flows.learning.evaluate import choose_model

@@ -20,7 +20,7 @@ from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.windows import dataset
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import choose_model, evaluation_of
 from sliplab.flows.learning.samples import several

@@ -15,8 +15,9 @@ from typing import Any
 
 from prefect import flow
 
-from sliplab.flows.collecting import controlling
-from sliplab.flows.collecting.stops import CampaignStopped, WindowOver
+from sliplab.flows.collecting import requests
+from sliplab.flows.collecting.requests import CampaignStopped
+from sliplab.flows.collecting.session import WindowOver
 from sliplab.flows.planning.run_request import RunRequest, SessionMetadata, check_disk, make_request
 from sliplab.flows.running import console, run_records, server_calls, stopping
 from sliplab.flows.running.embedded_server import die_with
@@ -256,7 +257,7 @@ def _run_request(
 
 
 def _take(wanted: OnRig, run_request: RunRequest, run: Any) -> str:
-    from sliplab.flows.collecting.collect import collect as take
+    from sliplab.flows.collect import collect as take
 
     done = when_free(run_request, wanted.patience_min * 60, partial(take, run_request), run)
     simulated = "simulated " if run_request.rig.simulated else ""
@@ -275,7 +276,7 @@ def _collect(wanted: Collect, here: Service, run: Any) -> str:
 
 
 def _chain(wanted: Chain, here: Service, run: Any) -> str:
-    from sliplab.flows.collecting.stops import WindowOver
+    from sliplab.flows.collecting.session import WindowOver
 
     try:
         taken = _collect(wanted, here, run)
@@ -315,9 +316,9 @@ def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:
     store = Store.open(here.folder)
     who = wanted.who or "Prefect's page"
     if kind == "stop":
-        outcome = controlling.stop(store, who=who, why=wanted.why, limit_s=wanted.wait_s)
+        outcome = requests.stop_collection(store, who=who, why=wanted.why, limit_s=wanted.wait_s)
     else:
-        outcome = controlling.request(store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s)
+        outcome = requests.ask(store, kind, who=who, why=wanted.why, limit_s=wanted.wait_s)
     if outcome.answer is None:
         return f"{kind}: not yet; request {outcome.request.number} stands"
     return f"{kind}: done, request {outcome.request.number}: {outcome.answer['did']}"

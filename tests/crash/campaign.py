@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from sliplab.flows.collecting.run_session import run_session
+from sliplab.flows.collecting.session import run_session
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store

@@ -17,7 +17,7 @@ from tests.conftest import ROOT, SMALL
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
-from sliplab.flows.collecting.collect import collect  # noqa: E402
+from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
 from sliplab.flows.running.orchestration import prepare  # noqa: E402
 from sliplab.flows.study import Outcome, study  # noqa: E402

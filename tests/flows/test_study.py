@@ -17,7 +17,7 @@ from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
 from sliplab.analysis.windows.dataset import recorded_span
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label_check import check_labels, folder_of, wanted
 from sliplab.flows.labelling.label_errors import read_check
 from sliplab.flows.labelling.reviewed import Labels

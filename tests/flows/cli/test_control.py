@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.collecting import controlling
+from sliplab.flows.collecting import requests
 from sliplab.storage.process import this_process
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import exclusive
@@ -179,7 +179,7 @@ def test_stop_signals_nothing_but_a_collection(script: str, tmp_path: Path) -> N
         if script == SLEEPER:
             stale = {**this_process(), "pid": process.pid, "collects": "tiny"}
             (store.folder / ".lock").write_text(json.dumps(stale))
-        outcome = controlling.stop(store, limit_s=1.0)
+        outcome = requests.stop_collection(store, limit_s=1.0)
         assert outcome.holder is None
         assert process.poll() is None
     finally:
@@ -193,11 +193,11 @@ def test_waiting_for_a_trial_to_end_is_bounded_and_the_request_stands(tmp_path: 
     store = Store.create(tmp_path / "s")
     begin = time.monotonic()
     with exclusive(store.folder / ".lock", "the store", about={"collects": "tiny"}):
-        outcome = controlling.request(store, "pause", limit_s=1.0)
+        outcome = requests.ask(store, "pause", limit_s=1.0)
         assert outcome.answer is None
         assert outcome.holder is not None
         assert outcome.as_json()["done"] is False
     assert time.monotonic() - begin < 30
     assert control.paused(store) == outcome.request
-    assert controlling.request(store, "resume").answer is not None
+    assert requests.ask(store, "resume").answer is not None
     assert control.open_requests(store) == []

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sliplab.flows.__main__ import main
-from sliplab.flows.collecting.run_session import run_session
+from sliplab.flows.collecting.session import run_session
 from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.lock import Locked, exclusive

@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Measurement
 from sliplab.flows.cli.rigs import _about
-from sliplab.flows.collecting.run_session import run_session
+from sliplab.flows.collecting.session import run_session
 from sliplab.flows.planning.device_checks import check_devices
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import load_plan
@@ -33,7 +33,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         raise AssertionError("a device was opened")
 
     for place in (
-        "flows.collecting.run_session.build_rig",
+        "flows.collecting.session.build_rig",
         "rigs.build.build_rig",
         "rigs.discovery.reach",
     ):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.collecting.run_session import owned
+from sliplab.flows.collecting.requests import store_lock
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.flows.running import console
 from sliplab.protocols import InputError
@@ -56,7 +56,7 @@ def test_nothing_of_it_stays_in_a_store(
     folder = commit(where, "t")
     store = Store.open(tmp_path / "store")
     error = OSError(f"cannot reach {os.environ['PREFECT_API_URL']}")
-    with owned(store):
+    with store_lock(store):
         target = where.quarantine(folder, f"{type(error).__name__}: {error}")
         assert SECRET not in (store.folder / ".lock").read_text()
     assert MASK in read_json(target / "cause.json")["cause"]

@@ -8,11 +8,9 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting import trial_gate as gate_module
-from sliplab.flows.collecting.run_session import run_session
-from sliplab.flows.collecting.session import Session
-from sliplab.flows.collecting.stops import CampaignStopped
-from sliplab.flows.collecting.trial_gate import TrialGate, carry_out, refuse_paused
+from sliplab.flows.collecting import session as session_module
+from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
+from sliplab.flows.collecting.session import Session, TrialGate, run_session
 from sliplab.flows.planning.run_request import make_request, pending_trials, set_aside
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
@@ -80,7 +78,7 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
     work.gate.wait, work.gate.on_pause = wait, pauses.append
     after_first(work, lambda: control.ask(store, "pause", who="anna", why="lunch"))
     assert during == [1, 1, 1]
-    assert pauses == [3 * gate_module.LOOK_S]
+    assert pauses == [3 * session_module.LOOK_S]
     asked = control.requests(store)
     assert [(item.kind, item.who, item.why) for item in asked] == [
         ("pause", "anna", "lunch"), ("resume", "ben", ""),
@@ -93,7 +91,7 @@ def test_a_pause_stands_still_between_trials_and_changes_no_data(tmp_path: Path)
 def test_a_pause_that_nobody_ends_ends_the_stretch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gate_module, "PAUSE_LIMIT_S", 2.0)
+    monkeypatch.setattr(session_module, "PAUSE_LIMIT_S", 2.0)
     work, campaign, store = guarded(tmp_path / "a")
     assert work.gate is not None
     work.gate.wait = lambda seconds: None

@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.collecting.disk_watch import DiskWatch
-from sliplab.flows.collecting.reference_watch import ReferenceWatch, hold_rate
+from sliplab.analysis.quality import hold_rate
 from sliplab.flows.collecting.remaining import Remaining
-from sliplab.flows.collecting.session import Session
-from sliplab.flows.collecting.stops import CampaignStopped
-from sliplab.flows.collecting.trial_gate import TrialGate, carry_out
+from sliplab.flows.collecting.requests import CampaignStopped, carry_out
+from sliplab.flows.collecting.session import Session, TrialGate
+from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
 from sliplab.flows.planning.run_request import RunRequest, make_request, pending_trials
 from sliplab.protocols import InputError, load_plan
@@ -89,7 +88,7 @@ def test_references_that_drift_apart_stop_the_campaign(
     first, second = references[:2]
     rates = {first: 1000.0, second: 1234.4}
     monkeypatch.setattr(
-        "sliplab.flows.collecting.reference_watch.hold_rate",
+        "sliplab.flows.collecting.watches.hold_rate",
         lambda recording: rates[recording.trial_id],
     )
     with pytest.raises(CampaignStopped) as stopped:
@@ -141,7 +140,7 @@ def test_without_the_gate_nothing_is_compared(
     def never(recording: object) -> float:
         raise AssertionError("read")
 
-    monkeypatch.setattr("sliplab.flows.collecting.reference_watch.hold_rate", never)
+    monkeypatch.setattr("sliplab.flows.collecting.watches.hold_rate", never)
     work.gate = TrialGate(run_request, Store.open(run_request.store), campaign)
     work.take(pending_trials(work.plan, campaign)[:3])
     ReferenceWatch(run_request, campaign).begin()

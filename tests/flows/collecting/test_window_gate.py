@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.collecting.run_session import run_session
-from sliplab.flows.collecting.stops import WindowOver
-from sliplab.flows.collecting.trial_gate import TrialGate
+from sliplab.flows.collecting.session import TrialGate, WindowOver, run_session
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials import control

@@ -10,7 +10,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.windows.dataset import TrialId
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import evaluate, evaluation_of

@@ -16,7 +16,7 @@ import pytest
 from sliplab.analysis.campaigns import collected
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.sweeps.scene_windows import PHASES
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.reporting import campaign_section, others_section

@@ -13,7 +13,7 @@ import pytest
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.clocks import synchronise
 from sliplab.flows.__main__ import main
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.reporting.summary import _sync as sync_summary

@@ -12,10 +12,9 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from sliplab.flows.collecting.remaining import Remaining
-from sliplab.flows.collecting.run_session import owned, refresh, run_session
-from sliplab.flows.collecting.session import Session
+from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
+from sliplab.flows.collecting.session import Session, refresh, run_session
 from sliplab.flows.collecting.showing import shown
-from sliplab.flows.collecting.trial_gate import carry_out, refuse_paused
 from sliplab.flows.planning.run_request import RunRequest, campaign_counts, check_disk
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, run
@@ -84,7 +83,7 @@ def collect(run_request: RunRequest) -> dict[str, Any]:
     store = Store.create(run_request.store)
     refuse_paused(store)
     if control.open_requests(store):  # whoever asked was killed before it was done
-        with owned(store):
+        with store_lock(store):
             carry_out(store)
     if run_request.wanted(store.campaign(run_request.campaign)):
         check_disk([run_request])

@@ -1,0 +1,261 @@
+"""Requests to a store from another terminal: pause, resume, stop, skip a trial, take it again.
+
+A running collection carries them out between two trials; while nobody collects, the program that
+asks does so. Either holds the store's lock. A stop is signalled before anything is written. This
+module loads little: the arm moves until `halt` has run.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from sliplab.analysis.campaigns import collected
+from sliplab.flows.running import console, stopping
+from sliplab.protocols import InputError
+from sliplab.rigs.core.capabilities import RigError
+from sliplab.storage import process
+from sliplab.storage.errors import translated_disk_errors
+from sliplab.storage.streams import Json
+from sliplab.storage.trials import control, decisions
+from sliplab.storage.trials.control import Kind, Request
+from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
+from sliplab.storage.trials.migrate import migrate
+from sliplab.storage.trials.store import Store
+
+LOOK_S = 0.2
+
+
+class CampaignStopped(RuntimeError):
+    """A campaign ended between two trials without a fault; the message says why, and what to do."""
+
+
+@contextmanager
+def store_lock(store: Store, *, brief: bool = False, collects: str = "") -> Iterator[None]:
+    """Hold the store's lock for writing while the block runs; the store has the newest format then.
+
+    Args:
+        brief: held for a moment only; a collection that begins meanwhile waits for it.
+        collects: the campaign that trials are taken for; `sliplab stop` stops nothing else.
+
+    Raises:
+        Locked: somebody else holds it.
+        StoreError: its disk is full, read-only or failing.
+    """
+    about = {"collects": collects} if collects else None
+    with (
+        translated_disk_errors(store.folder, RigError),
+        exclusive(store.folder / STORE_LOCK, f"the store {store.folder}", brief=brief, about=about),
+    ):
+        migrate(store)
+        yield
+
+
+def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]:
+    """Carry out all open requests; the caller holds the store's lock.
+
+    Args:
+        running: True if the caller is a collection, between two trials.
+
+    Returns:
+        The requests in order, each with its answer.
+    """
+    done = []
+    for request in control.open_requests(store):
+        did: Json
+        if request.kind in {"pause", "resume"}:
+            now = control.paused(store)
+            did = {"paused": now is not None, "running": running}
+        elif request.kind == "stop":
+            did = {"stopped": running, "running": running}
+        else:
+            change = decisions.skip if request.kind == "skip" else decisions.again
+            where = store.campaign(request.campaign)
+            if where.begun:
+                trials = change(where, request.trials, request.by)
+            else:
+                trials = dict.fromkeys(request.trials, "there is no such campaign")
+            did = {"trials": trials, "running": running}
+        done.append((request, control.answer(store, request, did)))
+    return done
+
+
+def refuse_paused(store: Store) -> None:
+    """Refuse to begin a collection whose store is paused; it would stand still at once.
+
+    Raises:
+        CampaignStopped: the store is paused.
+    """
+    if request := control.paused(store):
+        raise CampaignStopped(
+            f"{store.folder} is paused ({request}): `sliplab resume {store.folder}`, then run the "
+            "same command"
+        )
+
+
+def holder_of(folder: Path) -> Json | None:
+    """Return who holds the lock of the store in `folder`, None if nobody does."""
+    try:
+        with exclusive(folder / STORE_LOCK, "the store", brief=True):
+            return None
+    except Locked as error:
+        return error.holder
+
+
+def halt(folder: Path) -> tuple[Json | None, bool]:
+    """Signal the collection that runs on the store in `folder` to stop.
+
+    Returns:
+        Who holds the store, None if nobody does; and whether the signal reached a collection. It
+        does not reach another host or another user, and is never sent to what does not collect.
+    """
+    holder = holder_of(folder)
+    if holder is None or not holder.get("collects"):
+        return holder, False
+    return holder, process.send(holder, signal.SIGTERM)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a request.
+
+    Attributes:
+        answer: when it was carried out, and what was done; None while it is open.
+        holder: the program that held the store when the request was made, if any.
+    """
+
+    request: Request
+    answer: Json | None
+    holder: Json | None
+
+    def as_json(self) -> Json:
+        """Return it as one JSON object."""
+        return {
+            "request": self.request.number,
+            "what": self.request.kind,
+            "who": self.request.who,
+            "when": self.request.when,
+            "why": self.request.why,
+            "campaign": self.request.campaign or None,
+            "done": self.answer is not None,
+            "did": None if self.answer is None else self.answer["did"],
+            "holder": self.holder,
+        }
+
+
+def ask(
+    store: Store,
+    kind: Kind,
+    *,
+    who: str = "",
+    why: str = "",
+    campaign: str = "",
+    trials: tuple[str, ...] = (),
+    limit_s: float = 600.0,
+) -> Outcome:
+    """Make a request, and wait until a running collection or this program has carried it out.
+
+    Args:
+        limit_s: how long to wait for the boundary between two trials, s.
+    """
+    made = control.ask(store, kind, who=who, why=why, campaign=campaign, trials=trials)
+    holder = _carry_out_if_free(store)
+    if control.answered(store, made) is None and limit_s > 0:
+        _wait(store, "waiting for the end of the trial (s)", limit_s, made)
+    return Outcome(made, control.answered(store, made), holder)
+
+
+def stop_collection(
+    store: Store, *, who: str = "", why: str = "", limit_s: float = 60.0
+) -> Outcome:
+    """Stop the collection that runs on the store, the arm first, and wait until it has ended.
+
+    The signal goes out before anything is written. A collection that no signal reaches from here,
+    because it runs on another machine, stops before its next trial.
+    """
+    return note_stop(store, *halt(store.folder), who=who, why=why, limit_s=limit_s)
+
+
+def note_stop(
+    store: Store,
+    holder: Json | None,
+    reached: bool,
+    *,
+    who: str = "",
+    why: str = "",
+    limit_s: float = 60.0,
+) -> Outcome:
+    """Record a stop whose signal `halt` has sent, and wait until the collection has ended."""
+    if holder is not None and not holder.get("collects"):
+        console.say(f"{process.named(holder)}: collects nothing and was left alone")
+        holder = None
+    if holder is not None:
+        how = "was told to stop" if reached else "no signal reaches it; it stops at its next trial"
+        console.say(f"{process.named(holder)}: {how}")
+    made = control.ask(store, "stop", who=who, why=why)
+    if holder is not None and limit_s > 0:
+        _wait(store, "waiting until it has stopped (s)", limit_s, None)
+    left = holder_of(store.folder)
+    if holder is not None and (left is None or left.get("pid") != holder["pid"]):
+        control.answer(store, made, {"stopped": True, "running": True})
+    _carry_out_if_free(store)
+    return Outcome(made, control.answered(store, made), holder)
+
+
+def known_trials(
+    store: Store, names: list[str] | None, trials: list[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return the trials by campaign.
+
+    Raises:
+        InputError: a trial is in no campaign's plan, or in several.
+        StoreError: the store holds no campaign.
+    """
+    plans = {item.name: {trial.id for trial in item.plan} for item in collected(store, names)}
+    found: dict[str, list[str]] = {}
+    for trial in dict.fromkeys(trials):
+        where = [name for name, ids in plans.items() if trial in ids]
+        if len(where) > 1:
+            raise InputError("--campaign", "", None, f"is needed: {trial} is in {', '.join(where)}")
+        if not where:
+            near = get_close_matches(trial, [i for ids in plans.values() for i in ids], n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise InputError("TRIAL", "", trial, f"is in no plan of {', '.join(plans)}{hint}")
+        found.setdefault(where[0], []).append(trial)
+    return {name: tuple(ids) for name, ids in found.items()}
+
+
+def _carry_out_if_free(store: Store) -> Json | None:
+    """Carry out open requests if nobody holds the store; else return who does."""
+    with ExitStack() as lock:
+        try:
+            lock.enter_context(store_lock(store, brief=True))
+        except Locked as error:
+            return error.holder
+        carry_out(store)
+    return None
+
+
+def _wait(store: Store, title: str, limit_s: float, made: Request | None) -> None:
+    """Wait until the request is answered, or nobody holds the store; `limit_s` at most.
+
+    Raises:
+        KeyboardInterrupt: the user does not want to wait any longer; the request stands.
+    """
+    begin = time.monotonic()
+    with console.bar(title, round(limit_s)) as bar:
+        shown = 0.0
+        while (gone := time.monotonic() - begin) < limit_s:
+            if made is None:
+                if holder_of(store.folder) is None:
+                    return
+            elif control.answered(store, made) is not None or _carry_out_if_free(store) is None:
+                return
+            stopping.wait(LOOK_S)
+            bar.advance(gone - shown)
+            shown = gone

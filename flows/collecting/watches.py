@@ -1,0 +1,128 @@
+"""Checks between two trials that may end a campaign: disk space, and drift of reference trials."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from sliplab.analysis.quality import hold_rate
+from sliplab.flows.collecting.requests import CampaignStopped
+from sliplab.flows.planning.estimate import RESERVE, trial_bytes
+from sliplab.flows.planning.run_request import RunRequest
+from sliplab.flows.running.console import size
+from sliplab.protocols import Trial
+from sliplab.storage.trials.store import Campaign
+
+_LOOK_BACK = 50
+"""Committed trials from which a session estimates sizes when it begins."""
+
+
+class DiskWatch:
+    """Checks that the disk has room for the next trial.
+
+    A trial needs the plan's estimate times the largest ratio of true to estimated size among this
+    campaign's trials so far, and the raw size of frames that are spooled.
+
+    Args:
+        free: returns the bytes free where a folder is.
+    """
+
+    def __init__(
+        self,
+        run_request: RunRequest,
+        campaign: Campaign,
+        free: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
+    ) -> None:
+        self._run_request, self._campaign, self._free = run_request, campaign, free
+        self._ratio: float | None = None
+        there = campaign.committed()
+        for trial in [item for item in run_request.plan if item.id in there][-_LOOK_BACK:]:
+            self.learn(trial)
+
+    def learn(self, trial: Trial) -> None:
+        """Update the ratio by the size of a trial that was just committed."""
+        folder = self._campaign.folder / "trials" / trial.id
+        took = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+        ratio = took / max(trial_bytes(self._run_request.rig, self._run_request.plan, trial), 1.0)
+        self._ratio = max(ratio, self._ratio or 0.0)
+
+    def needs(self, trial: Trial) -> float:
+        """Return the bytes that a trial takes while it is written."""
+        rig, plan = self._run_request.rig, self._run_request.plan
+        kept = trial_bytes(rig, plan, trial) * (1.0 if self._ratio is None else self._ratio)
+        frame = rig.frame_px(plan)
+        if not rig.frame_camera.spool or frame is None:
+            return kept
+        rate = plan.protocol.collection.recording.sync_rate
+        return kept + frame[0] * frame[1] * rate * plan.seconds(trial, recorded_only=True)
+
+    def check(self, trial: Trial) -> None:
+        """Check that the next trial fits.
+
+        Raises:
+            CampaignStopped: it does not.
+        """
+        needed, free = self.needs(trial), self._free(self._campaign.folder)
+        if needed + RESERVE > free:
+            known = "by the plan" if self._ratio is None else "by the trials so far"
+            raise CampaignStopped(
+                f"{self._run_request.store}: stopped before its disk is full: {size(free)} are "
+                f"free, the next trial needs {size(needed)} ({known}) and {size(RESERVE)} stay in "
+                "reserve; make room, then run the same command to go on. Every committed trial "
+                "is kept"
+            )
+
+
+class ReferenceWatch:
+    """Compares the event rate of every reference trial with the campaign's first one.
+
+    Onsets are not compared: they are unknown until `sliplab label` has read the outside camera's
+    frames.
+    """
+
+    def __init__(self, run_request: RunRequest, campaign: Campaign) -> None:
+        self._run_request, self._campaign = run_request, campaign
+        self._gate = run_request.plan.protocol.collection.gates.reference
+        self._first: tuple[str, float] | None = None
+
+    def begin(self) -> None:
+        """Check the last reference trial of earlier sessions.
+
+        Raises:
+            CampaignStopped: it had drifted, and nobody asked for it again.
+        """
+        if self._gate is None:
+            return
+        there = self._campaign.committed()
+        known = [t for t in self._run_request.plan if t.role == "reference" and t.id in there]
+        for trial in dict.fromkeys([*known[:1], *known[-1:]]):
+            self.look(trial)
+
+    def look(self, trial: Trial) -> None:
+        """Check a trial that was just committed, if it is a reference trial.
+
+        Raises:
+            CampaignStopped: it drifted beyond the protocol's bound.
+        """
+        if self._gate is None or trial.role != "reference":
+            return
+        rate = hold_rate(self._campaign.recording(trial.id))
+        if self._first is None:
+            self._first = (trial.id, rate)
+            return
+        first, expected = self._first
+        drift = 100 * (rate / expected - 1) if expected else (100.0 if rate else 0.0)
+        bound = float(self._gate.event_rate)
+        if abs(drift) <= bound:
+            return
+        simulated = "simulated " if self._run_request.rig.simulated else ""
+        raise CampaignStopped(
+            f"campaign {self._campaign.name}: {simulated}reference trials drifted apart: "
+            f"{trial.id} has {rate:,.0f} events/s in the hold, {first} had {expected:,.0f} "
+            f"({drift:+.1f} %, gates.reference.event_rate = {bound:g} %). Skin, light or lens "
+            f"changed: see to it, then `sliplab again {self._run_request.store} {trial.id} "
+            f"--why ...` and the same command go on (give {first} as well if the new state is the "
+            "one to compare with). Onsets were not compared: they are known after `sliplab label` "
+            "only"
+        )
