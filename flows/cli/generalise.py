@@ -43,7 +43,8 @@ def generalise(
     store = Store.open(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
-    from sliplab.flows.searching.generalisation import COLUMNS, measure_generalisation, row_cells
+    from sliplab.analysis.sweeps.generalisation import COLUMNS, row_cells
+    from sliplab.flows.generalise import measure_generalisation
 
     result = measure_generalisation(
         store, collected(store, campaign), factor or (), level or (), every, skins, trials, epochs

@@ -29,8 +29,8 @@ def guesses(
     store = Store.open(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
-    from sliplab.flows.searching.guess_changes import FIGURES, UNITS
-    from sliplab.flows.searching.guesses import GUESSES, measure_guesses
+    from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS
+    from sliplab.flows.guesses import GUESSES, measure_guesses
 
     result = measure_guesses(store, collected(store, campaign), tuple(guess or GUESSES), trials)
     if as_json:

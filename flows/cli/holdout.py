@@ -30,8 +30,8 @@ def holdout(
     store = Store.open(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
+    from sliplab.flows.holdout import measure_holdout
     from sliplab.flows.reporting.holdout_section import COLUMNS, rows_of
-    from sliplab.flows.searching.holdout import measure_holdout
 
     done = measure_holdout(store, collected(store, campaign), trials, again)
     if as_json:

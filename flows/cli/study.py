@@ -112,8 +112,8 @@ def _chain(
     check_disk(run_requests)
     prepare_store(folder)
     from sliplab.flows.reporting.report import read_summary
+    from sliplab.flows.study import searches
     from sliplab.flows.study import study as run
-    from sliplab.flows.study_searches import searches
     from sliplab.storage.trials.store import Store
 
     outcome = run(run_requests, check, searches(run_requests) if more else (), holdout)

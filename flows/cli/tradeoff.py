@@ -170,15 +170,15 @@ def _detector(
     store = Store.open(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
-    from sliplab.flows.searching import detector_tradeoff as steps
-    from sliplab.flows.searching.detector_tradeoff_data import Ask
-    from sliplab.flows.searching.detector_tradeoff_grid import Axes
-    from sliplab.flows.searching.detector_tradeoff_text import short_table
+    from sliplab.analysis.report.tradeoff_detector import short_table
+    from sliplab.analysis.sweeps.detector_grid import Axes
+    from sliplab.analysis.sweeps.detector_search import SearchSize
+    from sliplab.flows import tradeoff as steps
 
-    asked = Ask(**{name: value for name, value in how.items() if value is not None})
+    asked = SearchSize(**{name: value for name, value in how.items() if value is not None})
     given = Axes(**{name: tuple(sorted(set(each))) for name, each in axes.items() if each})
     target = folder / "report" if out is None else out
-    result = steps.detector_tradeoff(
+    result = steps.tradeoff_detector(
         store, collected(store, campaign), target, asked, given, **options
     )
     if as_json:
@@ -193,7 +193,7 @@ def _detector(
         f"The quickest detectors by false early trials{simulated}", *short_table(result)
     )
     console.show("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
-    console.show(f"Page{simulated}: {(target / steps.PAGE).resolve()}")
+    console.show(f"Page{simulated}: {(target / steps.DETECTOR_PAGE).resolve()}")
 
 
 def register(app: typer.Typer) -> None:

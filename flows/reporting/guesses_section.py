@@ -6,8 +6,8 @@ from typing import Any
 
 from sliplab.analysis.report.figures.intervals import Changed, ChangePanel, lowered_and_raised
 from sliplab.analysis.report.page import Figure, Section, Table, number, percent
+from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
 from sliplab.flows.reporting.report_extras import command, odd_shape
-from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, NAMES, UNITS, changes, figures
 from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]

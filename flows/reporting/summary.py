@@ -60,7 +60,7 @@ def make_summary(
     """Everything `summary.json` says; only `timing_s` differs between equal runs.
 
     Args:
-        held_out: what `flows.searching.holdout` kept.
+        held_out: what `flows.holdout` kept.
     """
     windows, experiments = evaluation["windows"], evaluation["experiments"]
     reviewed = evaluation.get("reviewed") is not None

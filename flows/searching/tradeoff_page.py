@@ -44,7 +44,7 @@ SENSITIVITY_COLUMNS = (
 def render(result: Mapping[str, Any]) -> str:
     """The page as text; everything in it is escaped but the figures' SVG."""
     return render_page(
-        "tradeoff.html", make_sections(result), simulated=True,
+        "tradeoff_scene.html", make_sections(result), simulated=True,
         protocol=result["protocol"], rig=result["rig"],
     )  # fmt: skip
 

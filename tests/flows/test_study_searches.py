@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows import study_searches
+from sliplab.analysis.sweeps.detector_grid import Axes
+from sliplab.analysis.sweeps.detector_search import SearchSize
+from sliplab.flows import study as chain
+from sliplab.flows.generalise import measure_generalisation
 from sliplab.flows.learning import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import extras
-from sliplab.flows.searching.detector_tradeoff_data import Ask
-from sliplab.flows.searching.detector_tradeoff_grid import Axes
-from sliplab.flows.searching.generalisation import measure_generalisation
-from sliplab.flows.study import Outcome, expected, study
-from sliplab.flows.study_searches import searches
+from sliplab.flows.study import Outcome, expected, searches, study
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store
 
@@ -56,13 +55,13 @@ def test_each_is_done_once_and_reported(
     run_requests = [replace(run_request, store=tmp_path / "store") for run_request in ran[0]]
     monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1})
     few = partial(measure_generalisation, factors=("direction",), skins=1, trials=3, epochs=1)
-    monkeypatch.setattr(study_searches, "measure_generalisation", few)
-    monkeypatch.setattr(study_searches, "GUESSES", ("event_camera.contrast",))
-    monkeypatch.setattr(study_searches, "SCENE_TRIALS", 1)
-    ask = Ask(samples=40, epochs=1, trials=2, seeds=1, stride_ms=15)
-    monkeypatch.setattr(study_searches, "ASK", ask)
+    monkeypatch.setattr(chain, "measure_generalisation", few)
+    monkeypatch.setattr(chain, "GUESSES", ("event_camera.contrast",))
+    monkeypatch.setattr(chain, "SCENE_TRIALS", 1)
+    size = SearchSize(samples=40, epochs=1, trials=2, seeds=1, stride_ms=15)
+    monkeypatch.setattr(chain, "SIZE", size)
     axes = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(1.0,))
-    monkeypatch.setattr(study_searches, "AXES", axes)
+    monkeypatch.setattr(chain, "AXES", axes)
 
     outcome = study(run_requests, more=searches(run_requests))
     done = {step["step"]: step["done"] for step in outcome.steps}
@@ -83,7 +82,7 @@ def test_each_is_done_once_and_reported(
     notes = {row.name: (row.state, row.note) for row in again.rows}
     assert all(notes[name] == ("done", "nothing to do") for name in NAMES)
 
-    monkeypatch.setattr(study_searches, "SCENE_TRIALS", 2)
+    monkeypatch.setattr(chain, "SCENE_TRIALS", 2)
     third = {
         step["step"]: step["done"]
         for step in study(run_requests, more=searches(run_requests)).steps

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.sweeps import generalisation
+from sliplab.analysis.sweeps.generalisation import markdown
+from sliplab.analysis.sweeps.runner import Json, Task, task_sweep
+from sliplab.flows import other_rig
+from sliplab.flows.generalise import Generalisation, measure_generalisation
+from sliplab.flows.learning.evaluate import choose_model
+from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting.report_extras import extras
-from sliplab.flows.searching import generalisation
-from sliplab.flows.searching.generalisation import (
-    Generalisation,
-    Result,
-    measure_generalisation,
-    table,
-)
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store, StoreError
@@ -41,10 +41,13 @@ def test_a_level_is_tested_on_and_not_trained_on(store: Store) -> None:
     work = Generalisation(store, collected(store), 1)
     levels = work.levels("direction")
     assert levels == sorted(levels, key=lambda text: float(text.split()[0]))
-    row = work.results()[f"direction {levels[0]}"]
-    where = [item.plan.describe(trial).get("direction") for item, trial, _ in work.known]
+    row = work.results.read(f"direction {levels[0]}")
+    where = [condition["direction"] for condition in work.trials.conditions]
     assert row["trials"] == where.count(levels[0])
-    assert row["n"] == np.isin(work.place, np.flatnonzero(np.array(where) == levels[0])).sum()
+    assert (
+        row["n"]
+        == np.isin(work.trials.samples.trial, np.flatnonzero(np.array(where) == levels[0])).sum()
+    )
     assert 0 < row["trained_on"] < len(where) - row["trials"]
     assert 0 <= row["share"] <= 1
     assert not list(work.folder.glob("*.state"))
@@ -59,12 +62,13 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     assert not (folder / "skin101").exists()
     seen: list[str] = []
     monkeypatch.setattr(
-        generalisation,
+        other_rig,
         "collect",
         lambda run_request: seen.append(run_request.rig.scene.scene.skin.seed),
     )
+    model = choose_model(wanted_models(store, collected(store)))
     with pytest.raises(StoreError, match="holds no campaign yet"):
-        Generalisation(store, collected(store), 1).skin(102, 4)
+        Generalisation(store, collected(store), 1).skin(model, 102, 4).work()
     shutil.rmtree(folder / "skin102")
     assert seen == [102]
 
@@ -75,15 +79,15 @@ def test_what_is_kept_is_not_measured_again(store: Store) -> None:
     other = Generalisation(store, collected(store), 2)
     made: list[str] = []
 
-    def work(key: str) -> Result:
-        made.append(key)
+    def work() -> Json:
+        made.append("made")
         return {"left out": "not tried"}
 
     before = store.folder / "derived" / "generalisation" / "results.json"
     text = before.read_text()
-    name = next(iter(other.results()))
+    name = next(iter(other.results.all()))
     for _ in range(2):
-        other.once(name, None, work)
+        task_sweep([Task(name, "another key", work)], other.results).run()
     assert len(made) == 1
     before.write_text(text)
 
@@ -100,7 +104,9 @@ def test_the_table_has_a_row_for_each_result() -> None:
     counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
     row = generalisation.scored(counts, np.array([0, 1, 1, 2]), np.array([0, 0, 1, 1]))
     assert (row["share"], row["trials"], row["n"]) == (0.75, 2, 4)
-    text = table({"depth 2 mm": {**row, "seen": 0.9}, "speed 1": {"left out": "no trials"}}, True)
+    text = markdown(
+        {"depth 2 mm": {**row, "seen": 0.9}, "speed 1": {"left out": "no trials"}}, True
+    )
     assert "(simulated)" in text
     assert "| depth 2 mm | 2 | 4 | 75.0 | 0.0 to 100.0 | 83.3 | 90.0 |" in text
     assert "| speed 1 | no trials |" in text

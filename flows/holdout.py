@@ -1,8 +1,8 @@
-"""Figures of a campaign that nothing was chosen by: another skin and seed, once a release.
+"""`sliplab holdout`: figures of a campaign that nothing was chosen by, once a release.
 
-Test trials of a study judge every change of the program, so what is kept of these changes is what
-test trials liked: after some years of it they choose the design, a little. The trials here have a
-seed and a skin of the simulated rig that stand nowhere else. The study's own network and detection
+Test trials of a study judge every change of the program, so the changes that stayed are those that
+test trials liked: after some years they choose the design, a little. The trials here have a seed
+and a skin of the simulated rig that stand nowhere else. The study's own network and detection
 settings are judged on them, as they are, once with each version of the program; each time stands in
 the ledger beside the figures, so that a reader sees how often somebody looked.
 """
@@ -14,28 +14,25 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
 
-from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file
+from sliplab.analysis.sweeps.runner import Task, sample_trials, task_sweep
 from sliplab.analysis.windows import dataset
-from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import choose_model, evaluation_of
 from sliplab.flows.learning.samples import several
 from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.learning.trial_scores import summaries
+from sliplab.flows.other_rig import judge, other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
-from sliplab.flows.searching.other_rig import judge, other_request
-from sliplab.flows.searching.scene_runs import sample_trials
 from sliplab.protocols.settings import Detection
-from sliplab.storage.files import make_folder, read_json, write_json
-from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store, StoreError
 
-STEP, FILE, VERSION = "holdout", "results.json", 1
+STEP, NAME, VERSION = "holdout", "results", 1
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
 """Of trials and of the skin. They must not stand anywhere else: not in a protocol, a rig file, a
 test, or a search. Whoever has looked at single trials of it replaces both."""
@@ -62,8 +59,8 @@ class Holdout:
         trials: int,
         seeds: tuple[int, int] = (PROTOCOL_SEED, SKIN_SEED),
     ) -> None:
-        self.store, self.seeds = store, seeds
-        self.path = store.folder / STEP / FILE
+        self.folder, self.seeds, self.trials = store.folder / STEP, seeds, trials
+        self.results = Derived(self.folder)
         self.item = training_campaigns(campaigns)[0]
         if not self.item.info.get("simulated"):
             raise StoreError(
@@ -77,53 +74,45 @@ class Holdout:
         made_of = [self.item.plan.collection_hash, self.item.info["rig_hash"], trials, seeds]
         used = [labelling.VERSION, dataset.VERSION, *several(campaigns)]
         rule = self.detection.model_dump(mode="json")
-        self.key = make_key(STEP, VERSION, [self.model.key, made_of, *used], rule)
-        self.trials = trials
+        key = make_key(STEP, VERSION, [self.model.key, made_of, *used], rule)
+        self.sweep = task_sweep([Task(NAME, key, self.measure)], self.results)
 
-    def kept(self) -> Json | None:
-        """The result of the last time; None where it was never judged."""
+    def evaluations(self) -> list[Json]:
+        """Return each time that the campaign was judged."""
         try:
-            found: Json = read_json(self.path)
+            found: list[Json] = self.results.read(NAME)["evaluations"]
         except FileNotFoundError:
-            return None
+            return []
         return found
 
     def run_request(self) -> RunRequest:
-        """The study's protocol and rig with another seed and skin, all trials for the test."""
+        """Return the study's protocol and rig with another seed and skin; all trials test."""
         trials, skin = self.seeds
         split = {"method": "ranked", "train": 0.0, "validation": 0.0, "test": 1.0}
         run_request = other_request(
             self.item,
             {"mock": {"scene": {"skin": {"seed": skin}}}},
-            self.store.folder / STEP,
-            protocol={
-                "collection": {"seed": trials},
-                "analysis": {"split": split},
-            },
+            self.folder,
+            protocol={"collection": {"seed": trials}, "analysis": {"split": split}},
         )
         chosen = sample_trials(run_request.plan, self.trials)
         return replace(run_request, only=frozenset(trial.id for trial in chosen))
 
     def measure(self) -> Json:
-        """Take what is missing of the trials, label and judge them; keep figures and ledger."""
-        run_request = self.run_request()
-        collect(run_request)
-        store = Store.open(run_request.store)
-        campaigns = collected(store, [run_request.campaign])
-        label(store, campaigns)
+        """Take what is missing of the trials, label and judge them; return figures and ledger."""
+        store, campaigns = retake([self.run_request()])
         fitted = model_file.load(self.model.path)
-        judged = judge(fitted, {run_request.campaign: self.detection}, store, campaigns)
+        judged = judge(fitted, {self.item.name: self.detection}, store, campaigns)
         rows = [row for row, _ in judged.trials]
-        windows = metrics.score(judged.counts, judged.samples.y, self.detection.margin)
-        before = self.kept()
+        counts, y, trial = judged.counts, judged.samples.y, judged.samples.trial
+        windows = metrics.score(counts, y, self.detection.margin)
         now = {
             "version": version("sliplab"),
             "at": datetime.now(UTC).isoformat(timespec="seconds"),
             "model": self.model.key,
             "strict": windows.accuracy.strict,
         }
-        found = {
-            "key": self.key,
+        return {
             "simulated": True,
             "trials": len(rows),
             "protocol_seed": self.seeds[0],
@@ -131,20 +120,13 @@ class Holdout:
             "model": self.model.key,
             "windows": {
                 **windows.as_dict(),
-                "strict": window_groups.share(
-                    window_groups.strict_hits(judged.counts, judged.samples.y), judged.samples.trial
-                ),
-                "argmax": window_groups.share(
-                    window_groups.credit(judged.counts, judged.samples.y), judged.samples.trial
-                ),
+                "strict": window_groups.share(window_groups.strict_hits(counts, y), trial),
+                "argmax": window_groups.share(window_groups.credit(counts, y), trial),
             },
             "rows": rows,
             "kinematic": summaries(rows)["kinematic"],
-            "evaluations": [*([] if before is None else before["evaluations"]), now],
+            "evaluations": [*self.evaluations(), now],
         }
-        make_folder(self.path.parent)
-        write_json(self.path, found)
-        return found
 
 
 def measure_holdout(
@@ -162,16 +144,16 @@ def measure_holdout(
     Returns:
         ``done`` (0 or 1), ``file`` and ``result``.
     """
-    work = Holdout(store, campaigns, trials, seeds)
-    kept, done = work.kept(), 0
-    if kept is None or kept["key"] != work.key:
-        versions = [] if kept is None else [each["version"] for each in kept["evaluations"]]
-        if kept is not None and version("sliplab") in versions and not again:
-            console.say(
-                f"the hold-out campaign was judged with version {version('sliplab')} already, with "
-                "another network or other settings; a second look would begin to choose by it. "
-                f"`sliplab holdout {store.folder} --again` takes it and writes it down"
-            )
-        else:
-            kept, done = work.measure(), 1
-    return {"step": STEP, "done": done, "file": str(work.path), "result": kept}
+    work, current = Holdout(store, campaigns, trials, seeds), version("sliplab")
+    seen = current in [each["version"] for each in work.evaluations()]
+    done = 0
+    if work.sweep.pending and seen and not again:
+        console.say(
+            f"the hold-out campaign was judged with version {current} already, with "
+            "another network or other settings; a second look would begin to choose by it. "
+            f"`sliplab holdout {store.folder} --again` takes it and writes it down"
+        )
+    else:
+        done = work.sweep.run()
+    path = work.folder / f"{NAME}.json"
+    return {"step": STEP, "done": done, "file": str(path), "result": work.results.read(NAME)}

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, FIGURES, Setting, changes, figures
+from sliplab.flows import guesses
+from sliplab.flows.guesses import Guesses, measure_guesses
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import guesses_section
 from sliplab.flows.reporting.report import report
-from sliplab.flows.searching import guesses
-from sliplab.flows.searching.guess_changes import AS_IT_IS, FIGURES, changes, figures
-from sliplab.flows.searching.guesses import Guesses, Setting, measure_guesses
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.derived import Derived
@@ -86,10 +86,10 @@ def test_stopped_between_two_settings_it_goes_on(
     write_json(file, {"settings": {AS_IT_IS: kept(other)[AS_IT_IS]}})
     first = Guesses.measure
 
-    def stopped(self: Guesses, setting: Setting) -> None:
+    def stopped(self: Guesses, setting: Setting, key: str) -> Json:
         if setting.factor > 1:
             raise KeyboardInterrupt
-        first(self, setting)
+        return first(self, setting, key)
 
     monkeypatch.setattr(Guesses, "measure", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -104,9 +104,9 @@ def test_another_network_is_another_measurement(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = Guesses(store, collected(store))
-    assert work.missing(work.settings((GUESS,))) == []
+    assert work.sweep((GUESS,)).pending == []
     monkeypatch.setattr(guesses, "VERSION", 99)
-    assert len(work.missing(work.settings((GUESS,)))) == 3
+    assert len(work.sweep((GUESS,)).pending) == 3
 
 
 def test_the_report_shows_them(store: Store) -> None:

@@ -15,18 +15,7 @@ from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
 from sliplab.analysis.networks import training
-from sliplab.analysis.windows import dataset
-from sliplab.flows.labelling.label import STEP, label_key
-from sliplab.flows.running import stopping
-from sliplab.flows.searching.detector_tradeoff import (
-    NUMBERS,
-    PAGE,
-    TABLE,
-    Search,
-    detector_tradeoff,
-)
-from sliplab.flows.searching.detector_tradeoff_data import Ask
-from sliplab.flows.searching.detector_tradeoff_grid import (
+from sliplab.analysis.sweeps.detector_grid import (
     PAPER,
     Axes,
     Setting,
@@ -34,14 +23,18 @@ from sliplab.flows.searching.detector_tradeoff_grid import (
     make_grid,
     strides,
 )
-from sliplab.flows.searching.detector_tradeoff_rows import (
-    OBJECTIVES,
-    RULES,
-    mean,
-    objective,
-    short_list,
+from sliplab.analysis.sweeps.detector_rows import OBJECTIVES, RULES, Row, mean, short_list
+from sliplab.analysis.sweeps.detector_search import PRECISIONS, SearchSize, trial_counts
+from sliplab.analysis.windows import dataset
+from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.flows.running import console, stopping
+from sliplab.flows.tradeoff import (
+    DETECTOR_NUMBERS,
+    DETECTOR_PAGE,
+    DETECTOR_TABLE,
+    detector_search,
+    tradeoff_detector,
 )
-from sliplab.flows.searching.detector_tradeoff_runs import PRECISIONS, trial_counts
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import Detection, Network, Windows
 from sliplab.storage.errors import StoreError
@@ -51,7 +44,7 @@ from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.reviewable import Reviewable, label
 
-ASK = Ask(samples=40, epochs=2, trials=2, seeds=2, stride_ms=15)
+SIZE = SearchSize(samples=40, epochs=2, trials=2, seeds=2, stride_ms=15)
 AXES = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(0.5, 1.0))
 TRIALS = 20
 
@@ -80,7 +73,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 @pytest.fixture(scope="module")
 def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("out") / "new"
-    return detector_tradeoff(store, collected(store), folder, ASK, AXES), folder
+    return tradeoff_detector(store, collected(store), folder, SIZE, AXES), folder
 
 
 def test_lines_and_the_small_cross_are_tried_once_each() -> None:
@@ -151,19 +144,19 @@ def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> Non
 def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, result: Any) -> None:
     found, _ = result
     (paper,) = [row for row in found["rows"] if row["paper"]]
-    search = Search(store, collected(store), ASK, AXES)
+    search = detector_search(store, collected(store), SIZE, AXES)
     run = next(run for run in search.runs if run.setting == PAPER and run.seed == 1)
-    fitted = search.kept.fitted(run, lambda share, note: None)
+    fitted = search.fitted(run, lambda share, note: None)
     scored, hits = [], []
-    for used in search.data.test:
+    for used in search.trials.test:
         x, ends = dataset.trial_windows(used.recording, run.windows)
         counts = training.predict_counts(fitted, x)
         said = detect(counts, ends, Detection())
         slip = true_slip(used.label)
         assert slip is not None
         scored.append(score_trial(said, slip, 30_000_000))
-        kept = trial_counts(search.kept.read(run)[1], "trained", 15)
-        place = search.data.judged.index(used)
+        kept = trial_counts(search.read(run)[1], "trained", 15)
+        place = search.trials.judged.index(used)
         assert np.array_equal(kept[place][0][::2], counts)
         assert np.array_equal(kept[place][1][::2], ends)
         hits.append(len(counts))
@@ -175,10 +168,11 @@ def test_the_papers_row_is_what_its_rule_gives_on_every_window(store: Store, res
 
 
 def test_the_front_is_the_definitions(result: Any) -> None:
-    rows = result[0]["rows"]
+    rows = [Row.of_json(row) for row in result[0]["rows"]]
+    assert [row.as_json() for row in rows] == result[0]["rows"]
 
-    def costs(row: Any) -> list[float]:
-        values = [(objective(row, name), sign) for name, sign in OBJECTIVES.items()]
+    def costs(row: Row) -> list[float]:
+        values = [(row.objective(name), sign) for name, sign in OBJECTIVES.items()]
         return [float("inf") if value is None else sign * value for value, sign in values]
 
     for row in rows:
@@ -187,18 +181,18 @@ def test_the_front_is_the_definitions(result: Any) -> None:
             all(a <= b for a, b in zip(other, mine, strict=True)) and other != mine
             for other in map(costs, rows)
         )
-        assert row["front"] == (not beaten)
-    assert 0 < sum(row["front"] for row in rows) < len(rows)
+        assert row.front == (not beaten)
+    assert 0 < sum(row.front for row in rows) < len(rows)
 
 
 def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
-    def row(late: float, early: float, missed: float, work: float, test: float) -> dict[str, Any]:
+    def row(late: float, early: float, missed: float, work: float, test: float) -> Row:
         figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
-        return {
-            "validation": figures,
-            "test": {"mean_ms": [test]},
-            "work": {"synaptic_operations_per_s": [work]},
-        }
+        operations = {"synaptic_operations_per_s": [work]}
+        return Row(
+            PAPER, "trained", 30, "chosen", 4, 8.0, False, [0],
+            figures, {"mean_ms": [test]}, None, operations,
+        )  # fmt: skip
 
     rows = [
         row(100, 0.02, 0.0, 5, 1),
@@ -214,14 +208,16 @@ def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
 
 def test_page_numbers_and_table_say_the_same(result: Any) -> None:
     found, folder = result
-    assert sorted(item.name for item in folder.iterdir()) == sorted([PAGE, NUMBERS, TABLE])
-    written = json.loads((folder / NUMBERS).read_text())
+    assert sorted(item.name for item in folder.iterdir()) == sorted(
+        [DETECTOR_PAGE, DETECTOR_NUMBERS, DETECTOR_TABLE]
+    )
+    written = json.loads((folder / DETECTOR_NUMBERS).read_text())
     assert {**written, "made": 6} == json.loads(json.dumps(found))
-    page = (folder / PAGE).read_text()
+    page = (folder / DETECTOR_PAGE).read_text()
     assert page.count("<svg") == 2
     assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 7
     assert "★" in page
-    table = list(csv.DictReader(io.StringIO((folder / TABLE).read_text())))
+    table = list(csv.DictReader(io.StringIO((folder / DETECTOR_TABLE).read_text())))
     assert len(table) == len(found["rows"])
     for line, row in zip(table, found["rows"], strict=True):
         assert line["simulated"] == "True"
@@ -242,29 +238,29 @@ def test_page_numbers_and_table_say_the_same(result: Any) -> None:
 def test_a_kept_search_is_not_made_again_and_grows(
     store: Store, result: Any, tmp_path: Path
 ) -> None:
-    plan = detector_tradeoff(store, collected(store), tmp_path / "o", ASK, AXES, dry_run=True)
+    plan = tradeoff_detector(store, collected(store), tmp_path / "o", SIZE, AXES, dry_run=True)
     assert (plan["pending"], plan["estimated_s"]) == (0, 0)
     assert not (tmp_path / "o").exists()
-    more = Ask(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
-    plan = detector_tradeoff(store, collected(store), tmp_path / "o", more, AXES, dry_run=True)
+    more = SearchSize(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
+    plan = tradeoff_detector(store, collected(store), tmp_path / "o", more, AXES, dry_run=True)
     assert (plan["kept"], plan["pending"]) == (6, 3)
     assert plan["estimated_s"] > 0
     # other samples are another search beside it
-    other = Ask(samples=41, epochs=2, trials=2, seeds=1, stride_ms=15)
-    found = detector_tradeoff(
+    other = SearchSize(samples=41, epochs=2, trials=2, seeds=1, stride_ms=15)
+    found = tradeoff_detector(
         store, collected(store), tmp_path / "o", other, AXES, minutes=0
     )  # fmt: skip
     assert (found["kept"], found["rows"]) == (0, [])
-    assert (tmp_path / "o" / PAGE).exists()
+    assert (tmp_path / "o" / DETECTOR_PAGE).exists()
 
 
 def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
     axes = Axes(length_ms=(30,), step_ms=(5,), pool_px=(40,), width=(0.5,))
-    ask = Ask(samples=30, epochs=3, trials=1, seeds=1, stride_ms=30)
+    ask = SearchSize(samples=30, epochs=3, trials=1, seeds=1, stride_ms=30)
     stores = [made(tmp_path / name) for name in ("whole", "stopped")]
     models = []
     for store in stores:
-        search = Search(store, collected(store), ask, axes)
+        search = detector_search(store, collected(store), ask, axes)
         run = search.runs[0]
         if store is stores[1]:
             epochs: list[float] = []
@@ -275,27 +271,26 @@ def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:
                     raise KeyboardInterrupt
 
             with pytest.raises(KeyboardInterrupt):
-                search.kept.make(run, stop)
-            assert len(list(search.kept.derived.folder.glob("*.state"))) == 1
-            assert not search.kept.done(run)
+                search.measure(run, stop)
+            assert len(list(search.derived.folder.glob("*.state"))) == 1
+            assert not search.sweep.done(run)
         told: list[tuple[str, float]] = []
-        search.kept.make(run, lambda part, share, note, told=told: told.append((part, share)))
+        search.measure(run, lambda part, share, note, told=told: told.append((part, share)))
         assert sum(share for part, share in told if part == "train") == pytest.approx(1)
         assert sum(share for part, share in told if part == "count") == pytest.approx(1)
-        assert search.kept.done(run)
-        assert not list(search.kept.derived.folder.glob("*.state"))
-        models.append(search.kept.model_path(run).read_bytes())
+        assert not list(search.derived.folder.glob("*.state"))
+        models.append(search.model_path(run).read_bytes())
     assert models[0] == models[1]
 
 
 def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
-    data = Search(store, collected(store), ASK, AXES).data
+    trials = detector_search(store, collected(store), SIZE, AXES).trials
     for setting in (PAPER, Setting(length_ms=15)):
-        found = data.samples(setting, data.train, 10_000)
-        whole = data.samples(setting, data.train, 25)
+        found = trials.samples(setting, trials.train, 10_000)
+        whole = trials.samples(setting, trials.train, 25)
         assert len(whole) == 25
-        assert set(np.unique(found.trial)) == set(range(len(data.train)))
-        label_ns = data.train[0].label
+        assert set(np.unique(found.trial)) == set(range(len(trials.train)))
+        label_ns = trials.train[0].label
         ours = (found.trial == 0) & (found.y == 0)
         ends = found.start_ns[ours] + setting.length_ms * 1_000_000
         assert ends.max() == label_ns["incipient_ns"]
@@ -305,16 +300,16 @@ def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
 def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) -> None:
     campaigns = [item for item in collected(store) if item.name == "gravity"]
     with pytest.raises(StoreError, match="no kinematic campaign"):
-        Search(store, campaigns, ASK, AXES)
+        detector_search(store, campaigns, SIZE, AXES)
 
     def check() -> None:
         raise KeyboardInterrupt
 
-    more = Ask(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
-    search = Search(store, collected(store), more, AXES)
+    more = SearchSize(samples=40, epochs=2, trials=2, seeds=3, stride_ms=15)
+    search = detector_search(store, collected(store), more, AXES)
     monkeypatch.setattr(stopping, "check", check)
-    with pytest.raises(KeyboardInterrupt):
-        search.make(lambda: False)
+    with pytest.raises(KeyboardInterrupt), console.bar("", 1) as bar:
+        search.sweep.run(bar.advance)
 
 
 def test_the_command_takes_one_of_its_two_subjects(store: Store, tmp_path: Path) -> None:

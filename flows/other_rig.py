@@ -1,8 +1,8 @@
-"""A campaign's trials on a rig that differs from its own in a few simulated numbers, judged."""
+"""Trials of a campaign on a rig with other simulated numbers: taken, labelled, judged."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
+from sliplab.flows.collecting.collect import collect
+from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.trial_scores import score_row
@@ -33,28 +35,28 @@ def other_request(
     most: int | None = None,
     protocol: Mapping[str, Any] | None = None,
 ) -> RunRequest:
-    """A run request for the same protocol, into ``folder/store``.
+    """Return a run request for the same protocol, into ``folder/store``.
 
     Args:
-        change: values by key, as deep as they stand in a rig file.
+        change: values by key, nested as in a rig file.
         folder: gets the changed rig file too.
         most: trials at most.
-        protocol: likewise values of the protocol, which then is a changed one.
+        protocol: values of the protocol to change, likewise.
     """
     make_folder(folder)
     rig = folder / f"{item.name}.yaml"
-    _changed(item.campaign.folder / "rig.yaml", "rig file", change, rig)
+    _write_changed(item.campaign.folder / "rig.yaml", "rig file", change, rig)
     file = item.campaign.protocol_file
     if protocol is not None:
         file = folder / f"{item.name}.protocol.yaml"
-        _changed(item.campaign.protocol_file, "protocol", protocol, file)
+        _write_changed(item.campaign.protocol_file, "protocol", protocol, file)
     enabled: Any = item.info.get("enabled", ())
     return make_request(
         file, rig, folder / "store", enable=tuple(enabled), campaign=item.name, most=most
     )
 
 
-def _changed(source: Path, what: str, change: Mapping[str, Any], path: Path) -> None:
+def _write_changed(source: Path, what: str, change: Mapping[str, Any], path: Path) -> None:
     data = parse_yaml(read_text(source, what), source)
     _merge(data, change)
     write_text(path, rig_yaml(data))
@@ -66,6 +68,16 @@ def _merge(data: dict[str, Any], other: Mapping[str, Any]) -> None:
             _merge(data[name], value)
         else:
             data[name] = value
+
+
+def retake(run_requests: Sequence[RunRequest]) -> tuple[Store, list[Collected]]:
+    """Take what is missing of the trials and label them; return the store and its campaigns."""
+    store = Store.create(run_requests[0].store)
+    for run_request in run_requests:
+        collect(run_request)
+    campaigns = collected(store, [run_request.campaign for run_request in run_requests])
+    label(store, campaigns)
+    return store, campaigns
 
 
 @dataclass(frozen=True)
@@ -99,17 +111,17 @@ def judge(
         settings = detection[item.name]
         for trial, recording in item.of_split("test"):
             counts, end_ns = _counts(recording, fitted, settings)
-            label = labels.read(item, recording)
-            rows.append((score_row(item, trial, label, counts, end_ns, settings), recording))
+            of_trial = labels.read(item, recording)
+            row = score_row(item, trial, of_trial, counts, end_ns, settings)
+            rows.append((row, recording))
     samples = load_samples(labels, training_campaigns(campaigns), "test")
-    counts = training.predict_counts(fitted, samples.windows)
-    return Judged(counts, samples, rows)
+    return Judged(training.predict_counts(fitted, samples.windows), samples, rows)
 
 
 def _counts(
     recording: Recording, fitted: training.Fitted, settings: Detection
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Spikes of consecutive windows (n, 3), and where they end (n,), ns."""
+    """Return spikes of consecutive windows (n, 3), and where they end (n,), ns."""
     windows = fitted.windows
     if settings.stride_ms is None:
         x, end_ns = dataset.trial_windows(recording, windows)

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.flows import generalise, holdout
+from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.reporting import holdout_section
 from sliplab.flows.reporting.report import read_summary, report
-from sliplab.flows.searching import generalisation, holdout
-from sliplab.flows.searching.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.store import Store, StoreError
@@ -37,10 +37,10 @@ def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPa
 
 def test_the_release_s_seeds_stand_nowhere_else() -> None:
     used = [PROTOCOL_SEED, SKIN_SEED]
-    skins = range(generalisation.SKIN_SEEDS, generalisation.SKIN_SEEDS + 1000)
+    skins = range(generalise.SKIN_SEEDS, generalise.SKIN_SEEDS + 1000)
     assert not set(used) & set(skins)
     words = [str(seed) for seed in used] + [f"{seed:_}" for seed in used]
-    own = {ROOT / "flows" / "searching" / "holdout.py"}
+    own = {ROOT / "flows" / "holdout.py"}
     files = [
         path
         for folder in ("protocols", "rigs", "analysis", "flows", "storage", "tests", "benchmarks")

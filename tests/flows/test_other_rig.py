@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from sliplab.analysis.campaigns import collected
+from sliplab.flows.other_rig import other_request
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.searching.other_rig import other_request
 from sliplab.flows.study import Outcome
 from sliplab.storage.trials.store import Store
 
