@@ -42,6 +42,7 @@ from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import AnalysisSettings, Network, Samples, Training, Windows
 from sliplab.storage.files import make_folder, write_bytes
+from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import StoreError
@@ -86,7 +87,7 @@ class LabelSource(Protocol):
     def key(self, item: Collected, recording: Recording) -> str:
         """Return the key of a trial's label."""
 
-    def read(self, item: Collected, recording: Recording) -> Json:
+    def read(self, item: Collected, recording: Recording) -> TrialLabel:
         """Return a trial's label."""
 
 
@@ -97,7 +98,7 @@ class LabelledTrial:
     item: Collected
     trial: Trial
     recording: Recording
-    label: Json
+    label: TrialLabel
     label_key: str
 
     @property

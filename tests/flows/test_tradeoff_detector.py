@@ -290,11 +290,11 @@ def test_windows_of_each_length_lie_in_the_same_stretches(store: Store) -> None:
         whole = trials.samples(setting, trials.train, 25)
         assert len(whole) == 25
         assert set(np.unique(found.trial)) == set(range(len(trials.train)))
-        label_ns = trials.train[0].label
+        known = trials.train[0].label
         ours = (found.trial == 0) & (found.y == 0)
         ends = found.start_ns[ours] + setting.length_ms * 1_000_000
-        assert ends.max() == label_ns["incipient_ns"]
-        assert found.start_ns[(found.trial == 0) & (found.y == 2)].min() == label_ns["gross_ns"]
+        assert ends.max() == known.incipient_ns
+        assert found.start_ns[(found.trial == 0) & (found.y == 2)].min() == known.gross_ns
 
 
 def test_a_stop_and_a_lack_of_labels_are_said(store: Store, monkeypatch: Any) -> None:
