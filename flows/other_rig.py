@@ -14,7 +14,7 @@ from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.samples import load_samples

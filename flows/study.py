@@ -18,7 +18,7 @@ from sliplab.analysis.campaigns import Collected, collected, training_campaigns
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.analysis.sweeps.sensitivity import value_of
-from sliplab.flows.collecting.collect import collect
+from sliplab.flows.collect import collect
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.holdout import STEP, measure_holdout
