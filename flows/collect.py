@@ -15,7 +15,7 @@ from sliplab.flows.collecting.remaining import Remaining
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
 from sliplab.flows.collecting.session import Session, refresh, run_session
 from sliplab.flows.collecting.showing import shown
-from sliplab.flows.planning.run_request import RunRequest, campaign_counts, check_disk
+from sliplab.flows.planning.run_request import RunRequest, check_disk
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
@@ -66,7 +66,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
                     page.more(len(trials))
                     left.add(trials)
         return {
-            **campaign_counts(wanted, session.campaign),
+            **wanted.counts(session.campaign),
             "taken": session.taken,
             "retaken": session.retaken,
             "left_out": work.left_out,
@@ -89,7 +89,7 @@ def collect(run_request: RunRequest) -> dict[str, Any]:
         check_disk([run_request])
         return run(collect_flow, Opaque(run_request))
     return {
-        **campaign_counts(run_request, refresh(run_request)),
+        **run_request.counts(refresh(run_request)),
         "taken": 0,
         "retaken": 0,
         "left_out": 0,

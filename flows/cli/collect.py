@@ -38,17 +38,16 @@ def plan(
     needed, scene = None, None
     if rig is not None:
         from sliplab.flows.planning.estimate import plan_bytes
-        from sliplab.flows.planning.plan_scene import scene_of
         from sliplab.rigs.rig_file import check_plan, load_rig_file
 
         rig_file, _ = load_rig_file(rig)
         check_plan(rig_file, found, str(rig))
         needed = round(plan_bytes(rig_file, found))
-        scene = scene_of(rig_file, found)
+        scene = plan_view.scene_of(rig_file, found)
     if as_json:
-        console.print_json(plan_view.as_json(found, needed, scene))
+        console.print_json(plan_view.plan_json(found, needed, scene))
     else:
-        plan_view.show(found, needed, scene)
+        plan_view.print_plan(found, needed, scene)
 
 
 @app.command()
@@ -64,7 +63,7 @@ def check(
 
     found = preflight.check(protocol, rig, store, tuple(enable or ()))
     if as_json:
-        console.print_json(preflight.as_json(found))
+        console.print_json(preflight.checks_json(found))
     else:
         rows = [["ok" if item.passed else "FAILED", item.name, item.finding] for item in found]
         console.print_table(f"check {protocol} on {rig}", ["", "what", "found"], rows)
@@ -124,9 +123,9 @@ def collect(
     if not result["taken"]:
         console.say("nothing to do: the store holds every trial that can be taken")
     if not as_json:
-        from sliplab.flows.collecting.aside_view import show_aside
+        from sliplab.flows.planning.campaign_trials import print_excluded
 
-        show_aside(result["causes"])
+        print_excluded(result["causes"])
         result = {key: value for key, value in result.items() if key != "causes"}
     finish(result, f"collected into {store}", as_json)
     if result["missing"] > result["left_out"]:

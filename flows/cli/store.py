@@ -40,7 +40,7 @@ def trials(
     as_json: JsonOption = False,
 ) -> None:
     """The catalogue of committed trials as a table, and what was set aside, with causes."""
-    from sliplab.flows.collecting.aside_view import all_aside, show_aside
+    from sliplab.flows.planning.campaign_trials import all_excluded, print_excluded
     from sliplab.storage.trials.catalogue import catalogue, query
     from sliplab.storage.trials.store import Store
 
@@ -50,7 +50,7 @@ def trials(
     whole = None
     if not unreadable and len(table):  # else what is whole may be more than what can be read
         whole = {name: set(part) for name, part in table.groupby("campaign")["trial"]}
-    aside = all_aside(opened, unreadable, whole)
+    aside = all_excluded(opened, unreadable, whole)
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:
@@ -80,7 +80,7 @@ def trials(
         simulated = " (simulated)" if len(table) and table["simulated"].all() else ""
         spare = len(shown) - 2  # a row is its campaign and its trial
         console.print_table(f"trials of {store}{simulated}", shown, rows, limit=40, spare=spare)
-        show_aside(aside)
+        print_excluded(aside)
         console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
 
 

@@ -25,7 +25,8 @@ from typing import Any
 from sliplab.analysis.quality import Assessment, Motion, assess
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, store_lock
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
-from sliplab.flows.planning.run_request import RunRequest, describe_campaign, pending_trials
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import Plan, Task, Trial
 from sliplab.protocols.hashing import hash_integer

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 from uuid import UUID
 
-from sliplab.flows.planning.run_request import RunRequest, campaign_counts
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import orchestration, server_calls, stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_text
@@ -165,7 +165,7 @@ class _Page:
         import json
 
         campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
-        rows = outcome_rows(campaign_counts(self._run_request, campaign), self.show.outcomes)
+        rows = outcome_rows(self._run_request.counts(campaign), self.show.outcomes)
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
     def _report_figure(self, client: Any) -> None:

@@ -1,18 +1,60 @@
-"""A plan for people and for programs: the trials in order, and what it all comes to."""
+"""A plan for people and for programs: trials in order, sums, and a simulated rig's scene."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from sliplab.flows.running import console
 from sliplab.protocols import Plan
 
 if TYPE_CHECKING:  # a plan without a rig is answered before numpy is loaded
-    from sliplab.flows.planning.plan_scene import Scene
+    from sliplab.rigs.levels import Choice
+    from sliplab.rigs.rig_file import RigFile
 
 
-def as_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, Any]:
-    """The plan as one JSON object; `needed` is its bytes, None without a rig."""
+@dataclass(frozen=True)
+class Scene:
+    """A simulated rig's level of physics for a plan, and the slip to expect.
+
+    Attributes:
+        expected: see `rigs.levels.slip_expected`.
+    """
+
+    choice: Choice
+    expected: dict[str, Any] | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as part of the plan's JSON."""
+        return {
+            "level": self.choice.name,
+            "reason": self.choice.reason,
+            "expected": self.expected,
+        }
+
+    def as_pairs(self) -> dict[str, str]:
+        """Return titles and values to print."""
+        pairs = {"physics": f"{self.choice.name}: {self.choice.reason}"}
+        if self.expected is not None:
+            for key, title in (
+                ("first_slip_s", "first slip after the start (s)"),
+                ("incipient_s", "incipient slip lasts (s)"),
+            ):
+                low, high = self.expected[key]
+                pairs[title] = f"{low:.2f} to {high:.2f} (simulated, friction taken as even)"
+        return pairs
+
+
+def scene_of(rig: RigFile, plan: Plan) -> Scene | None:
+    """Return the scene of a plan, None on a real rig."""
+    from sliplab.rigs.levels import choose_level, slip_expected
+
+    choice = choose_level(rig, plan)
+    return None if choice is None else Scene(choice, slip_expected(rig, plan))
+
+
+def plan_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, Any]:
+    """Return the plan as one JSON object; `needed` is its bytes, None without a rig."""
     rows = [
         {
             "index": trial.index,
@@ -42,7 +84,7 @@ def as_json(found: Plan, needed: int | None, scene: Scene | None) -> dict[str, A
     }
 
 
-def show(found: Plan, needed: int | None, scene: Scene | None) -> None:
+def print_plan(found: Plan, needed: int | None, scene: Scene | None) -> None:
     """Print the plan as tables."""
     factors = list(found.protocol.collection.factors)
     table = []

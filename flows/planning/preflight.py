@@ -1,29 +1,47 @@
-"""`sliplab check`: all that can be known before anything moves."""
+"""`sliplab check`: everything that can be known before anything moves.
+
+Protocol and limits, region of the outside camera, disk space, calibration; then the devices: do
+they answer, what do they report of themselves, and can their clocks be fitted.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
-from sliplab.flows.planning.device_checks import Check, check_devices
-from sliplab.flows.planning.region import check_region
-from sliplab.flows.planning.run_request import (
-    RunRequest,
-    check_disk,
-    make_request,
-    missing_bytes,
-    pending_trials,
-)
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import RunRequest, check_disk, make_request, missing_bytes
 from sliplab.flows.running.console import size
 from sliplab.protocols import InputError
+from sliplab.protocols.program import Move
 from sliplab.rigs.core.calibration import COMMANDS, find_faults, measured_on
+from sliplab.rigs.core.capabilities import ArmFault, DeviceHealth, RigError
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
+from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import Store
+
+if TYPE_CHECKING:
+    from sliplab.rigs.core.rig import Rig
+
+LISTEN_S = 3.0
+"""How long pulses are recorded to fit the clocks, s."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check and its finding."""
+
+    name: str
+    passed: bool
+    finding: str
 
 
 def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> list[Check]:
-    """Look at protocol, rig file, space, devices and clocks; nothing moves.
+    """Check protocol, rig file, space, calibration, devices and clocks; nothing moves.
 
     Raises:
         InputError: protocol or rig file cannot be used at all.
@@ -49,7 +67,7 @@ def check(protocol: Path, rig: Path, store: Path, enable: tuple[str, ...]) -> li
 
 
 def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
-    """Whether what was measured on the rig is there, recent, and of one piece."""
+    """Check that what was measured on the rig is there, recent, and consistent."""
     plan, calibration = run_request.plan.protocol.collection, run_request.rig.calibration
     needed = {"contact_plane", "tool_centre_point", "event_crop"}
     if "frames" in plan.recording.streams:
@@ -86,18 +104,151 @@ def _check_calibration(run_request: RunRequest, rig: Path) -> list[Check]:
 
 
 def _outside_camera(run_request: RunRequest) -> str:
-    """What the labels will be read from."""
-    size = run_request.rig.frame_px(run_request.plan)
-    if size is None:
+    """Describe what the labels will be read from."""
+    frame_px = run_request.rig.frame_px(run_request.plan)
+    if frame_px is None:
         return "not recorded: these trials cannot be labelled"
     simulated = "simulated " if run_request.rig.simulated else ""
     if run_request.rig.frame_source == "tracks":
         return f"{simulated}tracks of the markers, no video"
-    return f"{simulated}video, {size[0]} x {size[1]} px"
+    return f"{simulated}video, {frame_px[0]} x {frame_px[1]} px"
 
 
-def as_json(found: list[Check]) -> dict[str, Any]:
-    """The checks as one JSON object."""
+def check_region(run_request: RunRequest) -> list[Check]:
+    """Check that the recorded region covers the markers on all motions; no check without video.
+
+    The centre marker must stay in it, since gross slip is read from it. Outer markers may leave:
+    they are not measured while they are cut by the edge.
+    """
+    size_px = run_request.rig.frame_px(run_request.plan)
+    if size_px is None:
+        return []
+    scale = run_request.rig.frame_camera.scale_px_per_mm
+    half = [side / scale / 2 for side in size_px]
+    radius = float(run_request.rig.skin.radius)
+    reach = _reach(run_request)
+    skin = max(math.hypot(x, y) for x, y in run_request.rig.skin.layout_mm())
+    spare = min(limit - moved - radius for limit, moved in zip(half, reach, strict=True))
+    if spare < 0:
+        text = (
+            f"{2 * half[0]:.1f} x {2 * half[1]:.1f} mm is too small: the centre marker goes "
+            f"{max(reach):.1f} mm from the middle and has a radius of {radius:g} mm; widen "
+            f"recording.region by {-2 * spare:.1f} mm"
+        )
+        return [Check("region", False, text)]
+    text = f"covers the centre marker on every way, with {spare:.1f} mm to spare"
+    if spare < skin:
+        text += f"; markers more than {spare:.1f} mm from the centre leave it on the longest"
+    return [Check("region", True, text)]
+
+
+def _reach(run_request: RunRequest) -> tuple[float, float]:
+    """Return how far from the middle recorded motion takes the sensor, mm, right and up."""
+    x = y = 0.0
+    for trial in run_request.plan:
+        for step in run_request.plan.program(trial).steps:
+            if isinstance(step, Move) and step.recorded:
+                x, y = max(x, abs(step.to.x_mm)), max(y, abs(step.to.y_mm))
+    return x, y
+
+
+def check_devices(run_request: RunRequest) -> list[Check]:
+    """Connect every device, read its state, and fit the clocks; nothing moves."""
+    from sliplab.rigs.rig_lock import held
+
+    try:
+        with held(run_request.rig, run_request.store):
+            return _check_held(run_request)
+    except Locked as error:
+        return [Check("rig", False, str(error))]
+    except RigError as error:
+        return [Check(error.device, False, _message(error))]
+
+
+def _check_held(run_request: RunRequest) -> list[Check]:
+    """Check the devices of a rig whose lock is held."""
+    from sliplab.rigs.build import build_rig
+
+    found = _check_reach(run_request)
+    if not all(item.passed for item in found):
+        return found
+    try:
+        rig = build_rig(run_request.rig)
+    except RigError as error:
+        return [Check(error.device, False, _message(error))]
+    try:
+        rig.connect()
+        state = rig.arm.state()
+        if not state.healthy:
+            raise ArmFault("arm", f"is in {state.value}: {state.advice}")
+        found.append(Check("arm", True, state.value))
+        found += [Check(device.device, True, _health_text(device)) for device in rig.health()]
+        found += _check_clocks(run_request, rig)
+    except RigError as error:
+        found.append(Check(error.device, False, _message(error)))
+    finally:
+        try:
+            rig.close()
+        except RigError as error:  # added to what was found
+            failed = Check(error.device, False, _message(error))
+            if failed not in found:
+                found.append(failed)
+    return found
+
+
+def _check_reach(run_request: RunRequest) -> list[Check]:
+    """Return the devices of a real rig that cannot be reached at all, each by name."""
+    if run_request.rig.simulated or run_request.rig.devices is None:
+        return []
+    from sliplab.rigs.discovery import reach
+
+    return [
+        Check(name, False, why)
+        for name, why in reach(run_request.rig.devices).items()
+        if why is not None
+    ]
+
+
+def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
+    """Fit every clock that needs no frames, as a trial's clocks are fitted."""
+    from sliplab.analysis.clocks.synchronise import streams_of, synchronise
+    from sliplab.storage.trials.hdf5 import StreamReader
+    from sliplab.storage.trials.writer import DATA, TrialWriter
+
+    rate = run_request.plan.protocol.collection.recording.sync_rate
+    with TemporaryDirectory() as folder:
+        aside = Path(folder) / "check"
+        writer = TrialWriter(aside, aside.with_name("none"), None, rate)
+        rig.listen(LISTEN_S, writer, rate)
+        with StreamReader(writer.seal() / DATA) as reader:
+            streams = streams_of(reader, None)
+    fitted = synchronise(streams, rig.timing, rate)
+    found = [
+        Check(
+            f"clock: {name}",
+            True,
+            f"{device.map.drift_ppm():+.1f} ppm, within {device.uncertainty_ns / 1000:.1f} us "
+            f"({device.grade})",
+        )
+        for name, device in fitted.devices.items()
+    ]
+    return found + [Check(f"clock: {name}", False, why) for name, why in fitted.refused.items()]
+
+
+def _health_text(device: DeviceHealth) -> str:
+    """Format what a device reports of itself, in a line."""
+    parts = [device.model, f"serial {device.serial}", f"firmware {device.firmware}"]
+    if device.temperature_c is not None:
+        parts.append(f"{device.temperature_c:.0f} °C")
+    return ", ".join([*parts, f"clock: {device.clock}", *device.notes])
+
+
+def _message(error: RigError) -> str:
+    return str(error).removeprefix(f"{error.device}: ")
+
+
+def checks_json(found: list[Check]) -> dict[str, Any]:
+    """Return the checks as one JSON object."""
     return {
         "passed": all(item.passed for item in found),
         "checks": [vars(item) for item in found],

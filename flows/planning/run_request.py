@@ -1,22 +1,27 @@
-"""What was asked for, checked before anything moves: protocol, rig and store belong together.
+"""The request to collect: protocol, rig and store, checked together before anything moves.
 
-Nothing here needs Prefect, so a wrong input is answered at once.
+A campaign that is continued must have the same collection and the same rig; what differs is named
+key by key. Nothing here needs Prefect, so a wrong input is answered at once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sliplab.flows.planning.changes import format_differences
+from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
 from sliplab.flows.planning.estimate import check_space, plan_bytes
 from sliplab.protocols import InputError, Plan, Trial, load_plan
+from sliplab.protocols.shown import shown
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml, read_text, without_secrets
 from sliplab.rigs.levels import at_level, with_level
 from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file, rig_hash, same_rig
-from sliplab.storage.trials.decisions import skipped
-from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+from sliplab.storage.trials.store import IMPORTED, Campaign, Store, StoreError
+
+MOST_CHANGES = 12
+_MISSING = object()
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,15 @@ class SessionMetadata:
 
 @dataclass(frozen=True)
 class RunRequest:
-    """A requested collection that was checked and found possible."""
+    """A requested collection, checked by `make_request`.
+
+    Attributes:
+        rig_text: the rig file as it was read.
+        enable: optional levels that are switched on, ``factor=level``.
+        most: how many trials to take at most; None for all.
+        until: when the rig has to be free again, seconds since 1970; None for no such time.
+        only: ids of the trials that may be taken; None for all.
+    """
 
     plan: Plan
     rig: RigFile
@@ -41,16 +54,29 @@ class RunRequest:
     enable: tuple[str, ...]
     metadata: SessionMetadata = SessionMetadata()
     most: int | None = None
-    """Trials that were asked for at most."""
     until: float | None = None
-    """When the rig has to be free again, seconds since 1970; None for no such time."""
     only: frozenset[str] | None = None
-    """Ids of the trials that may be taken; None for all."""
 
     def wanted(self, campaign: Campaign) -> list[Trial]:
-        """Trials to take now, in the plan's order."""
+        """Return the trials to take now, in the plan's order."""
         pending = pending_trials(self.plan, campaign)
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
+
+    def counts(self, campaign: Campaign) -> dict[str, Any]:
+        """Count what the campaign holds now; planned = committed + missing."""
+        planned = {trial.id for trial in self.plan}
+        committed = campaign.committed() & planned
+        excluded = excluded_trials(self.plan, campaign)
+        return {
+            "campaign": campaign.name,
+            "planned": len(planned),
+            "committed": len(committed),
+            "quarantined": len(campaign.quarantined()),
+            "set_aside": sorted(item["trial"] for item in excluded),
+            "causes": excluded,
+            "missing": len(planned) - len(committed),
+            "simulated": self.rig.simulated,
+        }
 
 
 def make_request(
@@ -64,7 +90,7 @@ def make_request(
     most: int | None = None,
     until: float | None = None,
 ) -> RunRequest:
-    """Read and check everything that can be known before anything moves.
+    """Read protocol and rig file, and check everything that can be known before anything moves.
 
     Raises:
         InputError: protocol, rig, or a plan that this rig or this disk cannot take.
@@ -81,7 +107,7 @@ def make_request(
     if Store.exists(store):
         found = Store.open(store).campaign(name)
         begun = found if found.begun else None
-    # one campaign, one physics: a level of a factor that is added later must not change it
+    # a level of a factor that is added later must not change the campaign's physics
     level = begun.info.get("scene_level") if begun else None
     rig_file = at_level(rig_file, level) if level else with_level(rig_file, plan)
     run_request = RunRequest(plan, rig_file, rig_text, store, name, enable, metadata, most, until)
@@ -91,6 +117,7 @@ def make_request(
 
 
 def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
+    """Check that a campaign that was begun may go on under this request."""
     info = campaign.info
     if IMPORTED in info:
         raise StoreError(
@@ -118,7 +145,7 @@ def _check_same(run_request: RunRequest, campaign: Campaign) -> None:
 
 
 def _changed(run_request: RunRequest, campaign: Campaign) -> str:
-    """What differs from the campaign's own copy of its protocol, if that can be read."""
+    """Return what differs from the campaign's own copy of its protocol, if that can be read."""
     try:
         begun = load_plan(campaign.protocol_file, campaign.info.get("enabled", ()), stored=True)
     except InputError:
@@ -134,57 +161,46 @@ def _changed(run_request: RunRequest, campaign: Campaign) -> str:
 
 
 def _rig_changed(run_request: RunRequest, campaign: Campaign) -> str:
-    """What differs from the campaign's own copy of its rig file."""
+    """Return what differs from the campaign's own copy of its rig file."""
     old = parse_yaml(read_text(campaign.folder / "rig.yaml", "rig file"), "rig.yaml")
     new = parse_yaml(run_request.rig_text, "rig file")
     changes = format_differences(without_secrets(old), without_secrets(new))
     return f" What changed:{changes}" if changes else ""
 
 
-def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
-    """Trials that are neither committed nor set aside, in the plan's order."""
-    done = campaign.committed() | skipped(campaign).keys()
-    failed = campaign.failed_attempts()
-    retakes = plan.protocol.collection.gates.retakes
-    return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
+def differences(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield key, old and new value of everything that differs, in the order of the keys."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*old, *(name for name in new if name not in old)]:
+            inner = f"{key}.{name}" if key else str(name)
+            yield from differences(old.get(name, _MISSING), new.get(name, _MISSING), inner)
+    elif isinstance(old, list) and isinstance(new, list) and _of_mappings(old, new):
+        for index in range(max(len(old), len(new))):
+            before, after = (part[index] if index < len(part) else _MISSING for part in (old, new))
+            yield from differences(before, after, f"{key}[{index}]")
+    elif old != new:
+        yield key, _shown_value(old, key), _shown_value(new, key)
 
 
-def set_aside(
-    plan: Plan, campaign: Campaign, committed: set[str] | None = None
-) -> list[dict[str, Any]]:
-    """Trials of the plan that no collection takes, in its order, each with its cause.
+def format_differences(old: Any, new: Any, key: str = "") -> str:
+    """Format differences, one a line, indented, at most `MOST_CHANGES`; empty if there are none."""
+    found = list(differences(old, new, key))
+    lines = [f"\n  {name}: {before} -> {after}" for name, before, after in found[:MOST_CHANGES]]
+    if len(found) > MOST_CHANGES:
+        lines.append(f"\n  and {len(found) - MOST_CHANGES} more")
+    return "".join(lines)
 
-    By JSON names: ``trial``, ``cause``, ``attempts`` that failed, ``by`` (a person, or None for
-    the gates), ``when``. Whoever knows which trials are whole spares looking with `committed`.
-    """
-    done = campaign.committed() if committed is None else committed
-    by_person, failed = skipped(campaign), campaign.failed_attempts()
-    retakes = plan.protocol.collection.gates.retakes
-    causes: dict[str, list[str]] = {}
-    for item in campaign.quarantined():
-        if str(item["cause"]).startswith("gate") and FORGIVEN not in item:
-            causes.setdefault(item["trial"], []).append(str(item["cause"]))
-    found = []
-    for trial in plan:
-        if trial.id in done:
-            continue
-        attempts, known = failed.get(trial.id, 0), by_person.get(trial.id)
-        if known is not None:
-            cause = known.get("why") or "no reason given"
-        elif attempts > retakes:
-            cause = "; then ".join(dict.fromkeys(causes[trial.id]))
-        else:
-            continue
-        person = known or {}
-        found.append(
-            {"trial": trial.id, "cause": cause, "attempts": attempts,
-             "by": person.get("who"), "when": person.get("when")}
-        )  # fmt: skip
-    return found
+
+def _of_mappings(*lists: list[Any]) -> bool:
+    return any(isinstance(item, dict) for part in lists for item in part)
+
+
+def _shown_value(value: Any, key: str) -> str:
+    return "not there" if value is _MISSING or value is None else shown(value, key)
 
 
 def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
-    """Write what the campaign is; the protocol's analysis and levels may have changed."""
+    """Write the campaign's description; the protocol's analysis and levels may have changed."""
     campaign = store.campaign(run_request.campaign)
     info = {
         "name": run_request.campaign,
@@ -203,35 +219,18 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
 
 
 def missing_bytes(run_request: RunRequest) -> float:
-    """Bytes that the trials still to take are expected to need."""
+    """Return the bytes that the trials still to take are expected to need."""
     pending = run_request.wanted(Store(run_request.store).campaign(run_request.campaign))
     done = {trial.id for trial in run_request.plan} - {trial.id for trial in pending}
     return plan_bytes(run_request.rig, run_request.plan, done)
 
 
 def check_disk(run_requests: list[RunRequest]) -> int:
-    """Free bytes where the requests' store is or will be.
+    """Return the free bytes where the requests' store is or will be.
 
     Raises:
-        InputError: what is still to be taken does not fit.
+        InputError: the trials still to take do not fit.
     """
     return check_space(
         run_requests[0].store, sum(missing_bytes(run_request) for run_request in run_requests)
     )
-
-
-def campaign_counts(run_request: RunRequest, campaign: Campaign) -> dict[str, Any]:
-    """What a campaign holds now: planned = committed + missing."""
-    planned = {trial.id for trial in run_request.plan}
-    committed = campaign.committed() & planned
-    aside = set_aside(run_request.plan, campaign)
-    return {
-        "campaign": campaign.name,
-        "planned": len(planned),
-        "committed": len(committed),
-        "quarantined": len(campaign.quarantined()),
-        "set_aside": sorted(item["trial"] for item in aside),
-        "causes": aside,
-        "missing": len(planned) - len(committed),
-        "simulated": run_request.rig.simulated,
-    }

@@ -12,12 +12,8 @@ from typing import Any
 import yaml
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.run_request import (
-    RunRequest,
-    describe_campaign,
-    make_request,
-    pending_trials,
-)
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.loopback.client import Loopback
 from sliplab.rigs.rig_file import RigFile

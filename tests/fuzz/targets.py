@@ -52,11 +52,11 @@ def _written(box: Path, name: str, data: bytes) -> Path:
 
 def read_protocol(box: Path, name: str, data: bytes) -> None:
     """A protocol, expanded, with all that `sliplab plan` tells of it."""
-    from sliplab.flows.planning.plan_view import as_json
+    from sliplab.flows.planning.plan_view import plan_json
     from sliplab.protocols.plan import load_plan
 
     plan = load_plan(_written(box, "protocol.yaml", data))
-    json.dumps(as_json(plan, None, None), allow_nan=False)
+    json.dumps(plan_json(plan, None, None), allow_nan=False)
     plan.warnings()
 
 

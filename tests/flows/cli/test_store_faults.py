@@ -11,7 +11,8 @@ import pytest
 
 from sliplab.flows.__main__ import main
 from sliplab.flows.collecting.session import run_session
-from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.lock import Locked, exclusive
 from sliplab.storage.trials.store import FORMAT, Store, StoreError
@@ -58,7 +59,7 @@ def test_figures_add_up_after_damage(whole: Path, sliplab: Sliplab) -> None:
     (trials(whole)[0] / "data.h5").write_bytes(b"x")
     run_request = make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")
     campaign = Store.open(whole / "store").campaign("tiny")
-    counts = campaign_counts(run_request, campaign)
+    counts = run_request.counts(campaign)
     assert (counts["planned"], counts["committed"], counts["missing"]) == (2, 1, 1)
     assert [trial.id for trial in pending_trials(run_request.plan, campaign)] == [
         trials(whole)[0].name

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.labels.labelling import label_recording
-from sliplab.flows.planning.run_request import campaign_counts, make_request, pending_trials
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import make_request
 from sliplab.protocols.settings import Labelling
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.core.rig import Rig
@@ -152,7 +153,7 @@ def test_every_fault_once_in_a_campaign_and_the_table_in_the_docs(tmp_path: Path
     assert kept.items() <= checksums(campaign).items()
     assert verify(Store.open(tmp_path / "store")) == []
     run_request = make_request(tmp_path / "p.yaml", tmp_path / "rig.yaml", tmp_path / "store")
-    counts = campaign_counts(run_request, campaign)
+    counts = run_request.counts(campaign)
     assert (counts["planned"], counts["missing"], counts["set_aside"]) == (PLANNED, 0, [])
 
     falling = tiny_gravity()

@@ -17,7 +17,8 @@ from typing import Any, cast
 import pytest
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.run_request import RunRequest, pending_trials
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import RunRequest
 from sliplab.rigs.build import calibrated_arm
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, RigError
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ

@@ -11,7 +11,7 @@ import pytest
 from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Measurement
 from sliplab.flows.cli.rigs import _about
 from sliplab.flows.collecting.session import run_session
-from sliplab.flows.planning.device_checks import check_devices
+from sliplab.flows.planning.preflight import check_devices
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file

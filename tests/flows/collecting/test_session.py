@@ -10,12 +10,8 @@ from typing import Any
 import pytest
 
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.run_request import (
-    campaign_counts,
-    describe_campaign,
-    make_request,
-    pending_trials,
-)
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.protocols.yaml_file import parse_yaml
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.capabilities import ArmFault, RigError
@@ -107,7 +103,7 @@ def test_a_trial_that_fails_every_time_is_set_aside(tmp_path: Path) -> None:
     run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
-    counts = campaign_counts(run_request, campaign)
+    counts = run_request.counts(campaign)
     assert counts["planned"] == counts["committed"] + counts["missing"] == 3
     assert len(counts["set_aside"]) == 3
 

@@ -11,7 +11,8 @@ import pytest
 from sliplab.flows.collecting import session as session_module
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
 from sliplab.flows.collecting.session import Session, TrialGate, run_session
-from sliplab.flows.planning.run_request import make_request, pending_trials, set_aside
+from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
+from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.storage.trials import control
@@ -164,7 +165,7 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     assert answer["did"]["trials"] == {
         second: "set aside", first: "is committed: left as it is",
     }  # fmt: skip
-    (aside,) = set_aside(work.plan, campaign)
+    (aside,) = excluded_trials(work.plan, campaign)
     assert (aside["trial"], aside["cause"], aside["by"]) == (second, "cable in the way", "anna")
     assert skipped(campaign)[second]["request"] == 1
     (kept,) = campaign.quarantined()
@@ -180,7 +181,7 @@ def test_trials_are_set_aside_and_wanted_again_while_it_runs(tmp_path: Path) -> 
     control.ask(store, "again", campaign="tiny", trials=(second,), why="cable is gone")
     work.take(work.gate.more())
     assert campaign.committed() == {first, second, third}
-    assert set_aside(work.plan, campaign) == []
+    assert excluded_trials(work.plan, campaign) == []
 
 
 def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path) -> None:
@@ -189,7 +190,7 @@ def test_a_trial_that_used_its_retakes_up_gets_all_of_them_again(tmp_path: Path)
     fault = {"kind": "event_gap", "at_s": 0.6, "seconds": 0.2}
     work, campaign, store = guarded(tmp_path / "a", data, faults=[fault])
     work.take(list(work.plan)[:1])
-    (aside,) = set_aside(work.plan, campaign)
+    (aside,) = excluded_trials(work.plan, campaign)
     assert aside["cause"].startswith("gate: event_gap_s = 0.2")
     assert (aside["attempts"], aside["by"]) == (2, None)
     control.ask(store, "again", campaign="tiny", trials=(aside["trial"],), why="cable mended")

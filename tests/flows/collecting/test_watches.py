@@ -12,8 +12,9 @@ from sliplab.flows.collecting.remaining import Remaining
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out
 from sliplab.flows.collecting.session import Session, TrialGate
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch
+from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.estimate import RESERVE, trial_bytes
-from sliplab.flows.planning.run_request import RunRequest, make_request, pending_trials
+from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols import InputError, load_plan
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Campaign, Store

@@ -11,7 +11,8 @@ import yaml
 
 from sliplab.analysis.labels.labelling import Label, label_recording
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.planning.run_request import describe_campaign, make_request, pending_trials
+from sliplab.flows.planning.campaign_trials import pending_trials
+from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.rigs.build import build_rig
 from sliplab.storage.trials.checksums import write_sums
 from sliplab.storage.trials.recording import Recording

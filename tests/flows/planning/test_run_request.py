@@ -8,8 +8,13 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.flows.planning.changes import MOST, differences, format_differences
-from sliplab.flows.planning.run_request import describe_campaign, make_request
+from sliplab.flows.planning.run_request import (
+    MOST_CHANGES,
+    describe_campaign,
+    differences,
+    format_differences,
+    make_request,
+)
 from sliplab.protocols import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.store import Store, StoreError
@@ -30,7 +35,7 @@ def test_differences_name_key_old_and_new() -> None:
         ("h", "not there", "{i: 1}"),
     ]
     assert format_differences(old, old) == ""
-    many = {str(number): number for number in range(MOST + 3)}
+    many = {str(number): number for number in range(MOST_CHANGES + 3)}
     assert format_differences(many, {}).endswith("\n  and 3 more")
 
 

@@ -11,8 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sliplab.flows.cli.app import app
-from sliplab.flows.planning.device_checks import check_devices
-from sliplab.flows.planning.region import check_region
+from sliplab.flows.planning.preflight import check_devices, check_region
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml

@@ -1,0 +1,100 @@
+"""Trials of a campaign that are pending, and trials that are excluded: no collection takes those.
+
+A trial is excluded if a person skipped it, or if its gates rejected it as often as it may be
+retaken. `sliplab again` makes it pending.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.flows.running import console
+from sliplab.protocols import InputError, Plan, Trial
+from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
+
+
+def pending_trials(plan: Plan, campaign: Campaign) -> list[Trial]:
+    """Return trials that are neither committed nor excluded, in the plan's order."""
+    done = campaign.committed() | skipped(campaign).keys()
+    failed = campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    return [t for t in plan if t.id not in done and failed.get(t.id, 0) <= retakes]
+
+
+def excluded_trials(
+    plan: Plan, campaign: Campaign, committed: set[str] | None = None
+) -> list[dict[str, Any]]:
+    """Return trials of the plan that no collection takes, in its order, each with its cause.
+
+    Args:
+        committed: the committed trials, if they are known already.
+
+    Returns:
+        For each ``trial``: ``cause``, ``attempts`` that failed, ``by`` (the person who skipped it,
+        None if its gates rejected it), ``when``.
+    """
+    done = campaign.committed() if committed is None else committed
+    by_person, failed = skipped(campaign), campaign.failed_attempts()
+    retakes = plan.protocol.collection.gates.retakes
+    causes: dict[str, list[str]] = {}
+    for item in campaign.quarantined():
+        if str(item["cause"]).startswith("gate") and FORGIVEN not in item:
+            causes.setdefault(item["trial"], []).append(str(item["cause"]))
+    found = []
+    for trial in plan:
+        if trial.id in done:
+            continue
+        attempts, known = failed.get(trial.id, 0), by_person.get(trial.id)
+        if known is not None:
+            cause = known.get("why") or "no reason given"
+        elif attempts > retakes:
+            cause = "; then ".join(dict.fromkeys(causes[trial.id]))
+        else:
+            continue
+        person = known or {}
+        found.append(
+            {"trial": trial.id, "cause": cause, "attempts": attempts,
+             "by": person.get("who"), "when": person.get("when")}
+        )  # fmt: skip
+    return found
+
+
+def all_excluded(
+    store: Store, unreadable: list[str], committed: dict[str, set[str]] | None = None
+) -> list[dict[str, Any]]:
+    """List the excluded trials of all campaigns, each with its ``campaign``.
+
+    Args:
+        unreadable: gets a line for every campaign that cannot be read.
+        committed: committed trials by campaign, if they are known already.
+    """
+    found = []
+    for campaign in store.campaigns():
+        try:
+            if IMPORTED in campaign.info:  # it has no plan
+                continue
+            done = None if committed is None else committed.get(campaign.name, set())
+            excluded = excluded_trials(Collected(campaign).plan, campaign, done)
+        except (InputError, StoreError) as error:
+            unreadable.append(f"campaign {campaign.name}: {error}")
+            continue
+        found += [{"campaign": campaign.name, **item} for item in excluded]
+    return found
+
+
+def print_excluded(excluded: list[dict[str, Any]]) -> None:
+    """Print the excluded trials as a table, if there are any."""
+    if not excluded:
+        return
+    rows = [
+        [item["trial"], item["by"] or f"gates, {item['attempts']} attempts", item["cause"]]
+        for item in excluded
+    ]
+    console.print_table(
+        f"{len(rows)} trials set aside (`sliplab again` takes them)",
+        ["trial", "by", "cause"],
+        rows,
+        limit=40,
+    )
