@@ -1,14 +1,34 @@
-"""What is said when a store, or the disk that it is on, cannot be used."""
+"""Errors of a store and of its disk, in words, and what must not stand in any of them."""
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import disk_fault, disk_full
+from sliplab.protocols.shown import MASK, is_secret, password_in, without_passwords
+
+_FAULTS = {
+    errno.ENOSPC: "is full",
+    errno.EDQUOT: "has no room left for this user (quota)",
+    errno.EFBIG: "takes no larger file (see ulimit -f)",
+    errno.EROFS: "is read-only",
+    errno.EACCES: "may not be written to by this user",
+    errno.EPERM: "may not be written to by this user",
+    errno.EIO: "reports errors; it may be failing",
+    errno.ENXIO: "is gone",
+    errno.ENODEV: "is gone",
+    errno.ESTALE: "is gone",
+}
+_OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
+_IN_WORDS = re.compile(r"errno = (\d+)")
+_SHORTEST = 8
+"""A shorter value is a switch, or stands in many a word."""
 
 
 class StoreError(RuntimeError):
@@ -29,6 +49,32 @@ class NoStore(InputError, StoreError):
     def __reduce__(self) -> tuple[type[NoStore], tuple[str, ...]]:
         """Its own arguments: it may come from another process."""
         return type(self), (str(self.file), self.expected)
+
+
+def disk_fault(error: BaseException | None) -> str | None:
+    """What is the matter with the disk if `error`, or what caused it, says so: ``is full``.
+
+    HDF5 tells some of it in words only.
+    """
+    while error is not None:
+        number = error.errno if isinstance(error, OSError) else None
+        if number is None and (told := _IN_WORDS.search(str(error))):
+            number = int(told[1])
+        if number in _FAULTS:
+            return _FAULTS[number]
+        hidden = error.__suppress_context__
+        error = error.__cause__ or (None if hidden else error.__context__)
+    return None
+
+
+def disk_full(error: BaseException | None) -> bool:
+    """Whether `error`, or what caused it, is a disk or a quota without room."""
+    return disk_fault(error) in {_FAULTS[errno.ENOSPC], _FAULTS[errno.EDQUOT]}
+
+
+def own_fault(error: Exception) -> bool:
+    """Whether a file could not be read for want of memory or open files: it is not damaged."""
+    return isinstance(error, OSError) and error.errno in _OWN_FAULTS
 
 
 def disk_error(folder: Path, error: BaseException) -> StoreError | None:
@@ -68,3 +114,28 @@ def translated_disk_errors(folder: Path, *others: type[BaseException]) -> Iterat
         if said is None:
             raise
         raise said from error
+
+
+def masked(text: str) -> str:
+    """`text` with every secret replaced by ``****``.
+
+    Secrets are the passwords of addresses (``scheme://user:password@host``), wherever they come
+    from, and the values of environment variables that are named as one.
+    """
+    for secret in _secrets():
+        if secret in text:
+            text = text.replace(secret, MASK)
+    return without_passwords(text)
+
+
+def _secrets() -> list[str]:
+    """Longest first: one may be part of another."""
+    found = set()
+    for name, value in os.environ.items():
+        if len(value) < _SHORTEST:
+            continue
+        if is_secret(name) and not value.startswith("/"):
+            found.add(value)
+        elif (password := password_in(value)) and len(password) >= _SHORTEST:
+            found.add(password)
+    return sorted(found, key=len, reverse=True)

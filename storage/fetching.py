@@ -6,8 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from sliplab.storage.errors import StoreError, translated_disk_errors
-from sliplab.storage.files import read_json
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import read_json, safe_name
 from sliplab.storage.objects import Remote, RemoteError
 from sliplab.storage.streams import Json
 

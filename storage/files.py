@@ -10,7 +10,6 @@ A killed program may leave a temporary file. Its name says whose it is (`.NAME.P
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import math
@@ -22,52 +21,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from sliplab.storage.errors import StoreError
+
 _BLOCK = 1 << 20
-
-
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
 _NAME_BYTES = 200
 """Of a target's name in that of its temporary file; a file's name has at most 255 bytes."""
-_FAULTS = {
-    errno.ENOSPC: "is full",
-    errno.EDQUOT: "has no room left for this user (quota)",
-    errno.EFBIG: "takes no larger file (see ulimit -f)",
-    errno.EROFS: "is read-only",
-    errno.EACCES: "may not be written to by this user",
-    errno.EPERM: "may not be written to by this user",
-    errno.EIO: "reports errors; it may be failing",
-    errno.ENXIO: "is gone",
-    errno.ENODEV: "is gone",
-    errno.ESTALE: "is gone",
-}
-_OWN_FAULTS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM}
-_IN_WORDS = re.compile(r"errno = (\d+)")
-
-
-def disk_fault(error: BaseException | None) -> str | None:
-    """What is the matter with the disk if `error`, or what caused it, says so: ``is full``.
-
-    HDF5 tells some of it in words only.
-    """
-    while error is not None:
-        number = error.errno if isinstance(error, OSError) else None
-        if number is None and (told := _IN_WORDS.search(str(error))):
-            number = int(told[1])
-        if number in _FAULTS:
-            return _FAULTS[number]
-        hidden = error.__suppress_context__
-        error = error.__cause__ or (None if hidden else error.__context__)
-    return None
-
-
-def disk_full(error: BaseException | None) -> bool:
-    """Whether `error`, or what caused it, is a disk or a quota without room."""
-    return disk_fault(error) in {_FAULTS[errno.ENOSPC], _FAULTS[errno.EDQUOT]}
-
-
-def own_fault(error: Exception) -> bool:
-    """Whether a file could not be read for want of memory or open files: it is not damaged."""
-    return isinstance(error, OSError) and error.errno in _OWN_FAULTS
+_SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
 def sync_folder(folder: Path) -> None:
@@ -294,3 +254,27 @@ def sha256(path: Path) -> str:
     for block in read_blocks(path):
         digest.update(block)
     return digest.hexdigest()
+
+
+def safe_name(name: str) -> str:
+    """`name` if it is a plain file name.
+
+    Raises:
+        StoreError: it could lead out of its folder.
+    """
+    if not _SAFE.fullmatch(name) or ".." in name:
+        raise StoreError(f"'{name}' cannot be the name of a folder in a store")
+    return name
+
+
+def inside(path: Path, store: Path) -> Path:
+    """`path`, if no link on the way to it leads out of the store's folder.
+
+    Raises:
+        StoreError: one does.
+    """
+    if not path.resolve().is_relative_to(store.resolve()):
+        raise StoreError(
+            f"{path}: a link leads out of the store; put a folder of its own in its place"
+        )
+    return path

@@ -10,7 +10,7 @@ import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sliplab.storage.secrets import masked
+from sliplab.storage.errors import masked
 from sliplab.storage.streams import Json
 
 _COMMAND_CHARACTERS = 300

@@ -22,8 +22,7 @@ from typer.exceptions import TyperException
 from sliplab.flows.running import console, extras
 from sliplab.flows.running.process import OutputLost, exhausted
 from sliplab.protocols.errors import InputError
-from sliplab.storage.errors import StoreError, disk_error
-from sliplab.storage.files import disk_fault
+from sliplab.storage.errors import StoreError, disk_error, disk_fault
 
 INTERRUPTED = "interrupted: every committed trial is kept; run the same command to go on"
 _EXPECTED = {

@@ -27,8 +27,7 @@ from sliplab.flows.reporting.summary import make_summary
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
 from sliplab.flows.syncing.sync_page import PAGE as CLOCKS
-from sliplab.storage.files import make_folder, read_json, write_json, write_text
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import make_folder, read_json, safe_name, write_json, write_text
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 

@@ -31,7 +31,7 @@ from rich.text import Text
 
 from sliplab.flows.running import stopping
 from sliplab.protocols.shown import CONTROL, printable
-from sliplab.storage.secrets import masked
+from sliplab.storage.errors import masked
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 

@@ -16,9 +16,8 @@ from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.files import json_text
+from sliplab.storage.files import json_text, safe_name
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError
-from sliplab.storage.names import safe_name
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (

@@ -8,9 +8,8 @@ from typing import Any
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import read_json
+from sliplab.storage.files import read_json, safe_name
 from sliplab.storage.formats.foreign import ForeignTrial
-from sliplab.storage.names import safe_name
 from sliplab.storage.streams import Json
 
 MANIFEST = "sliplab-export.json"

@@ -21,8 +21,7 @@ from typing import Any, Literal
 
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.fetching import objects_folder
-from sliplab.storage.files import json_text, read_json, sha256
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import json_text, read_json, safe_name, sha256
 from sliplab.storage.objects import SMALL_BYTES, Remote, RemoteError, RemoteMissing
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import read_sums

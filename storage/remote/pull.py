@@ -12,8 +12,7 @@ from pathlib import Path
 
 from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.fetching import ORIGIN, origin_of
-from sliplab.storage.files import make_folder, sync_folder, write_bytes, write_json
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import make_folder, safe_name, sync_folder, write_bytes, write_json
 from sliplab.storage.objects import OnBytes, Remote, RemoteError
 from sliplab.storage.remote.download import BIG, download_folder, get, holds
 from sliplab.storage.remote.manifest import Manifest, read_manifests, take_of

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 
 from sliplab.storage.fetching import objects_folder
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import safe_name
 from sliplab.storage.objects import OnBytes, Remote, RemoteError, RemoteMissing
 from sliplab.storage.remote.manifest import Kind, Manifest, check_against_sums, read_manifests
 from sliplab.storage.trials.store import StoreError

@@ -7,7 +7,8 @@ import re
 import stat
 from pathlib import Path
 
-from sliplab.storage.files import own_fault, read_json, sha256, write_json
+from sliplab.storage.errors import own_fault
+from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.writer import CHECKSUMS, DATA, RECORD
 

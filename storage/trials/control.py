@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import make_folder, read_json, write_new_json
-from sliplab.storage.names import safe_name
+from sliplab.storage.files import make_folder, read_json, safe_name, write_new_json
 from sliplab.storage.process import now, user_name
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store

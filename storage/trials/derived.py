@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.hashing import hash_data
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import read_json, write_bytes, write_json
-from sliplab.storage.names import inside, safe_name
+from sliplab.storage.files import inside, read_json, safe_name, write_bytes, write_json
 from sliplab.storage.schema.document import Document, DocumentError, NewerFormat
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store

@@ -18,8 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sliplab.storage.errors import StoreError
-from sliplab.storage.files import disk_fault
+from sliplab.storage.errors import StoreError, disk_fault
 from sliplab.storage.process import named, this_process
 from sliplab.storage.streams import Json
 

@@ -24,19 +24,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sliplab.storage.errors import NoStore, StoreError, translated_disk_errors
+from sliplab.storage.errors import NoStore, StoreError, masked, translated_disk_errors
 from sliplab.storage.files import (
+    inside,
     json_text,
     make_folder,
     read_json,
+    safe_name,
     sweep_temporary,
     sync_folder,
     write_bytes,
     write_json,
 )
-from sliplab.storage.names import inside, safe_name
 from sliplab.storage.schema.trial import Provenance
-from sliplab.storage.secrets import masked
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.checksums import partial, write_sums
 from sliplab.storage.trials.recording import Recording

@@ -10,8 +10,8 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.yaml_file import parse_yaml
-from sliplab.storage.errors import StoreError
-from sliplab.storage.files import own_fault, read_json, temporary_files
+from sliplab.storage.errors import StoreError, own_fault
+from sliplab.storage.files import read_json, temporary_files
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import Json

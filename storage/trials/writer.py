@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sliplab.storage.errors import masked
 from sliplab.storage.files import sha256, sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.secrets import masked
 from sliplab.storage.streams import (
     I64,
     U8,

@@ -12,10 +12,11 @@ from sliplab.flows.collecting.requests import store_lock
 from sliplab.flows.planning.run_request import describe_campaign, make_request
 from sliplab.flows.running import console
 from sliplab.protocols import InputError
+from sliplab.protocols.shown import MASK
 from sliplab.rigs.rig_file import load_rig_file, rig_hash
+from sliplab.storage.errors import masked
 from sliplab.storage.files import read_json
 from sliplab.storage.process import this_process
-from sliplab.storage.secrets import MASK, masked
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
 from tests.storage.trial_files import campaign, commit

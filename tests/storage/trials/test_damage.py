@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import pytest
 
-from sliplab.storage.errors import translated_disk_errors
-from sliplab.storage.files import disk_fault, read_json, sweep_temporary, write_bytes, write_json
+from sliplab.storage.errors import disk_fault, translated_disk_errors
+from sliplab.storage.files import read_json, sweep_temporary, write_bytes, write_json
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
