@@ -41,9 +41,10 @@ from sliplab.rigs.devices.dvxplorer.fake import DvxplorerServer, Packet
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.files import sync_file
 from sliplab.storage.streams import U8, EventChunk, FrameChunk
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.checksums import DATA, FRAMES, SPOOL
+from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.video import count_frames
-from sliplab.storage.trials.writer import DATA, FRAMES, SPOOL, TrialWriter
+from sliplab.storage.trials.writer import TrialWriter
 
 RATE_HZ = 100
 EMULATED_HZ = 102

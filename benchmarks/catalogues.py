@@ -16,8 +16,8 @@ from benchmarks.measure import Figures, alternate, spread
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.files import sha256
 from sliplab.storage.trials.catalogue import catalogue, query
+from sliplab.storage.trials.checksums import CHECKSUMS, DATA, FRAMES, RECORD
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.writer import CHECKSUMS, DATA, FRAMES, RECORD
 
 _LINKS = 30_000
 """Names that a file system lets one file have, and then some."""

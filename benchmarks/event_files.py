@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.columns import EVENT_CHUNK
+from sliplab.storage.trials.hdf5_writer import EVENT_CHUNK
 
 WIDTH, HEIGHT = 640, 480
 Lists = list[list[list[int]]]

@@ -25,8 +25,8 @@ from sliplab.analysis.networks.network import build, weights
 from sliplab.analysis.windows import dataset
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.protocols import load_plan
-from sliplab.storage.objects import Remote
-from sliplab.storage.remote.manifest import of_trial
+from sliplab.storage.remote.manifest import trial_manifest
+from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
@@ -49,9 +49,9 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
             store = Store.open(campaign.folder.parent.parent)
             found = list(campaign.recordings())
             each = len(found)
-            sizes = [of_trial(campaign, item.trial_id).files for item in found]
+            sizes = [trial_manifest(campaign, item.trial_id).files for item in found]
             figures[f"{prefix}bytes"] = (
-                sum(said["bytes"] for files in sizes for said in files.values()) / each
+                sum(known.bytes for files in sizes for known in files.values()) / each
             )
             figures[f"{prefix}events"] = sum(r.record.counts.events for r in found) / each
             steps: dict[str, Callable[[Recording], object]] = {
@@ -107,7 +107,7 @@ def _rates(store: Store, runs: int, places: dict[str, Callable[[], str]]) -> Fig
         sent: list[int] = []
 
         def send(read_back: bool, new: Callable[[], str] = new, sent: list[int] = sent) -> None:
-            done = push(store, Remote(new()), wishes=PushOptions(read_back=read_back))
+            done = push(store, Remote(new()), options=PushOptions(read_back=read_back))
             sent.append(done.bytes)
 
         taken = alternate(runs, checked=lambda: send(True), sizes=lambda: send(False))

@@ -20,7 +20,8 @@ from sliplab.rigs.scene.frames import FrameOptics, PlateView
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.formats.aedat4 import Aedat4File
 from sliplab.storage.streams import U8, EventChunk
-from sliplab.storage.trials.hdf5 import StreamFile, StreamReader
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import StreamFile
 from sliplab.storage.trials.video import VideoWriter, read_frames
 
 CHUNK = 20_000

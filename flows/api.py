@@ -380,12 +380,12 @@ def open_store(place: str | Path) -> Store:
     Raises:
         StoreError: there is none, it is damaged, or a newer version wrote it.
     """
-    from sliplab.storage.remote.mirror import open_mirror
-    from sliplab.storage.urls import is_url
+    from sliplab.storage.remote import mirror
+    from sliplab.storage.remote.objects import is_url
 
     if is_url(str(place)):
-        return Store(open_mirror(str(place))[0])
-    return Store(TrialStore.open(Path(place)))
+        return Store(mirror.open_mirror(str(place))[0])
+    return Store(mirror.open_store(Path(place)))
 
 
 def load_model(path: str | Path) -> Model:

@@ -37,9 +37,9 @@ def run_step(
     Args:
         dask: the scheduler whose workers take the trials.
     """
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    store = Store.open(folder)
+    store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
     from sliplab.flows.running.cluster import connected

@@ -32,7 +32,7 @@ from sliplab.protocols.timing import DeviceClock, Timing
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.trial import Clocks, DeviceRecord
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.recording import Recording
 
 I64 = npt.NDArray[np.int64]

@@ -41,7 +41,7 @@ def located(place: str) -> Path:
         StoreError: there is none.
     """
     from sliplab.storage.remote.mirror import open_mirror
-    from sliplab.storage.urls import is_url
+    from sliplab.storage.remote.objects import is_url
 
     if not is_url(place):
         return Path(place)

@@ -75,9 +75,9 @@ def export(
     """Write trials as files that other programs read, or their labels as a table."""
     from sliplab.storage.formats.export_trials import SUFFIXES, export_trials
     from sliplab.storage.formats.tables import label_table, write_table
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    opened = Store.open(store)
+    opened = open_store(store)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}
     if what in campaigns:
         campaign, names = campaigns[what], sorted(campaigns[what].committed())

@@ -38,9 +38,9 @@ def generalise(
     as_json: JsonOption = False,
 ) -> None:
     """Train without a level and test on it; test the network on other simulated skins."""
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    store = Store.open(folder)
+    store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
     from sliplab.analysis.sweeps.generalisation import COLUMNS, row_cells

@@ -24,9 +24,9 @@ def guesses(
     as_json: JsonOption = False,
 ) -> None:
     """Take some test trials again with each guess 20 % down and up, and judge them anew."""
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    store = Store.open(folder)
+    store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
     from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS

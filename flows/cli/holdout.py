@@ -25,9 +25,9 @@ def holdout(
     as_json: JsonOption = False,
 ) -> None:
     """Judge the network once on another simulated skin and seed, which choose nothing."""
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    store = Store.open(folder)
+    store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
     from sliplab.flows.holdout import measure_holdout

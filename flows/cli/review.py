@@ -34,7 +34,7 @@ def review(
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
     from sliplab.flows.reviewing.review_server import serve
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
     def ready(address: str, trials: TrialList) -> None:
         waiting = sum(row.state in {"open", "stale"} for row in trials.rows)
@@ -45,7 +45,7 @@ def review(
             console.say(f"{len(trials.rows)} trials, {waiting} to decide. Ctrl-C ends the page:")
             console.show(address)
 
-    serve(Store.open(store), campaign or (), port, who, ready)
+    serve(open_store(store), campaign or (), port, who, ready)
 
 
 @app.command()
@@ -62,9 +62,9 @@ def view(
 ) -> None:
     """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
     from sliplab.flows.reviewing import view as looking
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
-    subject = looking.find(Store.open(store), trial, campaign)
+    subject = looking.find(open_store(store), trial, campaign)
     if save is None:
         looking.show(subject)
         if as_json:

@@ -191,9 +191,9 @@ def report(
     result = run_step(folder, campaign, "report")
     if against is not None:
         from sliplab.flows.reporting import report, report_against_page
-        from sliplab.storage.trials.store import Store
+        from sliplab.storage.remote.mirror import open_store
 
-        compared = report.against(Store.open(folder), against)
+        compared = report.against(open_store(folder), against)
         if as_json:
             result["against"] = compared
         else:

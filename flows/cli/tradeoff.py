@@ -164,10 +164,10 @@ def _detector(
     options: dict[str, Any],
     as_json: bool,
 ) -> None:
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
     folder = located(place)
-    store = Store.open(folder)
+    store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
     from sliplab.analysis.report.tradeoff_detector import short_table

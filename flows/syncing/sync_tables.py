@@ -12,7 +12,7 @@ from sliplab.flows.syncing.sync_numbers import PULSES, campaign_numbers
 from sliplab.flows.syncing.sync_series import All
 from sliplab.flows.syncing.sync_trials import TrialClocks
 from sliplab.storage.schema.trial import DEVICES, Gate, TrialRecord
-from sliplab.storage.trials.writer import RECORD
+from sliplab.storage.trials.checksums import RECORD
 
 ROWS = 10
 """So many of the worst trials are shown."""

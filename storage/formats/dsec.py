@@ -1,7 +1,8 @@
 """HDF5 files with events: DSEC's layout, ours, and the lab's with seconds as floats.
 
 A foreign file's columns may be links out of it, larger than any disk, or packed by filters that are
-not here. `storage.trials.rows` refuses the first; the second is held against the bytes of the file.
+not here. `storage.trials.hdf5_reader` refuses the first; the second is held against the bytes of
+the file.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sliplab.storage.formats.foreign import (
     rounded_us,
 )
 from sliplab.storage.streams import I64, EventChunk
-from sliplab.storage.trials.rows import RowFile, Rows
+from sliplab.storage.trials.hdf5_reader import RowFile, Rows
 
 PIECE = 1 << 20
 _MOST_PACKED = 2000

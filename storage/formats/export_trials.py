@@ -10,12 +10,11 @@ import numpy as np
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
-from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, TRIGGERS, Aedat4Writer, Stream
+from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.formats.dsec import write_dsec
 from sliplab.storage.formats.foreign import Triggers
 from sliplab.storage.formats.import_trials import RISING
 from sliplab.storage.formats.manifest import FORMAT, MANIFEST
-from sliplab.storage.formats.read_aedat4 import SIMULATED
 from sliplab.storage.streams import I64, EventChunk, Json
 from sliplab.storage.trials.recording import Recording
 

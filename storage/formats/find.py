@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.formats.aedat4 import LINE
+from sliplab.storage.formats.aedat4 import LINE, read_aedat4
 from sliplab.storage.formats.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
 from sliplab.storage.formats.foreign import ForeignTrial, FormatError, read_head
 from sliplab.storage.formats.lab_pickles import pairs, read_pair
 from sliplab.storage.formats.manifest import as_it_was, read_manifest
 from sliplab.storage.formats.prophesee import faery_type, read_by_faery
-from sliplab.storage.formats.read_aedat4 import read_aedat4
 
 Reader = Callable[[Path, str], ForeignTrial]
 READERS: dict[str, tuple[tuple[str, ...], Reader]] = {

@@ -1,33 +1,41 @@
-"""What makes a pushed campaign or trial visible: one small object that lists all of its files.
+"""Manifests: one small object that lists all files of a campaign or trial, and makes it visible.
 
-    URL/sliplab.json                         which layout this is
-    URL/campaigns/NAME/objects/SHA256        files by their content, put once and never changed
+    URL/sliplab.json                         version of this layout
+    URL/campaigns/NAME/objects/SHA256        files by their content, written once, never changed
     URL/campaigns/NAME/about.json            manifest of campaign.json, protocol, rig file, bench
-    URL/campaigns/NAME/trials/ID.json        manifest of a committed trial, put after its files
-    URL/campaigns/NAME/quarantine/ID.N.json  manifest of what was set aside, where asked for
+    URL/campaigns/NAME/trials/ID.json        manifest of a committed trial, written after its files
+    URL/campaigns/NAME/quarantine/ID.N.json  manifest of a quarantined folder, where asked for
 
-A manifest comes from elsewhere and is believed in nothing: names are plain file names of the kinds
-that belong there, objects are found by their checksums, so no path in it leads anywhere.
+A manifest comes from elsewhere and is not trusted: names are plain file names of the kinds that
+belong there, and objects are found by their checksums, so that no path in it leads anywhere.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from sliplab.protocols.hashing import hash_data
-from sliplab.storage.fetching import objects_folder
-from sliplab.storage.files import json_text, read_json, safe_name, sha256
-from sliplab.storage.objects import SMALL_BYTES, Remote, RemoteError, RemoteMissing
-from sliplab.storage.streams import Json
-from sliplab.storage.trials.checksums import read_sums
+from sliplab.storage.files import json_text, read_json, safe_name
+from sliplab.storage.remote.objects import SMALL_BYTES, Remote, RemoteError, RemoteMissing
+from sliplab.storage.trials.checksums import (
+    CHECKSUMS,
+    DATA,
+    FRAMES,
+    PROVENANCE,
+    RECORD,
+    SPOOL,
+    Checksum,
+    Checksums,
+    as_json,
+    read_sums,
+)
 from sliplab.storage.trials.decisions import SKIPPED
 from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError
-from sliplab.storage.trials.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD, SPOOL
 
 Kind = Literal["about", "trials", "quarantine"]
 FORMAT = 1
@@ -48,43 +56,48 @@ _MOST_FILES = 10_000
 
 @dataclass(frozen=True)
 class Manifest:
-    """All files of a campaign's description, a trial, or something in quarantine.
+    """All files of a campaign's description, a trial, or a quarantined folder.
 
     Attributes:
         name: the folder's; empty for a description.
-        files: ``sha256`` and ``bytes`` by path below the folder.
-        take: stands for the raw data and the record; empty where there are no checksums.
+        files: checksums by path below the folder.
+        take: hash of the checksums of raw data and record; empty where there are none.
     """
 
     kind: Kind
     campaign: str
     name: str
-    files: Json
+    files: Checksums
     take: str = ""
 
     @property
     def key(self) -> str:
-        """Where it stands below the URL."""
+        """Key of this manifest."""
         return manifest_key(self.kind, self.campaign, self.name)
 
     def object_key(self, file: str) -> str:
-        """Where one of its files stands below the URL."""
-        return f"{objects_folder(self.campaign)}/{self.files[file]['sha256']}"
+        """Return the key of one of its files."""
+        return f"{objects_folder(self.campaign)}/{self.files[file].sha256}"
 
     def dump(self) -> bytes:
-        """As an object; equal manifests are equal bytes."""
-        data = {"format": FORMAT, **vars(self)}
+        """Return it as an object; equal manifests are equal bytes."""
+        data = {"format": FORMAT, **vars(self), "files": as_json(self.files)}
         return json_text({**data, "sum": hash_data(data)}).encode()
 
 
 def manifest_key(kind: Kind, campaign: str, name: str = "") -> str:
-    """Where a manifest stands below the URL."""
+    """Return the key of a manifest."""
     folder = f"campaigns/{safe_name(campaign)}/{kind}"
     return f"{folder}/{safe_name(name)}.json" if name else f"{folder}.json"
 
 
+def objects_folder(campaign: str) -> str:
+    """Return the folder of a campaign's files."""
+    return f"campaigns/{safe_name(campaign)}/objects"
+
+
 def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Manifest:
-    """A manifest that was read from `where`.
+    """Check a manifest that was read from `where`.
 
     Raises:
         RemoteError: it is damaged, of a newer version, of something else, or names a file that
@@ -108,34 +121,23 @@ def parse(data: bytes, kind: Kind, campaign: str, name: str, where: str) -> Mani
     files, take = found.get("files"), found.get("take")
     if not isinstance(files, dict) or not isinstance(take, str) or len(files) > _MOST_FILES:
         raise RemoteError(f"{where}: lists no files")
-    for path, known in files.items():
-        if not _belongs(kind, path):
+    sums: Checksums = {}
+    for path, item in files.items():
+        if path not in ALLOWED[kind] and not (kind == "about" and _BENCH.fullmatch(path)):
             raise RemoteError(f"{where}: names the file '{path}', which does not belong there")
-        if not _plain(known):
+        known = Checksum.parse(item)
+        if known is None or not _SHA256.fullmatch(known.sha256) or known.bytes < 0:
             raise RemoteError(f"{where}: has no checksum of {path}")
+        sums[path] = known
     if missing := NEEDED[kind] - files.keys():
         raise RemoteError(f"{where}: lacks {', '.join(sorted(missing))}")
-    return Manifest(kind, campaign, name, files, take)
-
-
-def _belongs(kind: Kind, path: str) -> bool:
-    return path in ALLOWED[kind] or (kind == "about" and _BENCH.fullmatch(path) is not None)
-
-
-def _plain(known: Any) -> bool:
-    return (
-        isinstance(known, dict)
-        and isinstance(known.get("sha256"), str)
-        and _SHA256.fullmatch(known["sha256"]) is not None
-        and type(known.get("bytes")) is int
-        and known["bytes"] >= 0
-    )
+    return Manifest(kind, campaign, name, sums, take)
 
 
 def read_manifests(
     remote: Remote, campaign: str, kind: Kind, only: str = ""
 ) -> dict[str, Manifest | RemoteError]:
-    """Every manifest of a kind by its name; what is wrong with it in place of one that is.
+    """Read every manifest of a kind, by its name; an error stands for a bad one.
 
     Args:
         only: the one of this name.
@@ -157,9 +159,9 @@ def read_manifests(
         except StoreError as error:
             found[name] = RemoteError(f"{remote.url}: campaign {campaign}: {error}")
     for key, data in remote.read_many(list(keys)).items():
-        name = keys[key]
         if isinstance(data, RemoteMissing):
             continue
+        name = keys[key]
         try:
             if isinstance(data, RemoteError):
                 raise data
@@ -169,8 +171,8 @@ def read_manifests(
     return found
 
 
-def of_campaign(campaign: Campaign) -> Manifest:
-    """The manifest of a campaign's description as it is on disk.
+def campaign_manifest(campaign: Campaign) -> Manifest:
+    """Make the manifest of a campaign's description as it is on disk.
 
     Raises:
         ValueError: it is just being written, or damaged; the message names the file.
@@ -179,72 +181,64 @@ def of_campaign(campaign: Campaign) -> Manifest:
     sums = read_sums(folder, (PROTOCOL, RIG, INFO))
     files = {name: sums[name] for name in (PROTOCOL, RIG, INFO)}
     more = [CHECKSUMS, *([SKIPPED] if (folder / SKIPPED).exists() else [])]
-    more += sorted(
-        f"bench/{path.name}"
-        for path in (folder / "bench").glob("*.json")
-        if _BENCH.fullmatch(f"bench/{path.name}")
-    )
-    files |= {name: _measured(folder / name) for name in more}
-    return Manifest("about", campaign.name, "", files)
+    bench = sorted(f"bench/{path.name}" for path in (folder / "bench").glob("*.json"))
+    more += filter(_BENCH.fullmatch, bench)
+    return Manifest("about", campaign.name, "", files | _measured(folder, more))
 
 
-def of_trial(campaign: Campaign, trial_id: str) -> Manifest:
-    """The manifest of a committed trial, by its checksums; its big files are not read.
+def trial_manifest(campaign: Campaign, trial_id: str) -> Manifest:
+    """Make the manifest of a committed trial from its checksums; its big files are not read.
 
     Raises:
         ValueError: its checksums are missing or damaged.
         OSError: it went away meanwhile.
     """
     folder = campaign.folder / "trials" / safe_name(trial_id)
-    sums = read_sums(folder)
-    files = {name: {key: sums[name][key] for key in ("sha256", "bytes")} for name in sums}
-    files |= {name: _measured(folder / name) for name in (CHECKSUMS, PROVENANCE)}
+    files = read_sums(folder) | _measured(folder, (CHECKSUMS, PROVENANCE))
     return Manifest("trials", campaign.name, trial_id, files, take_of(folder))
 
 
-def of_quarantined(campaign: Campaign, name: str) -> Manifest:
-    """The manifest of something in quarantine, all of it read.
+def quarantine_manifest(campaign: Campaign, name: str) -> Manifest:
+    """Make the manifest of a quarantined folder; all of it is read.
 
     Raises:
         OSError: it cannot be read, or lacks its cause.
     """
     folder = campaign.folder / "quarantine" / safe_name(name)
-    files = {
-        file: _measured(folder / file)
-        for file in sorted(ALLOWED["quarantine"])
-        if (folder / file).is_file() or file == CAUSE
-    }
-    return Manifest("quarantine", campaign.name, name, files)
+    names = {file for file in ALLOWED["quarantine"] if (folder / file).is_file()} | {CAUSE}
+    return Manifest("quarantine", campaign.name, name, _measured(folder, sorted(names)))
 
 
 def take_of(folder: Path) -> str:
-    """What stands for the raw data and record of a trial's folder; empty without checksums."""
+    """Return the hash of the checksums in a trial's folder; empty without checksums."""
     try:
         return hash_data(read_json(folder / CHECKSUMS))
     except (OSError, ValueError):
         return ""
 
 
-def check_against_sums(manifest: Manifest, sums: Json, where: str) -> None:
-    """A trial's manifest must say what the trial's own checksums say.
+def check_against_sums(manifest: Manifest, sums: Any, where: str) -> None:
+    """Check that a trial's manifest has the checksums that the trial itself has.
+
+    Args:
+        sums: the content of the trial's `checksums.json`.
 
     Raises:
-        RemoteError: it does not.
+        RemoteError: it has others.
     """
-    told = {
-        name: known for name, known in manifest.files.items() if name not in {CHECKSUMS, PROVENANCE}
-    }
+    apart = {CHECKSUMS, PROVENANCE}
+    stated = {name: known for name, known in manifest.files.items() if name not in apart}
     try:
-        same = told == {
-            name: {key: sums[name][key] for key in ("sha256", "bytes")} for name in sums
-        } and manifest.take == hash_data(sums)
-    except (KeyError, TypeError, ValueError):
+        own = {name: Checksum.parse(item) for name, item in sums.items()}
+        same = stated == own and manifest.take == hash_data(sums)
+    except (AttributeError, TypeError, ValueError):
         same = False
     if not same:
         raise RemoteError(f"{where}: is not what the trial's {CHECKSUMS} says")
 
 
-def _measured(path: Path) -> Json:
-    if path.is_symlink():
-        raise StoreError(f"{path}: is a link, which is not pushed")
-    return {"sha256": sha256(path), "bytes": path.stat().st_size}
+def _measured(folder: Path, names: Sequence[str]) -> Checksums:
+    for name in names:
+        if (folder / name).is_symlink():
+            raise StoreError(f"{folder / name}: is a link, which is not pushed")
+    return {name: Checksum.of(folder / name) for name in names}

@@ -11,32 +11,39 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 from sliplab.protocols.hashing import hash_text
-from sliplab.storage.errors import translated_disk_errors
-from sliplab.storage.fetching import ORIGIN, origin_of, remote_at
+from sliplab.storage.errors import StoreError, translated_disk_errors
 from sliplab.storage.files import make_folder, write_json
-from sliplab.storage.objects import Remote, RemoteError, RemoteMissing
-from sliplab.storage.remote.download import download_folder
-from sliplab.storage.remote.manifest import Manifest, read_manifests
-from sliplab.storage.remote.pull import PullResult, pull
-from sliplab.storage.trials.checksums import partial
+from sliplab.storage.remote.manifest import objects_folder, read_manifests
+from sliplab.storage.remote.objects import Remote, RemoteError, RemoteMissing, check_url, is_url
+from sliplab.storage.remote.pull import ORIGIN, PullResult, download, origin_of, pull
+from sliplab.storage.trials.checksums import Checksum, incomplete
 from sliplab.storage.trials.store import FORMAT, STORE, Store
-from sliplab.storage.urls import check_url, is_url
 
 CACHE = "SLIPLAB_CACHE"
-"""Names the folder that mirrors stand in."""
+"""Environment variable of the folder with all mirrors."""
 
 
 def mirror_folder(url: str) -> Path:
-    """Where the mirror of `url` stands on this machine."""
+    """Return the folder of the mirror of `url` on this machine."""
     url = check_url(url)
     configured = os.environ.get(CACHE)
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     base = Path(configured) if configured else Path(cache) / "sliplab"
     name = re.sub(r"[^A-Za-z0-9]+", "-", url.rpartition("/")[2]).strip("-") or "store"
     return base.absolute() / f"{name[:40]}-{hash_text(url)[:12]}"
+
+
+def open_store(folder: Path) -> Store:
+    """Open the store in `folder`; in a mirror, files are fetched when they are read.
+
+    Raises:
+        StoreError: as `Store.open`.
+    """
+    return Store.open(folder, None if origin_of(folder) is None else fetch)
 
 
 def open_mirror(
@@ -47,53 +54,46 @@ def open_mirror(
     Raises:
         RemoteError: nothing was pushed there, or the storage cannot be reached.
         StoreError: the cache folder cannot be used.
-        Locked: another program brings it up to date just now.
+        Locked: another program updates it just now.
     """
     folder = mirror_folder(url)
     with translated_disk_errors(folder):
         make_folder(folder)
     done = pull(Remote(url), folder, small=True, on_trial=on_trial)
-    return Store.open(folder), done
+    return open_store(folder), done
 
 
 def place_of(store: Store) -> str:
-    """By what another process, perhaps on another machine, finds the same store: path or URL."""
+    """Return the path or URL by which another process, perhaps elsewhere, finds the store."""
     url = origin_of(store.folder)
     if url is not None and store.folder.absolute() == mirror_folder(url):
         return url
     return str(store.folder.resolve())
 
 
-def reach(place: str, campaign: str, trial: str) -> Store:
-    """The store at a path or URL with one of its trials, for a process that works on just that.
+def open_for_trial(place: str, campaign: str, trial: str) -> Store:
+    """Open the store at a path or URL for a process that works on one of its trials.
 
     Raises:
         StoreError: there is no such store here, or no such trial in it.
     """
     if not is_url(place):
-        return Store.open(Path(place))
-    store = _bare_mirror(place)
+        return open_store(Path(place))
+    folder = mirror_folder(place)
+    if not (folder / STORE).is_file() or origin_of(folder) is None:
+        with translated_disk_errors(folder):  # several processes may do this at once
+            make_folder(folder)
+            write_json(folder / ORIGIN, {"url": check_url(place)})
+            write_json(folder / STORE, {"format": FORMAT})
+    store = open_store(folder)
     target = store.campaign(campaign).folder / "trials" / trial
-    if partial(target) is not None:
-        _bring_one(remote_at(place), campaign, trial, target)
+    if incomplete(target) is not None:
+        _download_trial(remote_at(place), campaign, trial, target)
     return store
 
 
-def _bare_mirror(url: str) -> Store:
-    """The mirror's folder with whatever it holds so far; several processes may do this at once."""
-    folder = mirror_folder(url)
-    if not (folder / STORE).is_file() or origin_of(folder) is None:
-        with translated_disk_errors(folder):
-            make_folder(folder)
-            write_json(folder / ORIGIN, {"url": check_url(url)})
-            write_json(folder / STORE, {"format": FORMAT})
-    return Store.open(folder)
-
-
-def _bring_one(remote: Remote, campaign: str, trial: str, target: Path) -> None:
-    found: Manifest | RemoteError | None = read_manifests(
-        remote, campaign, "trials", only=trial
-    ).get(trial)
+def _download_trial(remote: Remote, campaign: str, trial: str, target: Path) -> None:
+    found = read_manifests(remote, campaign, "trials", only=trial).get(trial)
     if found is None:
         raise RemoteMissing(f"{remote.url}: has no trial {trial} of campaign {campaign}")
     if isinstance(found, RemoteError):
@@ -102,6 +102,28 @@ def _bring_one(remote: Remote, campaign: str, trial: str, target: Path) -> None:
     with translated_disk_errors(target):
         for name in ("trials", "incoming"):
             make_folder(folder / name)
-        download_folder(
-            remote, found, folder / "incoming" / f"{trial}.{os.getpid()}", target, small=True
-        )
+        staging = folder / "incoming" / f"{trial}.{os.getpid()}"
+        download(remote, found, staging, target, small=True)
+
+
+def fetch(path: Path, known: Checksum) -> None:
+    """Fetch a file of a trial that the mirror has left out until now.
+
+    Raises:
+        StoreError: it is not at the URL any more, damaged there, or the storage cannot be reached.
+    """
+    campaign, store = path.parents[2].name, path.parents[4]
+    url = origin_of(store)
+    if url is None:
+        raise StoreError(f"{path}: is missing, and {store / ORIGIN} does not say where it is")
+    try:
+        with translated_disk_errors(store):
+            remote_at(url).get(f"{objects_folder(campaign)}/{known.sha256}", path, known)
+    except RemoteError as error:
+        raise RemoteError(f"{path}: {error}") from None
+
+
+@lru_cache(maxsize=4)
+def remote_at(url: str) -> Remote:
+    """Return the storage at `url`, kept open: many files of one trial come from there."""
+    return Remote(url)

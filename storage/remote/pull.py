@@ -1,4 +1,4 @@
-"""Bringing pushed campaigns back: files are checked on their way, trials appear by one rename.
+"""Pull of pushed campaigns: files are checked while they arrive, trials appear by one rename.
 
 What comes from elsewhere writes nothing but files of known names inside the store's own folders.
 """
@@ -6,27 +6,50 @@ What comes from elsewhere writes nothing but files of known names inside the sto
 from __future__ import annotations
 
 import hashlib
+import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.storage.errors import StoreError, translated_disk_errors
-from sliplab.storage.fetching import ORIGIN, origin_of
-from sliplab.storage.files import make_folder, safe_name, sync_folder, write_bytes, write_json
-from sliplab.storage.objects import OnBytes, Remote, RemoteError
-from sliplab.storage.remote.download import BIG, download_folder, get, holds
-from sliplab.storage.remote.manifest import Manifest, read_manifests, take_of
-from sliplab.storage.trials.checksums import ELSEWHERE, partial, to_fetch
+from sliplab.storage.files import (
+    make_folder,
+    read_json,
+    safe_name,
+    sync_folder,
+    write_bytes,
+    write_json,
+)
+from sliplab.storage.remote.manifest import (
+    Manifest,
+    check_against_sums,
+    read_manifests,
+    take_of,
+)
+from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError
+from sliplab.storage.trials.checksums import (
+    CHECKSUMS,
+    DATA,
+    ELSEWHERE,
+    FRAMES,
+    incomplete,
+    read_sums,
+    to_fetch,
+)
 from sliplab.storage.trials.lock import STORE_LOCK, exclusive
 from sliplab.storage.trials.store import Campaign, Store
-from sliplab.storage.trials.writer import CHECKSUMS
 
+ORIGIN = "origin.json"
+"""In a store that was pulled: its URL."""
+BIG = frozenset({DATA, FRAMES})
+"""Files of a trial that a mirror fetches when they are first read."""
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
 
 
 @dataclass
 class PullResult:
-    """Result of a pull.
+    """Counts of a pull.
 
     Attributes:
         trials: visible at the URL; pulled and replaced: of these, downloaded now; there: they had
@@ -46,6 +69,14 @@ class PullResult:
     problems: list[str] = field(default_factory=list)
 
 
+def origin_of(folder: Path) -> str | None:
+    """Return the URL that the store in `folder` was pulled from; None for any other store."""
+    try:
+        return str(read_json(folder / ORIGIN)["url"])
+    except (OSError, ValueError, KeyError):
+        return None
+
+
 def pull(
     remote: Remote,
     folder: Path,
@@ -60,11 +91,11 @@ def pull(
 
     A store that was pulled from here before follows: its descriptions are updated, and
     trials that were taken again, or withdrawn, go to quarantine. In any other store nothing that
-    is there is changed.
+    exists is changed.
 
     Args:
         campaigns: only these.
-        quarantine: what was set aside and pushed, too.
+        quarantine: pushed quarantine, too.
         small: leave out events and videos until they are read, as a mirror does.
         on_trial: called with each trial's id once it is done with.
 
@@ -96,8 +127,12 @@ def pull(
     return done
 
 
+class _Differs(StoreError):
+    """This store has something else under that name."""
+
+
 class _Pull:
-    """One campaign on its way."""
+    """Pull of one campaign."""
 
     def __init__(
         self,
@@ -130,7 +165,7 @@ class _Pull:
             try:
                 if isinstance(known, RemoteError):
                     raise known
-                self._one(known)
+                self._pull_trial(known)
             except (_Differs, RemoteError) as error:
                 self._done.problems.append(str(error))
             if on_trial is not None:
@@ -144,11 +179,11 @@ class _Pull:
             self._pull_quarantine()
 
     def _describe(self, about: Manifest) -> None:
-        """The campaign's own files: all of them, then their checksums."""
+        """Download the campaign's own files: all of them, then their checksums."""
         folder = self._campaign.folder
         for name in _FOLDERS:
-            make_folder(self._campaign._inside(folder / name))
-        lacks = [name for name, said in about.files.items() if not holds(folder / name, said)]
+            make_folder(self._campaign.inside(folder / name))
+        lacks = [name for name, known in about.files.items() if known.problem(folder / name)]
         if not lacks:
             return
         if not self._follows:
@@ -158,26 +193,26 @@ class _Pull:
                         f"{folder / name}: differs from that at {self._remote.url}; pull into "
                         "another store"
                     )
-        files = {name: self._small_object(about, name) for name in lacks}
+        files = {name: self._read_object(about, name) for name in lacks}
         if CHECKSUMS in files:
             (folder / CHECKSUMS).unlink(missing_ok=True)
             sync_folder(folder)
         for name in sorted(files, key=lambda name: name == CHECKSUMS):
             write_bytes(folder / name, files[name])
-            self._fetched(len(files[name]))
+            self._count(len(files[name]))
 
-    def _small_object(self, about: Manifest, name: str) -> bytes:
+    def _read_object(self, about: Manifest, name: str) -> bytes:
         key = about.object_key(name)
         data = self._remote.read(key)
-        if hashlib.sha256(data).hexdigest() != about.files[name]["sha256"]:
+        if hashlib.sha256(data).hexdigest() != about.files[name].sha256:
             raise RemoteError(f"{self._remote.where(key)}: {name} does not match its checksum")
         return data
 
-    def _one(self, manifest: Manifest) -> None:
-        target = self._campaign._inside(self._campaign.folder / "trials" / manifest.name)
+    def _pull_trial(self, manifest: Manifest) -> None:
+        target = self._campaign.inside(self._campaign.folder / "trials" / manifest.name)
         replaced = False
         if target.exists():
-            cause = partial(target) if target.is_dir() else "is no folder"
+            cause = incomplete(target) if target.is_dir() else "is no folder"
             if cause is None and take_of(target) == manifest.take:
                 self._complete(target, manifest)
                 self._done.there += 1
@@ -190,12 +225,10 @@ class _Pull:
             reason = f"damaged: {cause}" if cause else f"replaced: another is at {self._remote.url}"
             self._campaign.quarantine(target, reason)
             replaced = cause is None
-        staging = self._campaign._inside(self._campaign.folder / "incoming" / manifest.name)
+        staging = self._campaign.inside(self._campaign.folder / "incoming" / manifest.name)
         if staging.exists() and not (staging / ELSEWHERE).exists():
             self._campaign.quarantine(staging, "interrupted")
-        download_folder(
-            self._remote, manifest, staging, target, small=self._small, on_file=self._counted
-        )
+        download(self._remote, manifest, staging, target, small=self._small, on_file=self._count)
         if replaced:
             self._done.replaced += 1
         else:
@@ -207,33 +240,84 @@ class _Pull:
             return
         for name in sorted(BIG & manifest.files.keys()):
             if to_fetch(target / name):
-                self._counted(get(self._remote, manifest, name, target / name))
+                self._count(_get(self._remote, manifest, name, target))
         (target / ELSEWHERE).unlink()
         sync_folder(target)
 
     def _pull_quarantine(self) -> None:
         for name, known in read_manifests(self._remote, self._campaign.name, "quarantine").items():
-            target = self._campaign._inside(self._campaign.folder / "quarantine" / name)
+            target = self._campaign.inside(self._campaign.folder / "quarantine" / name)
             if target.exists():
                 continue
             try:
                 if isinstance(known, RemoteError):
                     raise known
                 staging = self._campaign.folder / "incoming" / f"{name}.aside"
-                download_folder(self._remote, known, staging, target, on_file=self._counted)
+                download(self._remote, known, staging, target, on_file=self._count)
                 self._done.set_aside += 1
             except RemoteError as error:
                 self._done.problems.append(str(error))
 
-    def _counted(self, size: int) -> None:
-        self._fetched(size)
+    def _count(self, size: int) -> None:
+        self._done.files += 1
+        self._done.bytes += size
         if self._on_bytes is not None:
             self._on_bytes(size)
 
-    def _fetched(self, size: int) -> None:
-        self._done.files += 1
-        self._done.bytes += size
+
+def download(
+    remote: Remote,
+    manifest: Manifest,
+    staging: Path,
+    target: Path,
+    *,
+    small: bool = False,
+    on_file: Callable[[int], None] | None = None,
+) -> None:
+    """Download a manifest's folder: all files into `staging`, each checked, then one rename.
+
+    Files that an interrupted download left in `staging` are used. If another process made
+    `target` meanwhile, that one stays.
+
+    Args:
+        on_file: called with the bytes of each file that was fetched.
+
+    Raises:
+        RemoteError: a file does not match its manifest, or cannot be fetched.
+    """
+    make_folder(staging)
+    marker = staging / ELSEWHERE
+    write_json(marker, {"take": manifest.take})
+    for name, known in sorted(manifest.files.items()):
+        if small and name in BIG:
+            continue
+        if known.problem(staging / name) is not None:
+            size = _get(remote, manifest, name, staging)
+            if on_file is not None:
+                on_file(size)
+    if manifest.kind == "trials":
+        try:
+            read_sums(staging)
+            check_against_sums(manifest, read_json(staging / CHECKSUMS), remote.where(manifest.key))
+        except ValueError as error:
+            raise RemoteError(f"{remote.where(manifest.key)}: {error}") from None
+    if not small:
+        marker.unlink()
+    sync_folder(staging)
+    try:
+        os.rename(staging, target)
+    except OSError:
+        if not target.is_dir():
+            raise
+        shutil.rmtree(staging)  # another process was first
+        return
+    sync_folder(target.parent)
 
 
-class _Differs(StoreError):
-    """This store has something else under that name."""
+def _get(remote: Remote, manifest: Manifest, name: str, folder: Path) -> int:
+    """Fetch one file of a manifest; return its size in bytes."""
+    try:
+        remote.get(manifest.object_key(name), folder / name, manifest.files[name])
+    except RemoteError as error:
+        raise RemoteError(f"{remote.where(manifest.key)}: {name}: {error}") from None
+    return manifest.files[name].bytes

@@ -1,7 +1,7 @@
-"""Pushing committed trials to shared or object storage: each is visible there whole, or not at all.
+"""Push of committed trials to shared or object storage: each is visible there complete or not.
 
 Files go first, each read back and held against its checksum; the trial's manifest goes last. Only
-what is committed is read, so a campaign may run meanwhile. What is there already is not sent again.
+committed trials are read, so a campaign may run meanwhile. What exists there is not sent again.
 """
 
 from __future__ import annotations
@@ -12,23 +12,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.storage.errors import StoreError
-from sliplab.storage.fetching import objects_folder
-from sliplab.storage.objects import OnBytes, Remote, RemoteError, RemoteMissing
-from sliplab.storage.remote import manifest as manifests
-from sliplab.storage.remote.manifest import Kind, Manifest, read_manifests
-from sliplab.storage.streams import Json
-from sliplab.storage.trials.checksums import byte_problem
+from sliplab.storage.remote.manifest import (
+    Kind,
+    Manifest,
+    campaign_manifest,
+    objects_folder,
+    quarantine_manifest,
+    read_manifests,
+    take_of,
+    trial_manifest,
+)
+from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError, RemoteMissing
+from sliplab.storage.trials.checksums import Checksum
 from sliplab.storage.trials.store import AGAIN, INFO, Campaign, Store
 
 OnTrial = Callable[[str], None]
 _TRIES = 2
+"""Of sending an object that comes back with other bytes."""
 _SAME = ("name", "protocol", "experiment", "rig", "simulated")
-"""What a campaign keeps for all its life; where these differ it is another one of that name."""
+"""Keys that a campaign keeps for all its life; where these differ it is another campaign."""
 
 
 @dataclass
 class PushResult:
-    """What a push did.
+    """Counts of a push.
 
     Attributes:
         trials: committed ones; pushed and replaced: of these, sent now, for the first time or
@@ -49,7 +56,7 @@ class PushResult:
     problems: list[str] = field(default_factory=list)
 
     def add(self, other: PushResult) -> None:
-        """Count what another round did; `trials` and `there` are those of the later one."""
+        """Add another round; `trials`, `there` and `problems` are those of the later one."""
         for name in ("pushed", "replaced", "withdrawn", "set_aside", "files", "bytes"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.trials, self.there, self.problems = other.trials, other.there, other.problems
@@ -57,12 +64,12 @@ class PushResult:
 
 @dataclass(frozen=True)
 class PushOptions:
-    """How a push is to be done.
+    """Options of a push.
 
     Attributes:
-        quarantine: what was set aside, too.
-        replace: also a trial of which another take is there that this store knows nothing of.
-        read_back: read every object that was sent; without it, only its size is looked at.
+        quarantine: push quarantine, too.
+        replace: also trials of which another take is there that this store knows nothing of.
+        read_back: read every object that was sent; without it, only its size is compared.
         check: read back what was there before, too, and send anew what is damaged.
     """
 
@@ -76,7 +83,7 @@ def push(
     store: Store,
     remote: Remote,
     campaigns: Sequence[Campaign] | None = None,
-    wishes: PushOptions | None = None,
+    options: PushOptions | None = None,
     on_trial: OnTrial | None = None,
     on_bytes: OnBytes | None = None,
 ) -> PushResult:
@@ -95,38 +102,46 @@ def push(
     remote.begin()
     done = PushResult()
     for campaign in store.campaigns() if campaigns is None else campaigns:
-        _Push(remote, campaign, wishes or PushOptions(), done, on_bytes).run(on_trial)
+        _Push(remote, campaign, options or PushOptions(), done, on_bytes).run(on_trial)
     return done
 
 
+class _Conflict(RemoteError):
+    """Two stores have campaigns of one name."""
+
+
 class _Push:
-    """One campaign on its way."""
+    """Push of one campaign.
+
+    Attributes:
+        sizes: bytes of the objects that exist, by SHA-256.
+        trusted: SHA-256 of objects that were read back, now or before a manifest was written.
+    """
 
     def __init__(
         self,
         remote: Remote,
         campaign: Campaign,
-        wishes: PushOptions,
+        options: PushOptions,
         done: PushResult,
         on_bytes: OnBytes | None,
     ) -> None:
-        self._remote, self._campaign, self._options = remote, campaign, wishes
+        self._remote, self._campaign, self._options = remote, campaign, options
         self._done, self._on_bytes = done, on_bytes
-        self._there: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}
         self._trusted: set[str] = set()
-        """Objects that a manifest names: they were read back before it was put."""
 
     def run(self, on_trial: OnTrial | None) -> None:
         name = self._campaign.name
         try:
-            about = manifests.of_campaign(self._campaign)
-            self._same_campaign()
+            about = campaign_manifest(self._campaign)
+            self._check_same_campaign()
         except (OSError, ValueError, StoreError) as error:
             if isinstance(error, RemoteError) and not isinstance(error, _Conflict):
                 raise
-            self._problem(f"{name}: {error}")
+            self._problem(f"{error}")
             return
-        self._there = self._remote.sizes(objects_folder(name))
+        self._sizes = self._remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
         self._send(about, self._campaign.folder, self._manifests("about").get(""))
         ours = set()
@@ -134,7 +149,7 @@ class _Push:
             trial = recording.folder.name
             ours.add(trial)
             self._done.trials += 1
-            self._one(trial, theirs.get(trial))
+            self._push_trial(trial, theirs.get(trial))
             if on_trial is not None:
                 on_trial(trial)
         for trial, pushed in theirs.items():
@@ -144,12 +159,12 @@ class _Push:
         if self._options.quarantine:
             self._push_quarantine()
 
-    def _one(self, trial: str, existing: Manifest | None) -> None:
+    def _push_trial(self, trial: str, existing: Manifest | None) -> None:
         folder = self._campaign.folder / "trials" / trial
         try:
-            made = manifests.of_trial(self._campaign, trial)
+            made = trial_manifest(self._campaign, trial)
         except (OSError, ValueError, StoreError) as error:
-            self._problem(f"{self._campaign.name}: {trial}: {error}")
+            self._problem(f"{trial}: {error}")
             return
         if existing is not None and existing.files == made.files:
             self._done.there += not self._options.check or self._send(made, folder, existing)
@@ -157,11 +172,10 @@ class _Push:
         foreign = existing is not None and existing.take not in {made.take, *self._takes(trial, "")}
         if foreign and not self._options.replace:
             self._problem(
-                f"{self._campaign.name}: {trial}: another take of it is there that is not of "
-                "this store; push to another place, or replace it with --replace"
+                f"{trial}: another take of it is there that is not of this store; push to another "
+                "place, or replace it with --replace"
             )
-            return
-        if self._send(made, folder, existing):
+        elif self._send(made, folder, existing):
             if existing is None:
                 self._done.pushed += 1
             else:
@@ -169,12 +183,12 @@ class _Push:
 
     def _push_quarantine(self) -> None:
         existing = self._manifests("quarantine")
-        for known in self._campaign.quarantined():
-            name = known["folder"]
+        for item in self._campaign.quarantined():
+            name = item["folder"]
             try:
-                made = manifests.of_quarantined(self._campaign, name)
+                made = quarantine_manifest(self._campaign, name)
             except (OSError, StoreError) as error:
-                self._problem(f"{self._campaign.name}: quarantine/{name}: {error}")
+                self._problem(f"quarantine/{name}: {error}")
                 continue
             if name in existing and existing[name].files == made.files and not self._options.check:
                 continue
@@ -182,79 +196,73 @@ class _Push:
                 self._done.set_aside += 1
 
     def _send(self, made: Manifest, folder: Path, existing: Manifest | None) -> bool:
-        """Objects, then the manifest. False where the files are not what they should be."""
-        for name, said in made.files.items():
-            problem = self._object(made.object_key(name), folder / name, said)
+        """Write the objects, then the manifest; False where a file is not what it should be."""
+        for name, known in made.files.items():
+            problem = self._send_object(made.object_key(name), folder / name, known)
             if problem is not None:
-                self._problem(f"{self._campaign.name}: {folder / name}: {problem}")
+                self._problem(f"{folder / name}: {problem}")
                 return False
         if made != existing:
-            self._remote.put_bytes(made.key, made.dump())
+            self._remote.put(made.key, made.dump())
         return True
 
-    def _object(self, key: str, path: Path, said: Json) -> str | None:
-        """Have a file's bytes under its checksum; what is wrong with the file, if it is."""
-        sha, size = said["sha256"], said["bytes"]
-        if self._there.get(sha) == size and (sha in self._trusted or self._right(key, said)):
+    def _send_object(self, key: str, path: Path, known: Checksum) -> str | None:
+        """Write a file under its checksum unless it exists; return the file's problem, if any."""
+        sha, size = known.sha256, known.bytes
+        if self._sizes.get(sha) == size and (sha in self._trusted or self._arrived(key, known)):
             self._trusted.add(sha)
             return None
-        if (problem := byte_problem(path, said)) is not None:
+        if (problem := known.problem(path)) is not None:
             return problem
         for _ in range(_TRIES):
             try:
-                self._remote.put_file(key, path)
+                self._remote.put(key, path)
             except RemoteError:
                 if not path.exists():
                     return "went away meanwhile"
                 raise
-            self._count(size)
-            if self._right(key, said):
+            if self._on_bytes is not None:
+                self._on_bytes(size)
+            if self._arrived(key, known):
                 break
         else:
             raise RemoteError(
                 f"{self._remote.where(key)}: came back with other bytes than were sent; see to "
                 "the storage, then run the same command to go on"
             )
-        self._there[sha] = size
+        self._sizes[sha] = size
         self._trusted.add(sha)
         self._done.files += 1
         self._done.bytes += size
         return None
 
-    def _right(self, key: str, said: Json) -> bool:
+    def _arrived(self, key: str, known: Checksum) -> bool:
         try:
             if self._options.read_back:
-                return self._remote.matches(key, said, self._on_bytes)
-            return bool(self._remote.size(key) == said["bytes"])
+                return self._remote.matches(key, known, self._on_bytes)
+            return self._remote.size(key) == known.bytes
         except RemoteMissing:
             return False
 
-    def _count(self, size: int) -> None:
-        if self._on_bytes is not None:
-            self._on_bytes(size)
-
     def _manifests(self, kind: Kind) -> dict[str, Manifest]:
-        """Read the visible manifests; what cannot be read is sent anew."""
-        found = {}
-        for name, known in read_manifests(self._remote, self._campaign.name, kind).items():
-            if isinstance(known, Manifest):
-                found[name] = known
-                if not self._options.check:
-                    self._trusted |= {str(said["sha256"]) for said in known.files.values()}
-        return found
+        """Read the visible manifests; one that cannot be read is sent anew."""
+        found = read_manifests(self._remote, self._campaign.name, kind)
+        good = {name: item for name, item in found.items() if isinstance(item, Manifest)}
+        if not self._options.check:
+            self._trusted |= {known.sha256 for m in good.values() for known in m.files.values()}
+        return good
 
-    def _same_campaign(self) -> None:
+    def _check_same_campaign(self) -> None:
         """
         Raises:
-            StoreError: the place has another campaign of this name.
+            _Conflict: the place has another campaign of this name.
         """
-        known = read_manifests(self._remote, self._campaign.name, "about").get("")
-        if not isinstance(known, Manifest):
+        theirs = read_manifests(self._remote, self._campaign.name, "about").get("")
+        if not isinstance(theirs, Manifest):
             return
         try:
-            theirs = json.loads(self._remote.read(known.object_key(INFO)))
-            ours = self._campaign.info
-            differ = [name for name in _SAME if ours.get(name) != theirs.get(name)]
+            info = json.loads(self._remote.read(theirs.object_key(INFO)))
+            differ = [name for name in _SAME if self._campaign.info.get(name) != info.get(name)]
         except (RemoteMissing, ValueError, AttributeError):
             return  # it is sent anew
         if differ:
@@ -264,16 +272,12 @@ class _Push:
             )
 
     def _takes(self, trial: str, cause: str) -> set[str]:
-        """Earlier takes of a trial that this store set aside for a cause that begins like this."""
+        """Return earlier takes of a trial that were quarantined for a cause that begins so."""
         return {
-            manifests.take_of(self._campaign.folder / "quarantine" / known["folder"])
-            for known in self._campaign.quarantined()
-            if known["trial"] == trial and str(known["cause"]).startswith(cause)
+            take_of(self._campaign.folder / "quarantine" / item["folder"])
+            for item in self._campaign.quarantined()
+            if item["trial"] == trial and str(item["cause"]).startswith(cause)
         } - {""}
 
     def _problem(self, text: str) -> None:
-        self._done.problems.append(text)
-
-
-class _Conflict(RemoteError):
-    """Two stores have campaigns of one name."""
+        self._done.problems.append(f"{self._campaign.name}: {text}")

@@ -1,17 +1,22 @@
-"""Is everything that was pushed still what it was? Reads it all, and changes nothing."""
+"""Check that everything that was pushed is as it was: all of it is read, nothing is changed."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-from sliplab.storage.fetching import objects_folder
 from sliplab.storage.files import safe_name
-from sliplab.storage.objects import OnBytes, Remote, RemoteError, RemoteMissing
-from sliplab.storage.remote.manifest import Kind, Manifest, check_against_sums, read_manifests
+from sliplab.storage.remote.manifest import (
+    Kind,
+    Manifest,
+    check_against_sums,
+    objects_folder,
+    read_manifests,
+)
+from sliplab.storage.remote.objects import OnBytes, Remote, RemoteError
+from sliplab.storage.trials.checksums import CHECKSUMS
 from sliplab.storage.trials.store import StoreError
 from sliplab.storage.trials.verify import Problem
-from sliplab.storage.trials.writer import CHECKSUMS
 
 KINDS: tuple[Kind, ...] = ("about", "trials", "quarantine")
 
@@ -24,7 +29,7 @@ def verify_remote(
     """Hold every visible file against its checksum.
 
     Returns:
-        How many trials are visible, and what is wrong; an empty list means all is well.
+        The number of visible trials, and the problems; an empty list means all is well.
 
     Raises:
         RemoteError: nothing was pushed there, or the storage cannot be reached.
@@ -48,37 +53,44 @@ def verify_remote(
                 else:
                     problems += [
                         Problem(remote.where(key), what, campaign=name, trial=trial)
-                        for key, what in _look(remote, found, sizes, known, on_bytes)
+                        for key, what in _problems(remote, found, sizes, known, on_bytes)
                     ]
                 if trial and on_trial is not None:
                     on_trial(trial)
     return trials, problems
 
 
-def _look(
+def _problems(
     remote: Remote,
     found: Manifest,
     sizes: dict[str, int],
-    known: dict[str, bool],
+    matching: dict[str, bool],
     on_bytes: OnBytes | None,
-) -> list[tuple[str, str]]:
-    problems = []
+) -> Iterator[tuple[str, str]]:
+    """Yield key and problem of every bad file of a manifest.
+
+    Args:
+        matching: by SHA-256, whether an object matches it; those that are read are added.
+    """
     owner = f"{found.kind}/{found.name}".rstrip("/")
-    for name, said in sorted(found.files.items()):
-        sha, key = said["sha256"], found.object_key(name)
+    fine = True
+    for name, known in sorted(found.files.items()):
+        sha, key, what = known.sha256, found.object_key(name), ""
         if sha not in sizes:
-            problems.append((key, f"{owner}: {name} is missing"))
-        elif sizes[sha] != said["bytes"]:
-            problems.append((key, f"{owner}: {name} has {sizes[sha]} bytes, not {said['bytes']}"))
+            what = "is missing"
+        elif sizes[sha] != known.bytes:
+            what = f"has {sizes[sha]} bytes, not {known.bytes}"
         else:
-            if sha not in known:
-                known[sha] = remote.matches(key, said, on_bytes)
-            if not known[sha]:
-                problems.append((key, f"{owner}: {name} does not match its checksum"))
-    if not problems and found.kind == "trials":
+            if sha not in matching:
+                matching[sha] = remote.matches(key, known, on_bytes)
+            if not matching[sha]:
+                what = "does not match its checksum"
+        if what:
+            fine = False
+            yield key, f"{owner}: {name} {what}"
+    if fine and found.kind == "trials":
         try:
             sums = json.loads(remote.read(found.object_key(CHECKSUMS)))
             check_against_sums(found, sums, found.key)
-        except (ValueError, RemoteMissing, RemoteError) as error:
-            problems.append((found.key, str(error)))
-    return problems
+        except (ValueError, RemoteError) as error:
+            yield found.key, str(error)

@@ -1,18 +1,46 @@
-"""Every committed trial of a store as one pandas table, units in the column names."""
+"""Every committed trial of a store as one pandas table, units in the column names.
+
+100,000 trials need not be read again each time: an index keeps the table as it was when it was last
+asked for. The truth is the trials' folders; the index only spares reading those that have not
+changed. A trial is known by its folder's inode and the time of the folder's last change, which a
+rename, a new file and a deleted one all move, and by the file with its refitted clocks. Bytes that
+were changed inside a file are for `sliplab verify` to find. An index that is missing, damaged, or
+of another version of this module is made anew; it stands among the derived results and may be
+deleted at any time.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
+import os
 import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from sliplab.protocols.plan import condition_columns
-from sliplab.storage.trials import catalogue_index
-from sliplab.storage.trials.checksums import partial
+from sliplab.storage.files import make_folder, write_bytes
+from sliplab.storage.streams import I64, Json
+from sliplab.storage.trials.checksums import incomplete
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
+
+VERSION = 1
+"""Of the index and of the catalogue's rows: a change of either counts on."""
+FRESH_NS = 2_000_000_000
+"""What changed so lately may change again without its time moving: some disks count in seconds."""
+_NAME, _ROW, _INODE, _CHANGED, _SYNC = (
+    f"index.{name}" for name in ("name", "row", "inode", "changed", "sync")
+)
+_META = b"sliplab"
 
 
 def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame:
@@ -20,7 +48,7 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
 
     Conditions become columns by factor; levels with a unit are numbers, the unit stands in the
     column's name (``depth_mm``), a slash in it as ``_per_``. Trials that have not changed since the
-    catalogue was last asked for are not read again (`storage.trials.catalogue_index`).
+    catalogue was last asked for are not read again.
 
     Args:
         unreadable: gets a line for every trial that is damaged; without it, one is an error.
@@ -29,8 +57,8 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
         StoreError: a trial is damaged.
     """
     began_ns = time.time_ns()
-    found = [(campaign, catalogue_index.Listing.of(campaign)) for campaign in store.campaigns()]
-    known = catalogue_index.read(store) or catalogue_index.Known(pd.DataFrame())
+    found = [(campaign, _Listing.of(campaign)) for campaign in store.campaigns()]
+    known = _read_index(store) or _Known(pd.DataFrame())
     parts, problems = [], []
     for campaign, listing in found:
         part = _Part(campaign, listing, known)
@@ -41,20 +69,19 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     names = [campaign.name for campaign, _ in found]
     if names == list(known.bounds) and not any(part.changed for part in parts):
         return known.table
-    return _anew(store, parts, known, began_ns)
+    return _rebuilt(store, parts, known, began_ns)
 
 
 class _Part:
-    """A campaign's part of the catalogue: what is known of it, and what has to be read.
+    """A campaign's part of the catalogue: rows of the index, and trials that have to be read.
 
     Attributes:
-        kept: rows of what is known that are still right, by trial.
-        sync: what stands for each trial's refitted clocks, taken before they are read.
+        kept: numbers of the index's rows that are still right, by trial.
+        sync: stamp of each trial's refitted clocks, taken before they are read.
+        fresh: rows that were read now, by trial.
     """
 
-    def __init__(
-        self, campaign: Campaign, listing: catalogue_index.Listing, known: catalogue_index.Known
-    ) -> None:
+    def __init__(self, campaign: Campaign, listing: _Listing, known: _Known) -> None:
         self.campaign, self.listing = campaign, listing
         low, high, stamp = known.bounds.get(campaign.name, (0, 0, ""))
         names, keys = known.names[low:high], known.keys[low:high]
@@ -67,13 +94,13 @@ class _Part:
         self.sync: dict[str, str] = {}
         if not same_clocks:
             old = known.sync()
-            self.sync = {name: catalogue_index.sync_key(campaign, name) for name in listing.names}
+            self.sync = {name: _sync_key(campaign, name) for name in listing.names}
             self.kept = {n: at for n, at in self.kept.items() if self.sync[n] == old[at]}
         self.fresh: dict[str, dict[str, Any]] = {}
         self.changed = len(self.kept) != high - low or not same_clocks
 
     def look(self, strict: bool) -> list[str]:
-        """Read what is not known; returns a line for each trial that is damaged.
+        """Read the trials that are not in the index; return a line for each that is damaged.
 
         Raises:
             StoreError: one is, and it is to be `strict`.
@@ -83,13 +110,13 @@ class _Part:
             if name in self.kept:
                 continue
             folder = self.campaign.folder / "trials" / name
-            if (cause := partial(folder)) is not None:
+            if (cause := incomplete(folder)) is not None:
                 damaged.append(f"{name}: {cause}")
                 continue
-            self.sync.setdefault(name, catalogue_index.sync_key(self.campaign, name))
-            clocks = catalogue_index.sync_folder(self.campaign) / f"{name}.json"
+            self.sync.setdefault(name, _sync_key(self.campaign, name))
             try:
-                self.fresh[name] = _row(self.campaign.name, Recording(folder, clocks))
+                recording = Recording(folder, self.campaign.sync_file(name), self.campaign.fetch)
+                self.fresh[name] = _row(self.campaign.name, recording)
             except StoreError as error:
                 if strict:
                     raise
@@ -98,15 +125,13 @@ class _Part:
         return damaged + broken
 
 
-def _anew(
-    store: Store, parts: list[_Part], known: catalogue_index.Known, began_ns: int
-) -> pd.DataFrame:
-    """The table from what is known and what was read, which is all known from now on."""
+def _rebuilt(store: Store, parts: list[_Part], known: _Known, began_ns: int) -> pd.DataFrame:
+    """Return the table from the index and the rows that were read, and write it as the index."""
     old_rows, old_sync = known.rows(), known.sync()
     rows: list[dict[str, Any]] = []
     sync: list[str] = []
     keys: list[Any] = []
-    new = catalogue_index.Known(pd.DataFrame())
+    new = _Known(pd.DataFrame())
     for part in parts:
         first = len(rows)
         for name, key in zip(part.listing.names, part.listing.settled(began_ns), strict=True):
@@ -121,7 +146,7 @@ def _anew(
     table = pd.DataFrame(rows)
     if rows:
         new.keys = np.array(keys, np.int64).reshape(-1, 2)
-        catalogue_index.write(store, table, rows, sync, new)
+        _write_index(store, table, rows, sync, new)
     return table
 
 
@@ -147,7 +172,10 @@ def _row(campaign: str, recording: Recording) -> dict[str, Any]:
 
 
 def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
-    """Rows for which a pandas expression holds, such as ``depth_mm > 2.8 and events > 1000``.
+    """Return the rows for which a pandas expression holds.
+
+    Args:
+        expression: such as ``depth_mm > 2.8 and events > 1000``.
 
     Raises:
         ValueError: the expression cannot be read, or names something besides columns.
@@ -159,3 +187,142 @@ def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
     except Exception as error:
         columns = ", ".join(map(str, table.columns))
         raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None
+
+
+@dataclass
+class _Listing:
+    """The folders among a campaign's committed trials as they are now, by name."""
+
+    names: list[str]
+    keys: I64
+    """Inode and time of the last change, ns since 1970, shape (n, 2)."""
+    sync: str
+    """Stamp of the folder with refitted clocks; empty for one that changed just now."""
+
+    @staticmethod
+    def of(campaign: Campaign) -> _Listing:
+        """List the folders that are there now."""
+        names: list[str] = []
+        inodes: list[int] = []
+        changed: list[int] = []
+        with suppress(FileNotFoundError, NotADirectoryError):
+            handle = os.open(campaign.folder / "trials", os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                with os.scandir(handle) as entries:
+                    for entry in entries:
+                        if entry.is_dir(follow_symlinks=False):
+                            told = entry.stat(follow_symlinks=False)
+                            names.append(entry.name)
+                            inodes.append(told.st_ino)
+                            changed.append(told.st_ctime_ns)
+            finally:
+                os.close(handle)
+        order = sorted(range(len(names)), key=names.__getitem__)
+        keys = np.array([inodes, changed], np.int64).T[order].reshape(-1, 2)
+        return _Listing([names[k] for k in order], keys, _stamp(campaign.sync_folder))
+
+    def settled(self, now_ns: int) -> I64:
+        """Return the keys, with zeros for what changed just now."""
+        keys = self.keys.copy()
+        keys[keys[:, 1] > now_ns - FRESH_NS] = 0
+        return keys
+
+
+@dataclass
+class _Known:
+    """The index: the catalogue as it was, a row a trial, and the folders that it came from."""
+
+    table: pd.DataFrame
+    names: list[str] = field(default_factory=list)
+    keys: I64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    bounds: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    """By campaign: its first row, the one after its last, and its stamp of refitted clocks."""
+    data: bytes = b""
+
+    def rows(self) -> list[Json]:
+        """Return the rows that the table was made of."""
+        return [json.loads(each) for each in self._column(_ROW)]
+
+    def sync(self) -> list[str]:
+        """Return the stamp of each trial's refitted clocks."""
+        return self._column(_SYNC)
+
+    def _column(self, name: str) -> list[str]:
+        if not self.data:
+            return []
+        found: list[str] = pq.read_table(io.BytesIO(self.data), columns=[name])[name].to_pylist()
+        return found
+
+
+def _sync_key(campaign: Campaign, name: str) -> str:
+    """Return the stamp of the file with a trial's refitted clocks."""
+    return _stamp(campaign.sync_file(name), settled=True)
+
+
+def _stamp(path: Path, settled: bool = False) -> str:
+    try:
+        told = path.stat()
+    except OSError:
+        return "none"
+    if not settled and told.st_mtime_ns > time.time_ns() - FRESH_NS:
+        return ""
+    return f"{told.st_ino} {told.st_mtime_ns} {told.st_size}"
+
+
+def _path(store: Store) -> Path:
+    return store.folder / "derived" / "catalogue" / "index"
+
+
+def _read_index(store: Store) -> _Known | None:
+    """Read the index; None where there is none that can be used."""
+    try:
+        whole = _path(store).read_bytes()
+    except OSError:
+        return None
+    digest, data = whole[:32], whole[32:]
+    return _parse(data) if hashlib.sha256(data).digest() == digest else None
+
+
+def _parse(data: bytes) -> _Known | None:
+    try:
+        file = pq.ParquetFile(io.BytesIO(data))
+        meta = json.loads(file.schema_arrow.metadata[_META])
+        if meta["version"] != VERSION:
+            return None
+        columns = [name for name in file.schema_arrow.names if name not in {_ROW, _SYNC}]
+        table = file.read(columns=columns)
+        keys = np.stack([table[_INODE].to_numpy(), table[_CHANGED].to_numpy()], axis=1)
+        bounds = {name: (low, high, sync) for name, low, high, sync in meta["campaigns"]}
+        frame = table.drop_columns([_NAME, _INODE, _CHANGED]).to_pandas()
+        return _Known(frame, table[_NAME].to_pylist(), keys, bounds, data)
+    except (ValueError, KeyError, TypeError, pa.ArrowException):
+        return None
+
+
+def _write_index(
+    store: Store, table: pd.DataFrame, rows: list[Json], sync: list[str], known: _Known
+) -> None:
+    """Write the index, where it can be written and reads again as it is."""
+    frame = table.copy()
+    frame[_NAME] = known.names
+    frame[_ROW] = [json.dumps(each) for each in rows]
+    frame[_INODE], frame[_CHANGED] = known.keys[:, 0], known.keys[:, 1]
+    frame[_SYNC] = sync
+    made = pa.Table.from_pandas(frame, preserve_index=False)
+    campaigns = [[name, *about] for name, about in known.bounds.items()]
+    meta = json.dumps({"version": VERSION, "campaigns": campaigns}).encode()
+    made = made.replace_schema_metadata({**(made.schema.metadata or {}), _META: meta})
+    buffer = io.BytesIO()
+    pq.write_table(made, buffer, compression="zstd")
+    data = buffer.getvalue()
+    back = _parse(data)
+    if (
+        back is None
+        or not back.table.equals(table)
+        or list(back.table.dtypes) != list(table.dtypes)
+    ):
+        return  # something that Parquet cannot keep as it is: it will be read again each time
+    with suppress(OSError):  # a store that is only read from
+        path = _path(store)
+        make_folder(path.parent)
+        write_bytes(path, hashlib.sha256(data).digest() + data)

@@ -1,82 +1,138 @@
-"""Is a folder what its `checksums.json` says? At a glance, or byte for byte."""
+"""Checksums of a folder's files, and whether the files still are what these say.
+
+A glance compares sizes; a full check reads every byte.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import stat
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sliplab.storage.errors import own_fault
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.writer import CHECKSUMS, DATA, RECORD
 
+DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
+SPOOL = "frames.raw"
+CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
 ELSEWHERE = "elsewhere.json"
 """Marks a trial of a mirror: files that it lacks are fetched when they are read."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""Of a file that stands beside its checksums."""
 
 
-def read_sums(folder: Path, needed: tuple[str, ...] = (DATA, RECORD)) -> Json:
-    """The checksums of a folder: by file name, ``sha256`` and ``bytes``.
+@dataclass(frozen=True)
+class Checksum:
+    """A file's SHA-256, 64 hex digits, and its size in bytes."""
+
+    sha256: str
+    bytes: int
+
+    @staticmethod
+    def of(path: Path) -> Checksum:
+        """Read a file and return its checksum."""
+        return Checksum(sha256(path), path.stat().st_size)
+
+    @staticmethod
+    def parse(data: Any) -> Checksum | None:
+        """Return the checksum that plain data hold; None if they hold none."""
+        if (
+            isinstance(data, dict)
+            and isinstance(data.get("sha256"), str)
+            and type(data.get("bytes")) is int
+        ):
+            return Checksum(data["sha256"], data["bytes"])
+        return None
+
+    def size_problem(self, path: Path) -> str | None:
+        """Say what is wrong with a file without reading it; None when it has all its bytes.
+
+        Raises:
+            OSError: this program has no more memory or open files; nothing is known of the file.
+        """
+        try:
+            found = path.lstat()
+        except OSError as error:
+            if own_fault(error):
+                raise
+            return "is missing"
+        if not stat.S_ISREG(found.st_mode):
+            return "is no plain file"
+        if found.st_size != self.bytes:
+            return f"has {found.st_size} bytes, not {self.bytes}"
+        return None
+
+    def problem(self, path: Path) -> str | None:
+        """Read a file and say what is wrong with it; None when it is as it was written.
+
+        Raises:
+            OSError: as `size_problem`.
+        """
+        if (problem := self.size_problem(path)) is not None:
+            return problem
+        try:
+            return None if sha256(path) == self.sha256 else "does not match its checksum"
+        except OSError as error:
+            if own_fault(error):
+                raise
+            return f"cannot be read: {error.strerror}"
+
+
+Checksums = dict[str, Checksum]
+"""Of the files of one folder, by name."""
+Fetch = Callable[[Path, Checksum], None]
+"""Brings a missing file of a mirrored trial, held against its checksum."""
+
+
+def read_sums(folder: Path, needed: Iterable[str] = (DATA, RECORD)) -> Checksums:
+    """Read the checksums of a folder's files.
 
     Raises:
         ValueError: missing, damaged, or without one of the files that are `needed`; the message
             names the file.
-        OSError: this program has no more memory or open files; nothing is known of the file.
+        OSError: as `Checksum.size_problem`.
     """
     path = folder / CHECKSUMS
     try:
-        sums = read_json(path)
+        data = read_json(path)
     except OSError as error:
         if own_fault(error):
             raise
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
-    for name, said in sums.items():
-        plain = (
-            isinstance(said, dict)
-            and isinstance(said.get("sha256"), str)
-            and type(said.get("bytes")) is int
-        )
-        if not plain or not _NAME.fullmatch(name):
+    sums = {}
+    for name, item in data.items():
+        found = Checksum.parse(item)
+        if found is None or not _NAME.fullmatch(name):
             raise ValueError(f"{path}: is no list of checksums")
+        sums[name] = found
     for name in needed:
         if name not in sums:
             raise ValueError(f"{path}: has no checksum of {name}")
     return sums
 
 
-def size_problem(path: Path, said: Json) -> str | None:
-    """What is wrong with a file without reading it; None when it is there with all its bytes."""
+def as_json(sums: Checksums) -> Json:
+    """Return checksums as plain data, as they stand in files."""
+    return {name: vars(known) for name, known in sums.items()}
+
+
+def write_sums(folder: Path, names: Iterable[str]) -> None:
+    """Write the checksums of some files of a folder, atomically, unless they are there already."""
+    sums = as_json({name: Checksum.of(folder / name) for name in names})
     try:
-        found = path.lstat()
-    except OSError as error:
-        if own_fault(error):
-            raise
-        return "is missing"
-    if not stat.S_ISREG(found.st_mode):
-        return "is no plain file"
-    if found.st_size != said["bytes"]:
-        return f"has {found.st_size} bytes, not {said['bytes']}"
-    return None
+        if read_json(folder / CHECKSUMS) == sums:
+            return
+    except (OSError, ValueError):
+        pass
+    write_json(folder / CHECKSUMS, sums)
 
 
-def byte_problem(path: Path, said: Json) -> str | None:
-    """What is wrong with a file, all of it read; None when it is as it was written."""
-    problem = size_problem(path, said)
-    if problem is None:
-        try:
-            return None if sha256(path) == said["sha256"] else "does not match its checksum"
-        except OSError as error:
-            if own_fault(error):
-                raise
-            return f"cannot be read: {error.strerror}"
-    return problem
-
-
-def partial(folder: Path) -> str | None:
-    """Why a trial's folder is not whole, by the sizes of its files; None when it is.
+def incomplete(folder: Path) -> str | None:
+    """Say why a trial's folder is incomplete, by the sizes of its files; None when it is complete.
 
     Bytes that changed in place are found by `storage.trials.verify` only.
     """
@@ -84,27 +140,13 @@ def partial(folder: Path) -> str | None:
         sums = read_sums(folder)
     except ValueError as error:
         return str(error)
-    for name, said in sums.items():
-        problem = size_problem(folder / name, said)
+    for name, known in sums.items():
+        problem = known.size_problem(folder / name)
         if problem is not None and not to_fetch(folder / name):
             return f"{folder / name}: {problem}"
     return None
 
 
 def to_fetch(path: Path) -> bool:
-    """Whether a file of a trial is not here, but where this store is a mirror of."""
+    """Return whether a trial's file is missing here because this store is a mirror."""
     return not os.path.lexists(path) and (path.parent / ELSEWHERE).is_file()
-
-
-def write_sums(folder: Path, names: tuple[str, ...]) -> None:
-    """Write the checksums of some files of a folder, atomically, if they are not there already."""
-    sums = {
-        name: {"sha256": sha256(folder / name), "bytes": (folder / name).stat().st_size}
-        for name in names
-    }
-    try:
-        if read_json(folder / CHECKSUMS) == sums:
-            return
-    except (OSError, ValueError):
-        pass
-    write_json(folder / CHECKSUMS, sums)

@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from sliplab.storage.files import make_folder, write_bytes, write_json
-from sliplab.storage.trials.checksums import write_sums
+from sliplab.storage.trials.checksums import CHECKSUMS, write_sums
 from sliplab.storage.trials.store import INFO, PROTOCOL, RIG, STORE, Store, StoreError
-from sliplab.storage.trials.writer import CHECKSUMS
 
 Step = Callable[[Store], None]
 

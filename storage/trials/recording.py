@@ -12,14 +12,20 @@ import numpy as np
 
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.errors import StoreError
-from sliplab.storage.fetching import fetch
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.trial import Clocks, SyncResult, TrialRecord
-from sliplab.storage.streams import F64, I64, U8, EventChunk, Json
-from sliplab.storage.trials.checksums import byte_problem, read_sums, to_fetch
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.streams import F64, I64, U8, EventChunk
+from sliplab.storage.trials.checksums import (
+    DATA,
+    FRAMES,
+    RECORD,
+    Checksums,
+    Fetch,
+    read_sums,
+    to_fetch,
+)
+from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.video import FrameReader, read_frame, read_frames
-from sliplab.storage.trials.writer import DATA, FRAMES, RECORD
 
 
 @dataclass(frozen=True)
@@ -42,17 +48,21 @@ class Recording:
 
     Args:
         folder: the trial's own folder.
-        sync_file: where the result of fitting its clocks again is, once there is one.
+        sync_file: path of the result of fitting its clocks again, once there is one.
+        fetch: brings files that a mirror lacks; it goes to other processes by its name.
     """
 
-    def __init__(self, folder: Path, sync_file: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, sync_file: Path | None = None, fetch: Fetch | None = None
+    ) -> None:
         self.folder = folder
         self.sync_file = sync_file
+        self._fetch = fetch
         self._checked: set[str] = set()
 
-    def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None]]:
-        """To another process goes where the trial is, not what was read of it."""
-        return Recording, (self.folder, self.sync_file)
+    def __reduce__(self) -> tuple[type[Recording], tuple[Path, Path | None, Fetch | None]]:
+        """Send another process the trial's paths, not what was read of it."""
+        return Recording, (self.folder, self.sync_file, self._fetch)
 
     @cached_property
     def record(self) -> TrialRecord:
@@ -77,10 +87,10 @@ class Recording:
     @cached_property
     def raw_checksum(self) -> str:
         """One hash that stands for the raw data of this trial and its record."""
-        return "".join(str(self._sums[name]["sha256"])[:16] for name in sorted(self._sums))
+        return "".join(self._sums[name].sha256[:16] for name in sorted(self._sums))
 
     @cached_property
-    def _sums(self) -> Json:
+    def _sums(self) -> Checksums:
         """The trial's checksums."""
         try:
             return read_sums(self.folder)
@@ -88,7 +98,7 @@ class Recording:
             raise self._damaged(str(error)) from None
 
     def _sound(self, name: str) -> Path:
-        """One of the trial's files, once it has been held against its checksum.
+        """Return one of the trial's files, once it has been held against its checksum.
 
         Raises:
             StoreError: it is damaged.
@@ -98,8 +108,13 @@ class Recording:
             if name not in self._sums:
                 raise self._damaged(f"{path}: is not among the checksums")
             if to_fetch(path):
-                fetch(path, self._sums[name])
-            if (problem := byte_problem(path, self._sums[name])) is not None:
+                if self._fetch is None:
+                    raise StoreError(
+                        f"{path}: was left at the URL that this store mirrors; open the store by "
+                        "`storage.remote.mirror.open_store`, which fetches it"
+                    )
+                self._fetch(path, self._sums[name])
+            if (problem := self._sums[name].problem(path)) is not None:
                 raise self._damaged(f"{path}: {problem}")
             self._checked.add(name)
         return path
@@ -113,7 +128,7 @@ class Recording:
 
     @property
     def checksum(self) -> str:
-        """What stands for all that analysis reads of this trial: raw data and clocks in use."""
+        """One hash of all that analysis reads of this trial: raw data and clocks in use."""
         refitted = self._refitted
         return self.raw_checksum if refitted is None else self.raw_checksum + refitted.key
 
@@ -126,7 +141,7 @@ class Recording:
 
     @property
     def refitted(self) -> bool:
-        """Whether other clocks are in use than those of the record."""
+        """True if other clocks are in use than those of the record."""
         return self._refitted is not None
 
     @cached_property
@@ -151,7 +166,7 @@ class Recording:
 
     @property
     def clocks_elsewhere(self) -> SyncResult | None:
-        """What another process needs to use the same clocks (`use_clocks`): None, the record's."""
+        """Clocks for `use_clocks` in another process; None for those of the record."""
         return self._refitted
 
     def use_clocks(self, refitted: SyncResult | None) -> None:
@@ -166,18 +181,18 @@ class Recording:
 
     @property
     def has_video(self) -> bool:
-        """Whether the frames themselves were recorded."""
+        """True if the frames themselves were recorded."""
         return FRAMES in self._sums
 
     @cached_property
     def has_tracks(self) -> bool:
-        """Whether the markers' places were recorded instead of a video."""
+        """True if the markers' places were recorded instead of a video."""
         with self.open() as reader:
             return reader.has("tracks/markers")
 
     @property
     def frame_source(self) -> str:
-        """``video``, ``tracks`` or ``none``: what is there of the outside camera."""
+        """``video``, ``tracks`` or ``none``: the data of the outside camera."""
         if self.has_video:
             return "video"
         # frames that are in no video are tracks, and the record is a small file
@@ -301,9 +316,9 @@ class Recording:
 
     @property
     def simulated(self) -> bool:
-        """Whether a mock rig made this."""
+        """True if a mock rig made this."""
         return self.record.simulated
 
     def simulation_truth(self) -> dict[str, Any] | None:
-        """What really happened, on the time line; only for tests and error reports."""
+        """Return the simulated truth, on the time line; only for tests and error reports."""
         return self.record.simulation_truth

@@ -4,24 +4,24 @@
     STORE/campaigns/NAME/campaign.json protocol.yaml rig.yaml checksums.json
     STORE/campaigns/NAME/trials/ID/      committed trials
     STORE/campaigns/NAME/incoming/ID/    the trial being written
-    STORE/campaigns/NAME/quarantine/     what did not become a trial, each with its cause
-    STORE/campaigns/NAME/bench/          who stood at the rig, one file a stretch of work
-    STORE/campaigns/NAME/skipped.json    trials that a person set aside (`storage.trials.decisions`)
-    STORE/control/                       what people asked for meanwhile (`storage.trials.control`)
-    STORE/review/                        what people decided about labels (`storage.trials.review`)
-    STORE/derived/ models/ report/       what analysis made of it; may be deleted at any time
+    STORE/campaigns/NAME/quarantine/     attempts that are no trials, each with its cause
+    STORE/campaigns/NAME/bench/          who stood at the rig, one file a session
+    STORE/campaigns/NAME/skipped.json    trials that a person skipped (`storage.trials.control`)
+    STORE/control/                       requests of people (`storage.trials.control`)
+    STORE/review/                        decisions about labels (`storage.trials.review`)
+    STORE/derived/ models/ report/       results of analysis; may be deleted at any time
     STORE/before/                        copies of what a migration changed
 
-What is committed is decided by one rename and by nothing else. A folder among the committed ones
-that is not whole all the same (a file was deleted or cut short) is no trial: it is passed over when
-reading, and quarantined and taken again by the next collection. docs/store.md has all of it.
+One rename, and nothing else, decides that a trial is committed. A folder among the committed trials
+that is incomplete all the same (a file was deleted or cut short) is no trial: readers skip it, and
+the next collection quarantines it and takes the trial again. docs/store.md has all of it.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sliplab.storage.errors import NoStore, StoreError, masked, translated_disk_errors
@@ -38,23 +38,24 @@ from sliplab.storage.files import (
 )
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.checksums import partial, write_sums
+from sliplab.storage.trials.checksums import CHECKSUMS, PROVENANCE, Fetch, incomplete, write_sums
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.writer import CHECKSUMS, PROVENANCE, TrialWriter
+from sliplab.storage.trials.writer import TrialWriter
 
 __all__ = ["FORMAT", "SYNC", "Campaign", "Store", "StoreError"]
 
 FORMAT = 2
 """Format that this version writes; `storage.trials.migrate` brings older ones forward."""
 SYNC = "sync"
-"""The step whose results hold clocks that were fitted again; recordings read them there."""
+"""Step whose results hold clocks that were fitted again; recordings read them there."""
 INFO, PROTOCOL, RIG, STORE, CAUSE = (
     "campaign.json", "protocol.yaml", "rig.yaml", "store.json", "cause.json"
 )  # fmt: skip
 IMPORTED = "imported"
-"""In a campaign's description: where its trials come from, if nobody collected them here."""
+"""Key of a campaign's description: where its trials come from, if they were imported."""
 AGAIN, FORGIVEN = "again", "forgiven"
-"""A committed trial that a person wants anew; a failed attempt that counts no longer."""
+"""Cause of a committed trial that a person wants anew; mark of a failed attempt that counts no
+longer."""
 _FOLDERS = ("campaigns", "control", "derived", "models", "report", "before")
 
 
@@ -64,9 +65,14 @@ def _holds(path: Path, data: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Campaign:
-    """One protocol on one rig inside a store."""
+    """One protocol on one rig inside a store.
+
+    Attributes:
+        fetch: brings files that a mirror lacks when they are read; None in any other store.
+    """
 
     folder: Path
+    fetch: Fetch | None = field(default=None, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -75,7 +81,7 @@ class Campaign:
 
     @property
     def info(self) -> Json:
-        """What `campaign.json` says.
+        """The content of `campaign.json`.
 
         Raises:
             StoreError: it is damaged.
@@ -94,7 +100,7 @@ class Campaign:
 
     @property
     def begun(self) -> bool:
-        """Whether something was ever collected into it, or could have been."""
+        """True once something was collected into it, or could have been."""
         return (self.folder / INFO).exists() or any(self._folders("trials"))
 
     @property
@@ -109,7 +115,7 @@ class Campaign:
         them was interrupted, one that does not match them is damaged.
         """
         for name in ("trials", "incoming", "quarantine", "bench"):
-            make_folder(self._inside(self.folder / name))
+            make_folder(self.inside(self.folder / name))
         # who made them may have been killed before their entries were on the disk
         for folder in (self.folder.parent.parent, self.folder.parent, self.folder):
             sync_folder(folder)
@@ -127,21 +133,21 @@ class Campaign:
         write_sums(self.folder, tuple(texts))
 
     def committed(self) -> set[str]:
-        """Ids of the committed trials, as far as they are whole."""
-        return {path.name for path in self._whole()}
+        """Return the ids of the committed trials, as far as they are complete."""
+        return {path.name for path in self._complete()}
 
     def damaged(self) -> dict[str, str]:
-        """Folders among the committed trials that are not whole, and why."""
-        found = {path.name: partial(path) for path in self._folders("trials")}
+        """Return folders among the committed trials that are incomplete, and why."""
+        found = {path.name: incomplete(path) for path in self._folders("trials")}
         return {name: cause for name, cause in found.items() if cause is not None}
 
     def recordings(self) -> Iterator[Recording]:
-        """The committed trials by id, as far as they are whole."""
-        for path in self._whole():
-            yield Recording(path, self._sync_file(path.name))
+        """Yield the committed trials by id, as far as they are complete."""
+        for path in self._complete():
+            yield Recording(path, self.sync_file(path.name), self.fetch)
 
     def recording(self, trial_id: str) -> Recording:
-        """One committed trial.
+        """Return one committed trial.
 
         Raises:
             StoreError: there is none of this id.
@@ -149,28 +155,28 @@ class Campaign:
         path = self.folder / "trials" / safe_name(trial_id)
         if not path.is_dir():
             raise StoreError(f"{path}: no such trial in campaign '{self.name}'")
-        return Recording(path, self._sync_file(trial_id))
+        return Recording(path, self.sync_file(trial_id), self.fetch)
 
     def begin(
         self, trial_id: str, frame_px: tuple[int, int] | None, rate_hz: int, *, spool: bool = False
     ) -> TrialWriter:
-        """Begin to write a trial; what stood aside under its id is quarantined first."""
-        aside = self._inside(self.folder / "incoming" / safe_name(trial_id))
-        target = self._inside(self.folder / "trials" / trial_id)
-        if aside.exists():
-            self.quarantine(aside, "interrupted")
-        if target.is_dir() and (cause := partial(target)) is not None:
+        """Begin to write a trial; an interrupted attempt under its id is quarantined first."""
+        incoming = self.inside(self.folder / "incoming" / safe_name(trial_id))
+        target = self.inside(self.folder / "trials" / trial_id)
+        if incoming.exists():
+            self.quarantine(incoming, "interrupted")
+        if target.is_dir() and (cause := incomplete(target)) is not None:
             self.quarantine(target, f"damaged: {cause}")
-        return TrialWriter(aside, target, frame_px, rate_hz, spool=spool)
+        return TrialWriter(incoming, target, frame_px, rate_hz, spool=spool)
 
     def sweep(self) -> int:
-        """Clear up after a killed program or a failing disk, before trials are taken.
+        """Clean up after a killed program or a failing disk, before trials are taken.
 
-        Trials that stand aside, and committed ones that are not whole, go to quarantine; temporary
-        files are deleted. Whoever calls this holds the store's lock.
+        Unfinished trials, and committed ones that are incomplete, go to quarantine; temporary files
+        are deleted. The caller holds the store's lock.
 
         Returns:
-            how many folders went to quarantine.
+            The number of folders that went to quarantine.
         """
         for folder in (self.folder, self.folder / "bench"):
             sweep_temporary(folder)
@@ -184,7 +190,7 @@ class Campaign:
         return len(left)
 
     def quarantine(self, folder: Path, cause: str, **more: object) -> Path:
-        """Move a folder that is no trial, or no longer, out of the way, with its cause."""
+        """Move a folder that is no trial, or no longer one, to quarantine, with its cause."""
         sweep_temporary(folder)
         write_json(folder / CAUSE, {"cause": masked(cause), "trial": folder.name, **more})
         target = self.quarantine_path(folder.name)
@@ -193,15 +199,15 @@ class Campaign:
         return target
 
     def quarantine_path(self, trial_id: str) -> Path:
-        """A free folder in quarantine for this trial."""
-        self._inside(self.folder / "quarantine")
+        """Return a free folder in quarantine for a trial."""
+        self.inside(self.folder / "quarantine")
         number = 1
         while (path := self.folder / "quarantine" / f"{trial_id}.{number}").exists():
             number += 1
         return path
 
     def quarantined(self) -> list[Json]:
-        """Cause and trial of everything in quarantine."""
+        """Return cause, trial and folder of everything in quarantine."""
         causes = []
         for path in self._folders("quarantine"):
             try:
@@ -214,13 +220,13 @@ class Campaign:
         return causes
 
     def failed_attempts(self) -> dict[str, int]:
-        """How often each trial was taken and failed a gate, since it was last asked for again."""
+        """Count the attempts at each trial that failed a gate since it was last requested again."""
         return self._count(
             lambda item: str(item["cause"]).startswith("gate") and FORGIVEN not in item
         )
 
     def attempts(self) -> dict[str, int]:
-        """How often each trial was taken to its end and not kept: each take has its own seed."""
+        """Count the complete attempts at each trial that were not kept: each has its own seed."""
         return self._count(lambda item: str(item["cause"]).startswith(("gate", AGAIN)))
 
     def _count(self, wanted: Callable[[Json], bool]) -> dict[str, int]:
@@ -231,20 +237,25 @@ class Campaign:
         return counts
 
     def add_bench_record(self, data: Json) -> None:
-        """Keep who stood at the rig, with what, for one stretch of work."""
+        """Keep who stood at the rig, with what, for one session."""
         folder = self.folder / "bench"
-        make_folder(self._inside(folder))
+        make_folder(self.inside(folder))
         there = [int(path.stem) for path in folder.glob("*.json") if path.stem.isdecimal()]
         number = max(there, default=0) + 1
         write_json(folder / f"{number:04d}.json", data)
 
     def provenance(self, recording: Recording) -> Provenance:
-        """When, where and with which versions a trial was taken."""
+        """Return when, where and with which versions a trial was taken."""
         return Provenance.load(recording.folder / PROVENANCE)
 
-    def _sync_file(self, trial_id: str) -> Path:
-        """Where the sync step keeps what it found of a trial."""
-        return self.folder.parent.parent / "derived" / SYNC / self.name / f"{trial_id}.json"
+    @property
+    def sync_folder(self) -> Path:
+        """Folder of the clocks that were fitted again, if there are any."""
+        return self.folder.parent.parent / "derived" / SYNC / self.name
+
+    def sync_file(self, trial_id: str) -> Path:
+        """Return the path of a trial's clocks that were fitted again, if there are any."""
+        return self.sync_folder / f"{trial_id}.json"
 
     def _folders(self, name: str) -> Iterator[Path]:
         folder = self.folder / name
@@ -253,27 +264,29 @@ class Campaign:
                 if path.is_dir() and not path.is_symlink():
                     yield path
 
-    def _whole(self) -> Iterator[Path]:
-        return (path for path in self._folders("trials") if partial(path) is None)
+    def _complete(self) -> Iterator[Path]:
+        return (path for path in self._folders("trials") if incomplete(path) is None)
 
-    def _inside(self, path: Path) -> Path:
-        """`path`, if no link on the way to it leads out of the store.
-
-        Raises:
-            StoreError: one does.
-        """
+    def inside(self, path: Path) -> Path:
+        """Return `path`; raise `StoreError` if a link on the way leads out of the store."""
         return inside(path, self.folder.parent.parent)
 
 
 @dataclass(frozen=True)
 class Store:
-    """A store on disk."""
+    """A store on disk.
+
+    Attributes:
+        fetch: brings files that a mirror lacks when they are read (`storage.remote.mirror`); None
+            for any other store.
+    """
 
     folder: Path
+    fetch: Fetch | None = field(default=None, compare=False, repr=False)
 
     @staticmethod
-    def open(folder: Path) -> Store:
-        """An existing store.
+    def open(folder: Path, fetch: Fetch | None = None) -> Store:
+        """Open an existing store.
 
         Raises:
             NoStore: no store there.
@@ -299,16 +312,16 @@ class Store:
         for name in _FOLDERS:
             if (folder / name).is_symlink():
                 inside(folder / name, folder)
-        return Store(folder)
+        return Store(folder, fetch)
 
     @property
     def format(self) -> int:
-        """The format that the store has; `storage.trials.migrate` brings older ones to `FORMAT`."""
+        """Format of the store; `storage.trials.migrate` brings older ones to `FORMAT`."""
         return int(read_json(self.folder / STORE)["format"])
 
     @staticmethod
     def exists(folder: Path) -> bool:
-        """Return whether a store is there already, in a folder that could hold one.
+        """Return whether a folder holds a store; False for one that could hold one.
 
         Raises:
             NoStore: it is a file, or a folder that holds something else.
@@ -323,7 +336,7 @@ class Store:
 
     @staticmethod
     def create(folder: Path) -> Store:
-        """The store in `folder`, made if there is none.
+        """Open the store in `folder`; make it if there is none.
 
         Raises:
             NoStore: the folder holds something else.
@@ -336,21 +349,21 @@ class Store:
         return Store.open(folder)
 
     def campaign(self, name: str) -> Campaign:
-        """The campaign `name`, which may not exist yet."""
-        return Campaign(self.folder / "campaigns" / safe_name(name))
+        """Return the campaign `name`, which may not exist yet."""
+        return Campaign(self.folder / "campaigns" / safe_name(name), self.fetch)
 
     def campaigns(self) -> list[Campaign]:
-        """All campaigns by name."""
+        """Return all campaigns by name."""
         folder = self.folder / "campaigns"
         if not folder.is_dir():
             return []
         return [
-            Campaign(path)
+            Campaign(path, self.fetch)
             for path in sorted(folder.iterdir())
             if not path.is_symlink() and (path / INFO).is_file()
         ]
 
     @property
     def simulated(self) -> bool:
-        """Whether any of it came from a mock rig."""
+        """True if any of it came from a mock rig."""
         return any(bool(campaign.info["simulated"]) for campaign in self.campaigns())

@@ -1,4 +1,4 @@
-"""Is everything in a store what it was when it was committed? Looks, and changes nothing."""
+"""Check that everything in a store is as it was committed; nothing is changed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from sliplab.storage.errors import StoreError, own_fault
 from sliplab.storage.files import read_json, temporary_files
 from sliplab.storage.schema.document import NewerFormat
 from sliplab.storage.schema.trial import Provenance, TrialRecord
-from sliplab.storage.streams import Json
-from sliplab.storage.trials.checksums import ELSEWHERE, byte_problem, read_sums, to_fetch
-from sliplab.storage.trials.columns import TIMING, TRACKS
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.checksums import (
+    CHECKSUMS,
+    DATA,
+    ELSEWHERE,
+    FRAMES,
+    PROVENANCE,
+    RECORD,
+    Checksums,
+    read_sums,
+    to_fetch,
+)
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import TIMING, TRACKS
 from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, Store
 from sliplab.storage.trials.video import count_frames
-from sliplab.storage.trials.writer import CHECKSUMS, DATA, FRAMES, PROVENANCE, RECORD
 
 _KNOWN = {DATA, FRAMES, RECORD, CHECKSUMS, PROVENANCE, ELSEWHERE}
 _FOLDERS = ("trials", "incoming", "quarantine", "bench")
@@ -36,7 +44,7 @@ class Problem:
         what: what is wrong with it.
         kind: ``damaged``, or ``unfinished`` for what a killed program left, which the next
             collection clears up.
-        campaign: whose it is; empty for the store's own files.
+        campaign: its campaign; empty for the store's own files.
         trial: the committed trial that it belongs to; empty for any other file.
     """
 
@@ -78,13 +86,13 @@ def _campaign(
 
 
 def trial_folders(campaign: Campaign) -> list[Path]:
-    """Everything that stands where committed trials do, whole or not."""
+    """Return everything that stands among the committed trials, complete or not."""
     folder = campaign.folder / "trials"
     return sorted(folder.iterdir()) if folder.is_dir() else []
 
 
 def verify_trial(folder: Path) -> list[Problem]:
-    """Checksums, sizes, counts and clocks of one committed trial."""
+    """Check checksums, sizes, counts and clocks of one committed trial."""
     return [
         Problem(str(path), what, DAMAGED, folder.parent.parent.name, folder.name)
         for path, what in _trial(folder)
@@ -103,9 +111,9 @@ def _trial(folder: Path) -> Found:
         return [(folder / CHECKSUMS, f"cannot be used: {error}")]
     found = [
         (folder / name, problem)
-        for name, said in sorted(sums.items())
+        for name in sorted(sums)
         if not to_fetch(folder / name)
-        and (problem := byte_problem(folder / name, said)) is not None
+        and (problem := sums[name].problem(folder / name)) is not None
     ]
     found += [
         (path, "does not belong here")
@@ -129,7 +137,7 @@ def _trial(folder: Path) -> Found:
 
 
 def _description(store: Store, campaign: Campaign) -> list[Problem]:
-    """The campaign's own files."""
+    """Check the campaign's own files."""
 
     def problem(path: Path, what: str, kind: str = DAMAGED) -> Problem:
         return Problem(str(path), what, kind, campaign.name)
@@ -141,7 +149,7 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
         if (folder / name).is_symlink() or not (folder / name).is_dir():
             found.append(problem(folder / name, "is missing, or no folder"))
     names = (PROTOCOL, RIG, INFO)
-    sums: Json = {}
+    sums: Checksums = {}
     if store.format > 1 and not (folder / CHECKSUMS).exists():
         what = "is missing; the next `sliplab collect` writes it"
         found.append(problem(folder / CHECKSUMS, what, UNFINISHED))
@@ -160,7 +168,7 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
         except (OSError, ValueError, StoreError, InputError) as error:
             found.append(problem(path, f"cannot be read: {error}"))
             continue
-        if name in sums and (wrong := byte_problem(path, sums[name])) is not None:
+        if name in sums and (wrong := sums[name].problem(path)) is not None:
             found.append(problem(path, f"{wrong}; `sliplab collect` writes it again"))
     return found + [
         Problem(item.path, item.what, item.kind, campaign.name)
@@ -170,7 +178,7 @@ def _description(store: Store, campaign: Campaign) -> list[Problem]:
 
 
 def _temporary(folder: Path, campaign: str) -> list[Problem]:
-    """Temporary files whose program is gone."""
+    """Find temporary files whose program is gone."""
     what = "is what a killed program left; the next `sliplab collect` deletes it"
     return [
         Problem(str(path), what, UNFINISHED, campaign)
@@ -211,7 +219,7 @@ def _contents(folder: Path) -> Found:
 
 
 def _frame_problems(folder: Path, tracks: list[str], counts: dict[str, int]) -> Found:
-    """A row of tracks, or a picture in the video, for every frame."""
+    """Check for a row of tracks, or a picture in the video, for every frame."""
     frames, video = counts["frames/t"], (folder / FRAMES).exists()
     problems: Found = [
         (folder / DATA, f"{counts[name]} rows of {name}, not {frames}")
@@ -226,7 +234,7 @@ def _frame_problems(folder: Path, tracks: list[str], counts: dict[str, int]) -> 
 
 
 def _leftovers(campaign: Campaign) -> list[Problem]:
-    """What stands aside, and what is in quarantine without a cause."""
+    """Find unfinished trials, and what is in quarantine without a cause."""
     found = []
     folder = campaign.folder / "incoming"
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
@@ -242,8 +250,8 @@ def _leftovers(campaign: Campaign) -> list[Problem]:
     return found
 
 
-def set_aside(store: Store, problems: list[Problem]) -> list[str]:
-    """Quarantine every committed trial that has a problem; whoever calls holds the store's lock.
+def quarantine_damaged(store: Store, problems: list[Problem]) -> list[str]:
+    """Quarantine every committed trial that has a problem; the caller holds the store's lock.
 
     Returns:
         The ids, which the next collection takes again.

@@ -1,16 +1,24 @@
-"""A trial being written: it stands aside until it is whole, then becomes visible by one rename."""
+"""Writing of a trial: in `incoming` until every file is complete, then visible by one rename.
+
+Raw frames of a rig that cannot encode as fast as its camera delivers wait in a spool file. The
+caller never waits for the disk while the spool's queue has room. What was written is sent on to the
+disk at once: an operating system that gathers gigabytes first stops every writer when it has
+enough of them, the one with the events too.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+import threading
+from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from sliplab.storage.errors import masked
-from sliplab.storage.files import sha256, sync_file, sync_folder, write_json_aside
+from sliplab.storage.files import sync_file, sync_folder, write_json_aside
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import (
     I64,
@@ -22,13 +30,108 @@ from sliplab.storage.streams import (
     PoseChunk,
     PulseChunk,
 )
-from sliplab.storage.trials.hdf5 import StreamFile
-from sliplab.storage.trials.spool import Spool
+from sliplab.storage.trials.checksums import (
+    CHECKSUMS,
+    DATA,
+    FRAMES,
+    PROVENANCE,
+    RECORD,
+    SPOOL,
+    Checksum,
+    as_json,
+)
+from sliplab.storage.trials.hdf5_writer import StreamFile
 from sliplab.storage.trials.video import VideoWriter
 
-DATA, FRAMES, RECORD = "data.h5", "frames.mkv", "record.json"
-SPOOL = "frames.raw"
-CHECKSUMS, PROVENANCE = "checksums.json", "provenance.json"
+QUEUE_BYTES = 1 << 29
+"""The most that waits in memory, bytes: five seconds of 1000 x 1000 px at 100/s."""
+WAIT_S = 60.0
+"""The longest that a full queue, and the end of the file, are waited for, s."""
+_AHEAD_BYTES = 1 << 24
+
+
+class Spool:
+    """A file of grey frames, one after the other; bounded in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("wb", buffering=0)
+        self._waiting: deque[U8] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._error: OSError | None = None
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="spool", daemon=True)
+        self._thread.start()
+
+    def write(self, images: U8) -> None:
+        """Append frames, which must not change afterwards; waits only where the queue is full.
+
+        Raises:
+            OSError: the disk refused these or earlier ones, or has stood still for `WAIT_S`.
+        """
+        if not images.size:
+            return
+        images = np.ascontiguousarray(images)
+        with self._changed:
+            done = self._changed.wait_for(
+                lambda: self._error or self._bytes < QUEUE_BYTES, timeout=WAIT_S
+            )
+            self._check()
+            if not done:
+                raise OSError(f"{self.path}: the disk has stood still for {WAIT_S:g} s")
+            self._waiting.append(images)
+            self._bytes += images.nbytes
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Write what waits, and close the file; safe to call more than once.
+
+        Raises:
+            OSError: not all of it could be written.
+        """
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(WAIT_S)
+        if self._thread.is_alive():
+            raise OSError(f"{self.path}: the disk has stood still for {WAIT_S:g} s")
+        self._file.close()
+        self._check()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        written = sent_on = 0
+        try:
+            while (images := self._next()) is not None:
+                left = images.reshape(-1).data
+                while left:
+                    left = left[self._file.write(left) or 0 :]
+                written += images.nbytes
+                if written - sent_on >= _AHEAD_BYTES:
+                    self._send_on(written)
+                    sent_on = written
+                with self._changed:
+                    self._bytes -= images.nbytes
+                    self._changed.notify_all()
+        except OSError as error:
+            with self._changed:
+                self._error = error
+                self._waiting.clear()
+                self._changed.notify_all()
+
+    def _next(self) -> U8 | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closed)
+            return self._waiting.popleft() if self._waiting else None
+
+    def _send_on(self, end: int) -> None:
+        """Begin to write to the disk, and forget what is there already, where one can ask so."""
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self._file.fileno(), 0, end, os.POSIX_FADV_DONTNEED)
 
 
 class TrialWriter:
@@ -164,29 +267,30 @@ class TrialWriter:
         sync_folder(self.target.parent)
         return self.target
 
-    def set_aside(
-        self, quarantine: Path, record: TrialRecord, provenance: Provenance, cause: Json
+    def quarantine(
+        self, target: Path, record: TrialRecord, provenance: Provenance, cause: Json
     ) -> None:
-        """Keep a whole but unwanted attempt in `quarantine`, with its record and the cause."""
+        """End a complete but unwanted attempt: keep it in `target`, with its record and cause."""
         self.seal()
         write_json_aside(
             self.folder / "cause.json", {**cause, "cause": masked(str(cause["cause"]))}
         )
         self._finish_folder(record, provenance)
-        os.rename(self.folder, quarantine)
-        sync_folder(quarantine.parent)
+        os.rename(self.folder, target)
+        sync_folder(target.parent)
 
     def _finish_folder(self, record: TrialRecord, provenance: Provenance) -> None:
         write_json_aside(self.folder / RECORD, record.to_json())
         write_json_aside(self.folder / PROVENANCE, provenance.to_json())
-        sums = {}
-        for name in (DATA, FRAMES, RECORD):
-            path = self.folder / name
-            if path.exists():
-                if name != RECORD:  # whose writer did it
-                    sync_file(path)
-                sums[name] = {"sha256": sha256(path), "bytes": path.stat().st_size}
-        write_json_aside(self.folder / CHECKSUMS, sums)
+        for name in (DATA, FRAMES):
+            if (self.folder / name).exists():
+                sync_file(self.folder / name)
+        sums = {
+            name: Checksum.of(self.folder / name)
+            for name in (DATA, FRAMES, RECORD)
+            if (self.folder / name).exists()
+        }
+        write_json_aside(self.folder / CHECKSUMS, as_json(sums))
         sync_folder(self.folder)
 
     def abandon(self) -> None:

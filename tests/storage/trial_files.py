@@ -100,4 +100,4 @@ def fail(where: Campaign, trial: str, attempt: int) -> None:
     writer = where.begin(trial, FRAME, 100)
     fill(writer)
     cause = {"cause": "gate: frames_lost = 3", "trial": trial, "attempt": attempt}
-    writer.set_aside(where.quarantine_path(trial), record(trial), Provenance(), cause)
+    writer.quarantine(where.quarantine_path(trial), record(trial), Provenance(), cause)

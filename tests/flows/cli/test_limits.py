@@ -149,7 +149,7 @@ def test_a_trial_that_cannot_be_read_now_is_not_damaged(
 FULL = """
 import resource, sys
 from pathlib import Path
-from sliplab.storage.trials.hdf5 import StreamFile
+from sliplab.storage.trials.hdf5_writer import StreamFile
 from tests.storage.trial_files import events
 path = Path(sys.argv[1])
 file = StreamFile(path)

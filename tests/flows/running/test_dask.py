@@ -27,8 +27,8 @@ from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.searching.tradeoff_runs import everywhere
 from sliplab.protocols.errors import InputError
-from sliplab.storage.objects import Remote
 from sliplab.storage.remote.mirror import open_mirror
+from sliplab.storage.remote.objects import Remote
 from sliplab.storage.remote.push import push
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT

@@ -21,10 +21,10 @@ from sliplab.flows.syncing.sync import sync
 from sliplab.flows.syncing.sync_fit import fit_again, same_clocks
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.checksums import CHECKSUMS, RECORD
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
-from sliplab.storage.trials.writer import CHECKSUMS, RECORD
 from tests.flows.conftest import tiny, write
 
 SHIFT_NS = 3_000_000

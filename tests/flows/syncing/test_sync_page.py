@@ -16,9 +16,9 @@ from sliplab.flows.reporting import clock_words
 from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 from sliplab.storage.files import write_json
+from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Campaign
-from sliplab.storage.trials.writer import RECORD
 from tests.storage.trial_files import record
 
 

@@ -22,9 +22,9 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.formats import lab_pickles as lab
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
-from sliplab.storage.formats.dv_buffers import events_buffer, frame_buffer
 from sliplab.storage.formats.export_trials import export_trials
 from sliplab.storage.formats.find import kind_of, name_of, trials_in
+from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
 from sliplab.storage.formats.foreign import FormatError, Triggers
 from sliplab.storage.formats.import_trials import import_trials
 from sliplab.storage.formats.manifest import MANIFEST

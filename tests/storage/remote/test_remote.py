@@ -15,19 +15,26 @@ from hypothesis import strategies as st
 
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data
-from sliplab.storage.fetching import ORIGIN, objects_folder
+from sliplab.protocols.shown import MASK
 from sliplab.storage.files import read_json, write_json
-from sliplab.storage.objects import Remote, RemoteError, RemoteMissing
-from sliplab.storage.remote.manifest import Manifest, manifest_key, of_trial, parse, read_manifests
-from sliplab.storage.remote.mirror import mirror_folder, open_mirror, place_of, reach
-from sliplab.storage.remote.pull import pull
+from sliplab.storage.remote.manifest import (
+    Manifest,
+    manifest_key,
+    objects_folder,
+    parse,
+    read_manifests,
+    trial_manifest,
+)
+from sliplab.storage.remote.mirror import mirror_folder, open_for_trial, open_mirror, place_of
+from sliplab.storage.remote.objects import Remote, RemoteError, RemoteMissing, check_url, is_url
+from sliplab.storage.remote.pull import ORIGIN, pull
 from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.checksums import Checksum
 from sliplab.storage.trials.decisions import again
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
-from sliplab.storage.urls import check_url, is_url
 from tests.storage.remote.remotes import new_bucket, s3_server, tree
 from tests.storage.trial_files import campaign, commit
 
@@ -79,9 +86,9 @@ def test_what_is_pulled_is_what_was_pushed(
         "memory": lambda: f"memory://{uuid4().hex}/lab",
     }[kind]()
     the(store).quarantine(the(store).folder / "trials" / TRIALS[2], "gate: too loud")
-    sent = push(store, Remote(url), wishes=PushOptions(quarantine=True))
+    sent = push(store, Remote(url), options=PushOptions(quarantine=True))
     assert (sent.trials, sent.pushed, sent.set_aside, sent.problems) == (2, 2, 1, [])
-    twice = push(store, Remote(url), wishes=PushOptions(quarantine=True))
+    twice = push(store, Remote(url), options=PushOptions(quarantine=True))
     assert (twice.there, twice.pushed, twice.files, twice.bytes) == (2, 0, 0, 0)
     assert verify_remote(Remote(url)) == (2, [])
     back = pull(Remote(url), tmp_path / "back", quarantine=True)
@@ -95,7 +102,7 @@ def test_cut_anywhere_nothing_half_is_visible(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The storage fails at its n-th write, for every n, and the next push goes on from there."""
-    put, whole = Remote._put, 0
+    put, whole = Remote.put, 0
     for cut in range(100):
         url, count, done = f"memory://{uuid4().hex}", [0], 0
 
@@ -106,7 +113,7 @@ def test_cut_anywhere_nothing_half_is_visible(
             put(self, key, *how)  # type: ignore[arg-type]
 
         with monkeypatch.context() as patch:
-            patch.setattr(Remote, "_put", failing)
+            patch.setattr(Remote, "put", failing)
             try:
                 whole = push(store, Remote(url)).files
             except RemoteError:
@@ -136,16 +143,16 @@ def test_a_pull_that_was_cut_goes_on(
     store: Store, remote: Remote, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push(store, remote)
-    get, count = Remote.get_file, [0]
+    get, count = Remote.get, [0]
 
-    def failing(self: Remote, key: str, path: Path, said: dict[str, object]) -> None:
+    def failing(self: Remote, key: str, path: Path, known: Checksum) -> None:
         count[0] += 1
         if count[0] > 7:
             raise KeyboardInterrupt
-        get(self, key, path, said)
+        get(self, key, path, known)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Remote, "get_file", failing)
+        patch.setattr(Remote, "get", failing)
         with pytest.raises(KeyboardInterrupt):
             pull(remote, tmp_path / "back")
     back = Store.open(tmp_path / "back")
@@ -158,13 +165,13 @@ def test_a_damaged_object_is_named_and_sent_anew(
     store: Store, remote: Remote, tmp_path: Path
 ) -> None:
     push(store, remote)
-    manifest = of_trial(the(store), TRIALS[1])
+    manifest = trial_manifest(the(store), TRIALS[1])
     objects = tmp_path / "shared" / objects_folder("c")
-    video = objects / manifest.files["frames.mkv"]["sha256"]
+    video = objects / manifest.files["frames.mkv"].sha256
     data = bytearray(video.read_bytes())
     data[len(data) // 2] ^= 1
     video.write_bytes(data)
-    own = objects / of_trial(the(store), TRIALS[2]).files["record.json"]["sha256"]
+    own = objects / trial_manifest(the(store), TRIALS[2]).files["record.json"].sha256
     own.unlink()
     found = {(p.trial, p.path.rpartition("/")[2]): p.what for p in verify_remote(remote)[1]}
     # equal files are one object: every trial that has it is named
@@ -174,7 +181,7 @@ def test_a_damaged_object_is_named_and_sent_anew(
     assert back.pulled == 3 - len({trial for trial, _ in found})
     assert all("frames.mkv" in text or "record.json" in text for text in back.problems)
     assert push(store, remote).files in {0, 1}  # what is gone shows in the list
-    assert push(store, remote, wishes=PushOptions(check=True)).problems == []
+    assert push(store, remote, options=PushOptions(check=True)).problems == []
     assert verify_remote(remote) == (3, [])
     assert pull(remote, tmp_path / "back").problems == []
 
@@ -302,7 +309,7 @@ def test_names_and_objects_of_others_are_refused(
 @given(st.data())
 def test_a_mutated_manifest_is_refused(data: st.DataObject) -> None:
     files = {
-        name: {"sha256": "a" * 64, "bytes": 3}
+        name: Checksum("a" * 64, 3)
         for name in ("data.h5", "record.json", "checksums.json", "provenance.json")
     }
     whole = Manifest("trials", "c", "t", files, "take").dump()
@@ -341,15 +348,15 @@ def test_a_mirror_fetches_what_is_read(
     assert place_of(store) == str(store.folder)
     # another machine, of which only one trial is asked
     monkeypatch.setenv("SLIPLAB_CACHE", str(tmp_path / "other"))
-    there = reach(remote.url, "c", TRIALS[1])
+    there = open_for_trial(remote.url, "c", TRIALS[1])
     assert len(the(there).recording(TRIALS[1]).events()) == 1000
     assert the(there).committed() == {TRIALS[1]}
     with pytest.raises(RemoteMissing, match="has no trial"):
-        reach(remote.url, "c", "depth=9mm")
+        open_for_trial(remote.url, "c", "depth=9mm")
     # what is damaged there is not read
-    target = of_trial(the(store), TRIALS[0]).files["data.h5"]["sha256"]
+    target = trial_manifest(the(store), TRIALS[0]).files["data.h5"].sha256
     (tmp_path / "shared" / objects_folder("c") / target).write_bytes(b"x")
-    again_there = reach(remote.url, "c", TRIALS[2])
+    again_there = open_for_trial(remote.url, "c", TRIALS[2])
     with pytest.raises(RemoteError, match=r"data\.h5: .*does not match its checksum"):
         the(again_there).recording(TRIALS[2]).events()
     assert not (the(again_there).folder / "trials" / TRIALS[2] / "data.h5").exists()
@@ -399,4 +406,4 @@ def test_secrets_are_nowhere(endpoint: str, store: Store, tmp_path: Path) -> Non
     assert secret.decode() not in str(told.value)
     with pytest.raises(RemoteError) as told, lost._errors_translated("key", "read"):
         raise ValueError(f"signature of {secret.decode()} is wrong")
-    assert "signature of *** is wrong" in str(told.value)
+    assert f"signature of {MASK} is wrong" in str(told.value)

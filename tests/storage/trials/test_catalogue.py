@@ -1,12 +1,162 @@
-"""The catalogue: one row a trial, units in the names, queries that can only query."""
+"""The catalogue's index: never another table than without it, and nothing read twice."""
 
+from __future__ import annotations
+
+import shutil
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
+from sliplab.storage.files import make_folder, write_json
+from sliplab.storage.trials import catalogue as module
 from sliplab.storage.trials.catalogue import catalogue, query
-from sliplab.storage.trials.store import Store
-from tests.storage.trial_files import campaign, commit
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Campaign, Store
+from tests.storage.trial_files import IDENTITY, campaign, commit
+
+INDEX = Path("derived/catalogue/index")
+
+
+@pytest.fixture
+def where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Campaign:
+    """A campaign of three trials; what changes counts as settled at once."""
+    monkeypatch.setattr(module, "FRESH_NS", -(10**18))
+    found = campaign(tmp_path / "s")
+    commit(found, "a", condition={"depth": "2.4 mm", "side": "left"})
+    commit(found, "b", condition={"depth": "3.4 mm", "speed": "1.6 mm/s"}, recorded_s=1 / 3)
+    commit(found, "c", condition={"side": "right"})
+    return found
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The trials that were read, in order."""
+    names: list[str] = []
+    row = module._row
+
+    def told(name: str, recording: Recording) -> dict[str, object]:
+        names.append(recording.folder.name)
+        return row(name, recording)
+
+    monkeypatch.setattr(module, "_row", told)
+    return names
+
+
+def _store(where: Campaign) -> Store:
+    return Store.open(where.folder.parent.parent)
+
+
+def _both(where: Campaign) -> tuple[pd.DataFrame, list[str]]:
+    """The table with the index, held against the one without it."""
+    lines: list[str] = []
+    with_index = catalogue(_store(where), lines)
+    index = _store(where).folder / INDEX
+    kept = index.read_bytes() if index.exists() else None
+    index.unlink(missing_ok=True)
+    plain: list[str] = []
+    without = catalogue(_store(where), plain)
+    pd.testing.assert_frame_equal(with_index, without, check_exact=True)
+    assert with_index.to_csv() == without.to_csv()
+    assert with_index.to_json(orient="records") == without.to_json(orient="records")
+    assert lines == plain
+    if kept is not None:
+        index.write_bytes(kept)
+    return with_index, lines
+
+
+def test_only_what_changed_is_read_again(where: Campaign, read: list[str]) -> None:
+    first = catalogue(_store(where))
+    assert read == ["a", "b", "c"]
+    pd.testing.assert_frame_equal(catalogue(_store(where)), first, check_exact=True)
+    assert read == ["a", "b", "c"]
+    commit(where, "ab")
+    assert list(catalogue(_store(where))["trial"]) == ["a", "ab", "b", "c"]
+    assert read == ["a", "b", "c", "ab"]
+    where.quarantine(where.folder / "trials" / "b", "again")
+    assert list(_both(where)[0]["trial"]) == ["a", "ab", "c"]
+    del read[:]
+    commit(where, "b", attempt=1)
+    assert list(catalogue(_store(where))["attempt"]) == [0, 0, 1, 0]
+    assert read == ["b"]
+    _both(where)
+
+
+def test_a_campaign_more_or_less_is_seen(where: Campaign) -> None:
+    store = _store(where)
+    catalogue(store)
+    commit(campaign(store.folder, "d"), "a")
+    assert list(_both(where)[0]["campaign"]) == ["c", "c", "c", "d"]
+    shutil.rmtree(store.folder / "campaigns" / "c")
+    assert list(catalogue(store)["campaign"]) == ["d"]
+    shutil.rmtree(store.folder / "campaigns" / "d")
+    assert catalogue(store).empty
+
+
+def test_damage_is_named_with_the_index_as_without(where: Campaign, read: list[str]) -> None:
+    catalogue(_store(where))
+    (where.folder / "trials" / "b" / "record.json").unlink()
+    record = commit(where, "e") / "record.json"
+    record.write_bytes(record.read_bytes().replace(b"kinematic", b"kinematix"))
+    table, lines = _both(where)
+    assert list(table["trial"]) == ["a", "c"]
+    assert len(lines) == 2
+    del read[:]
+    catalogue(_store(where), [])
+    assert read == ["e"]
+
+
+def test_refitted_clocks_are_seen(where: Campaign, read: list[str]) -> None:
+    assert list(catalogue(_store(where))["sync_uncertainty_us"]) == [1, 1, 1]
+    folder = where.sync_folder
+    for us in (2, 3):
+        clock = {"map": IDENTITY, "uncertainty_ns": us * 1000.0}
+        raw = where.recording("b").raw_checksum
+        make_folder(folder)
+        write_json(folder / "b.json", {"key": "k", "raw": raw, "clocks": {"events": clock}})
+        assert list(_both(where)[0]["sync_uncertainty_us"]) == [1, us, 1]
+    del read[:]
+    catalogue(_store(where))
+    assert read == []
+
+
+@pytest.mark.parametrize("damage", ["gone", "empty", "short", "flipped", "older"])
+def test_an_index_that_cannot_be_used_is_made_anew(
+    where: Campaign, damage: str, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = catalogue(_store(where))
+    index = _store(where).folder / INDEX
+    data = bytearray(index.read_bytes())
+    if damage == "gone":
+        shutil.rmtree(index.parent)
+    elif damage == "older":
+        monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
+    else:
+        data[len(data) // 2] ^= 1
+        index.write_bytes({"empty": b"", "short": data[:-1], "flipped": data}[damage])
+    for _ in range(2):
+        pd.testing.assert_frame_equal(catalogue(_store(where)), first, check_exact=True)
+    assert read == ["a", "b", "c"] * 2
+
+
+def test_what_changed_just_now_is_not_trusted(
+    where: Campaign, read: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FRESH_NS", 3600 * 10**9)
+    for _ in range(2):
+        catalogue(_store(where))
+    assert read == ["a", "b", "c"] * 2
+
+
+def test_a_store_that_cannot_be_written_to_has_a_catalogue(
+    where: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(module, "write_bytes", refuse)
+    assert list(catalogue(_store(where))["trial"]) == ["a", "b", "c"]
+    assert not (_store(where).folder / INDEX).exists()
 
 
 def test_conditions_become_columns_with_units(tmp_path: Path) -> None:

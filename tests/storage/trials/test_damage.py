@@ -14,7 +14,7 @@ from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store, StoreError
-from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, set_aside, verify
+from sliplab.storage.trials.verify import DAMAGED, UNFINISHED, quarantine_damaged, verify
 from tests.storage.trial_files import campaign, commit, fill, record
 
 NOBODY = 2**22 + 1
@@ -149,7 +149,7 @@ def test_damaged_trials_are_set_aside_when_asked(tmp_path: Path) -> None:
     _flip(commit(where, "t") / "data.h5")
     commit(where, "whole")
     store = Store.open(tmp_path / "s")
-    assert set_aside(store, verify(store)) == ["t"]
+    assert quarantine_damaged(store, verify(store)) == ["t"]
     assert where.committed() == {"whole"}
     assert where.quarantined()[0]["cause"] == "damaged: data.h5: does not match its checksum"
     assert verify(store) == []

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplab.storage.streams import EventChunk, PulseChunk
-from sliplab.storage.trials.columns import COLUMNS, SMALL_HELD
-from sliplab.storage.trials.hdf5 import StreamFile, StreamReader
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import COLUMNS, SMALL_HELD, StreamFile
 from tests.storage.trial_files import events
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from sliplab.storage.schema.trial import Provenance
 from sliplab.storage.streams import ClockReads, PulseChunk
-from sliplab.storage.trials.columns import TIMING
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import TIMING
 from sliplab.storage.trials.store import Store
 from sliplab.storage.trials.verify import verify
 from sliplab.storage.trials.writer import TrialWriter

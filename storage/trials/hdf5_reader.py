@@ -1,4 +1,4 @@
-"""Reading columns of an HDF5 file through the library's own calls.
+"""Reading of a trial's HDF5 file, column by column, through the library's own calls.
 
 h5py's files and datasets make a window of 30 ms cost twice as much as its events do. What is read
 must be in the file itself: links, external and virtual data would lead out of it.
@@ -7,16 +7,34 @@ must be in the file itself: links, external and virtual data would lead out of i
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from functools import cache
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401  (registers the filters)
 import numpy as np
 
-from sliplab.storage.streams import I64
-from sliplab.storage.trials.columns import Array
+from sliplab.storage.errors import StoreError
+from sliplab.storage.streams import (
+    I64,
+    ClockReads,
+    EventChunk,
+    PoseChunk,
+)
+from sliplab.storage.trials.hdf5_writer import (
+    COLUMNS,
+    INDEX,
+    INDEX_CUT_FORMAT,
+    OFFSET,
+    READS,
+    TIMES,
+    TIMING,
+    TRACKS,
+    Array,
+)
 
 _BLOCK = 1 << 15
 _FEW = 16
@@ -150,3 +168,120 @@ class Rows:
             block[...] = narrow[start : start + _BLOCK]  # never reaches rows that are still to come
             block += amount
         return values
+
+
+class StreamReader:
+    """A trial's HDF5 file opened for reading; a context manager.
+
+    Raises:
+        StoreError: it was written by a newer version.
+        ValueError: a column points out of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = RowFile(path)
+        try:
+            found = self._file.attribute("format", 1)
+            if found > INDEX_CUT_FORMAT:
+                raise StoreError(
+                    f"{path}: format = {found}: was written by a newer version of SlipLab; this "
+                    f"one reads formats up to {INDEX_CUT_FORMAT}: update it"
+                )
+            self._index_cut = found == INDEX_CUT_FORMAT
+            self.t_offset_us = int(self._file.rows(OFFSET).read())
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> StreamReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def event_times(self) -> I64:
+        """Times of all events on the camera's clock, us."""
+        return self._times(0, len(self._file.rows(TIMES)))
+
+    def _times(self, low: int, high: int) -> I64:
+        """Times of some events on the camera's clock, us."""
+        return self._file.rows(TIMES).added(low, high, self.t_offset_us)
+
+    def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
+        """Events with start <= t < end on the camera's clock; all by default.
+
+        Only the part of the file that holds them is read.
+        """
+        x, y, p = (self._file.rows(f"events/{name}") for name in "xyp")
+        low, high = 0, len(self._file.rows(TIMES))
+        marks = self._file.rows(INDEX)
+        if start_us is not None and len(marks):
+            low = self._bracket(marks, start_us - self.t_offset_us, high)[0]
+        if end_us is not None and len(marks):
+            high = self._bracket(marks, end_us - self.t_offset_us, high)[1]
+        high = max(low, high)
+        times = self._times(low, high)
+        first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
+        last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
+        last = max(first, last)
+        low, high = low + first, low + last
+        return EventChunk(
+            x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
+        )
+
+    def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
+        """Indices that enclose time `t_us` after the offset, from the index or behind its end."""
+        ms = t_us // 1000
+        near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
+        if ms < 0:
+            return 0, near[0] if ms == -1 and near else 0
+        if self._index_cut and len(near) < 2:
+            times = self._file.rows(TIMES)
+            rows = range(near[0] if near else 0, count)
+            found = bisect_left(rows, t_us, key=lambda row: int(times.read(row, row + 1)[0]))
+            return rows.start + found, rows.start + found
+        near += [count, count]
+        return near[0], near[1]
+
+    def pulses(self, group: str) -> I64:
+        """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
+
+        Exposures are empty where the sync box sees none.
+        """
+        return self._late(f"{group}/t")
+
+    def clock_reads(self, group: str) -> ClockReads:
+        """All of ``box_reads`` or ``frame_camera_reads``; empty where nobody read that clock."""
+        return ClockReads(*(self._late(f"{group}/{name}") for name in READS))
+
+    def _late(self, name: str) -> I64:
+        """A column of times; empty if it is one of `TIMING` that was never made."""
+        if name in TIMING and not self.has(name):
+            return np.empty(0, np.int64)
+        return self.column(name)
+
+    def poses(self) -> PoseChunk:
+        """All arm poses."""
+        return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
+
+    def column(self, name: str) -> Array:
+        """One column by its name in the file, such as ``frames/t``; times are int64."""
+        values = self._file.rows(name).read()
+        return values.astype(np.int64) if name == TIMES else values
+
+    def has(self, name: str) -> bool:
+        """Whether the file has a column of this name; those of `TRACKS` and
+        `TIMING` may be missing."""
+        return self._file.has(name)
+
+    def counts(self) -> dict[str, int]:
+        """Rows of every column; 0 for one that is missing."""
+        return {
+            name: len(self._file.rows(name)) if self.has(name) else 0
+            for name in (*COLUMNS, *TRACKS, *TIMING)
+        }

@@ -5,19 +5,29 @@ index reaches as far as their 32-bit times (71.6 min), later events are found by
 other streams stand beside them. Columns are chunked and compressed with bitshuffle, events in
 LZ4 and the others in zstd. Attributes give every column its unit. Files carry no time stamps: the
 same data are the same bytes.
+
+A trial has more columns than most of them have chunks, so that making, opening and resizing them
+costs more than their data. So every file begins as a copy of one that has all columns and no rows,
+and rows wait in memory until they are whole chunks.
+
+Format 2 differs from 1 in how events are kept: LZ4 instead of zstd, and times after the offset in
+32 bits (docs/decisions/0020). A reader need not know which it has. Format 3 is format 2 with an
+index that ends before the last event (docs/decisions/0067).
 """
 
 from __future__ import annotations
 
 import os
-from bisect import bisect_left
+from functools import cache
+from io import BytesIO
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 import h5py
+import hdf5plugin
 import numpy as np
+import numpy.typing as npt
 
-from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import (
     I64,
     U8,
@@ -27,26 +37,163 @@ from sliplab.storage.streams import (
     PoseChunk,
     PulseChunk,
 )
-from sliplab.storage.trials.columns import (
-    COLUMNS,
-    INDEX,
-    INDEX_CUT_FORMAT,
-    INDEXED_MS,
-    OFFSET,
-    SMALL_HELD,
-    TIMES,
-    TIMING,
-    TRACKS,
-    WIDE,
-    Array,
-    Column,
-    blank,
-    create,
-)
-from sliplab.storage.trials.rows import RowFile, Rows
 
+Array = npt.NDArray[Any]
+Kind = tuple[str, tuple[int, ...], str]
+"""Type, shape of a row, unit."""
+
+FORMAT, INDEX_CUT_FORMAT = 2, 3
+"""What a file is written as; the second one where its index ends before its events do."""
+EVENT_CHUNK = 1 << 16
+SMALL_CHUNK = 1 << 10
+SMALL_HELD = 1 << 14
+"""Rows of small columns that are held back; each write costs more than what is in it."""
+
+COLUMNS: dict[str, Kind] = {
+    "events/x": ("uint16", (), "px"),
+    "events/y": ("uint16", (), "px"),
+    "events/p": ("uint8", (), "1 brighter, 0 darker"),
+    "events/t": ("uint32", (), "us of the event camera's clock after t_offset"),
+    "event_pulses/t": ("int64", (), "ns of the event camera's clock"),
+    "arm_pulses/t": ("int64", (), "ns of the arm controller's clock"),
+    "sync_pulses/t": ("int64", (), "ns of the sync box's clock: the trial's time line"),
+    "poses/t": ("int64", (), "ns of the arm controller's clock"),
+    "poses/host": ("int64", (), "ns of the host's monotonic clock"),
+    "poses/xyz": ("float64", (3,), "mm in the arm's base frame"),
+    "poses/rotvec": ("float64", (3,), "degrees, rotation vector"),
+    "frames/number": ("int64", (), "the camera's frame counter"),
+    "frames/t": ("int64", (), "ns of the frame camera's clock, middle of exposure"),
+    "frames/host": ("int64", (), "ns of the host's monotonic clock"),
+    "frames/sync": ("uint8", (), "level of the sync line during exposure"),
+}
+# only there once something came, a row a frame; -1 stands for the number of markers
+TRACKS: dict[str, Kind] = {
+    "tracks/markers": ("float32", (-1, 2), "px, column and row; NaN where a marker was not seen"),
+    "tracks/plate": ("float32", (2,), "px, column and row; NaN where the marker was not seen"),
+}
+# only there once something came, for they depend on which wires a rig has
+TIMING: dict[str, Kind] = {
+    "exposures/t": ("int64", (), "ns of the sync box's clock, start of an exposure"),
+    "box_reads/t": ("int64", (), "ns of the sync box's clock"),
+    "box_reads/before": ("int64", (), "ns of the host's monotonic clock"),
+    "box_reads/after": ("int64", (), "ns of the host's monotonic clock"),
+    "frame_camera_reads/t": ("int64", (), "ns of the frame camera's clock"),
+    "frame_camera_reads/before": ("int64", (), "ns of the host's monotonic clock"),
+    "frame_camera_reads/after": ("int64", (), "ns of the host's monotonic clock"),
+    "triggers/t": ("int64", (), "ns of the event camera's clock"),
+    "triggers/kind": ("uint8", (), "what the event camera noted, as AEDAT4 numbers it"),
+}
+TIMES = "events/t"
+WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
+"""The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
+INDEX, OFFSET = "ms_to_idx", "t_offset"
+READS = ("t", "before", "after")
+"""Columns of the reads of a clock."""
 _LAST_32 = 2**32 - 1
-_READS = ("t", "before", "after")
+INDEXED_MS = 2**32 // 1000 + 1
+"""Milliseconds that the index reaches to: those that DSEC's 32-bit times can tell."""
+# one block a chunk: in the filter's own blocks of 8 kB, half of the time goes into beginning them
+_SMALL = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="zstd", clevel=1)
+_EVENTS = hdf5plugin.Bitshuffle(nelems=EVENT_CHUNK, cname="lz4")
+# whole bytes: the lowest one of a time is noise, the highest ones are all but constant
+_TIMES = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
+
+
+@cache
+def blank() -> bytes:
+    """A file with every column of `COLUMNS`, an index and an offset, and no rows."""
+    made = BytesIO()
+    with h5py.File(made, "w", libver="latest") as file:
+        file.attrs["format"] = FORMAT
+        for name, kind in COLUMNS.items():
+            create(file, name, kind)
+        create(file, INDEX, ("int64", (), "index of the first event at or after this ms"))
+        file[OFFSET] = np.int64(0)
+        file[OFFSET].attrs["unit"] = "us of the event camera's clock"
+    return made.getvalue()
+
+
+def create(file: Any, name: str, kind: Kind) -> None:
+    """A dataset without rows in an open `h5py.File`."""
+    dtype, shape, unit = kind
+    data = file.create_dataset(
+        name,
+        (0, *shape),
+        dtype,
+        maxshape=(None, *shape),
+        chunks=(_chunk(name), *shape),
+        **_filter(name),
+    )
+    data.attrs["unit"] = unit
+
+
+def _filter(name: str) -> Any:
+    if name.startswith(TIMES):
+        return _TIMES
+    return _EVENTS if name.startswith("events/") else _SMALL
+
+
+def _chunk(name: str) -> int:
+    return EVENT_CHUNK if name.startswith("events/") else SMALL_CHUNK
+
+
+class Column:
+    """A dataset that grows at its end.
+
+    Rows are gathered until they fill whole chunks: a partial one would be compressed twice.
+
+    Attributes:
+        shape: of one row.
+    """
+
+    def __init__(self, file: Any, name: str) -> None:
+        self._data = h5py.h5d.open(file.id, name.encode())
+        self.shape: tuple[int, ...] = self._data.shape[1:]
+        rows = EVENT_CHUNK if _chunk(name) == EVENT_CHUNK else SMALL_HELD
+        self._held: Array = np.empty((rows, *self.shape), self._data.dtype)
+        self._written = self._waiting = 0
+
+    @property
+    def count(self) -> int:
+        """Rows appended so far, written or not."""
+        return self._written + self._waiting
+
+    def append(self, values: Array) -> None:
+        """Add rows, (k, *shape)."""
+        while len(values):
+            room = len(self._held) - self._waiting
+            part = values[:room]
+            self._held[self._waiting : self._waiting + len(part)] = part
+            self._waiting += len(part)
+            if len(part) == room:
+                self.flush()
+            values = values[room:]
+
+    def flush(self) -> None:
+        """Write what waits."""
+        if not self._waiting:
+            return
+        rows = self._held[: self._waiting]
+        end = self._written + len(rows)
+        self._data.set_extent((end, *self.shape))
+        place = self._data.get_space()
+        place.select_hyperslab((self._written, *(0 for _ in self.shape)), rows.shape)
+        self._data.write(h5py.h5s.create_simple(rows.shape), place, rows)
+        self._written, self._waiting = end, 0
+
+    def widened(self, file: Any, name: str, kind: Kind) -> Column:
+        """The same rows as another type, in place of the dataset `name`."""
+        self.flush()
+        wider = f"{name}64"
+        create(file, wider, kind)
+        column = Column(file, wider)
+        old = file[name]
+        for start in range(0, self._written, EVENT_CHUNK):
+            column.append(old[start : start + EVENT_CHUNK])
+        column.flush()
+        del file[name]
+        file.move(wider, name)
+        return column
 
 
 class StreamFile:
@@ -117,7 +264,7 @@ class StreamFile:
 
     def add_clock_reads(self, group: str, chunk: ClockReads) -> None:
         """Append reads of a clock to ``box_reads`` or ``frame_camera_reads``."""
-        columns = zip(_READS, (chunk.device_ns, chunk.before_ns, chunk.after_ns), strict=True)
+        columns = zip(READS, (chunk.device_ns, chunk.before_ns, chunk.after_ns), strict=True)
         self._append_late({f"{group}/{name}": values for name, values in columns})
 
     def add_triggers(self, t_ns: I64, kind: U8) -> None:
@@ -204,120 +351,3 @@ class StreamFile:
             finally:
                 os.close(nothing)
         self._file.close()
-
-
-class StreamReader:
-    """A trial's HDF5 file opened for reading; a context manager.
-
-    Raises:
-        StoreError: it was written by a newer version.
-        ValueError: a column points out of the file.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file = RowFile(path)
-        try:
-            found = self._file.attribute("format", 1)
-            if found > INDEX_CUT_FORMAT:
-                raise StoreError(
-                    f"{path}: format = {found}: was written by a newer version of SlipLab; this "
-                    f"one reads formats up to {INDEX_CUT_FORMAT}: update it"
-                )
-            self._index_cut = found == INDEX_CUT_FORMAT
-            self.t_offset_us = int(self._file.rows(OFFSET).read())
-        except BaseException:
-            self._file.close()
-            raise
-
-    def __enter__(self) -> StreamReader:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def event_times(self) -> I64:
-        """Times of all events on the camera's clock, us."""
-        return self._times(0, len(self._file.rows(TIMES)))
-
-    def _times(self, low: int, high: int) -> I64:
-        """Times of some events on the camera's clock, us."""
-        return self._file.rows(TIMES).added(low, high, self.t_offset_us)
-
-    def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
-        """Events with start <= t < end on the camera's clock; all by default.
-
-        Only the part of the file that holds them is read.
-        """
-        x, y, p = (self._file.rows(f"events/{name}") for name in "xyp")
-        low, high = 0, len(self._file.rows(TIMES))
-        marks = self._file.rows(INDEX)
-        if start_us is not None and len(marks):
-            low = self._bracket(marks, start_us - self.t_offset_us, high)[0]
-        if end_us is not None and len(marks):
-            high = self._bracket(marks, end_us - self.t_offset_us, high)[1]
-        high = max(low, high)
-        times = self._times(low, high)
-        first = 0 if start_us is None else int(np.searchsorted(times, start_us, "left"))
-        last = len(times) if end_us is None else int(np.searchsorted(times, end_us, "left"))
-        last = max(first, last)
-        low, high = low + first, low + last
-        return EventChunk(
-            x.read(low, high), y.read(low, high), p.read(low, high), times[first:last]
-        )
-
-    def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
-        """Indices that enclose time `t_us` after the offset, from the index or behind its end."""
-        ms = t_us // 1000
-        near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
-        if ms < 0:
-            return 0, near[0] if ms == -1 and near else 0
-        if self._index_cut and len(near) < 2:
-            times = self._file.rows(TIMES)
-            rows = range(near[0] if near else 0, count)
-            found = bisect_left(rows, t_us, key=lambda row: int(times.read(row, row + 1)[0]))
-            return rows.start + found, rows.start + found
-        near += [count, count]
-        return near[0], near[1]
-
-    def pulses(self, group: str) -> I64:
-        """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
-
-        Exposures are empty where the sync box sees none.
-        """
-        return self._late(f"{group}/t")
-
-    def clock_reads(self, group: str) -> ClockReads:
-        """All of ``box_reads`` or ``frame_camera_reads``; empty where nobody read that clock."""
-        return ClockReads(*(self._late(f"{group}/{name}") for name in _READS))
-
-    def _late(self, name: str) -> I64:
-        """A column of times; empty if it is one of `TIMING` that was never made."""
-        if name in TIMING and not self.has(name):
-            return np.empty(0, np.int64)
-        return self.column(name)
-
-    def poses(self) -> PoseChunk:
-        """All arm poses."""
-        return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
-
-    def column(self, name: str) -> Array:
-        """One column by its name in the file, such as ``frames/t``; times are int64."""
-        values = self._file.rows(name).read()
-        return values.astype(np.int64) if name == TIMES else values
-
-    def has(self, name: str) -> bool:
-        """Whether the file has a column of this name; those of `TRACKS` and
-        `TIMING` may be missing."""
-        return self._file.has(name)
-
-    def counts(self) -> dict[str, int]:
-        """Rows of every column; 0 for one that is missing."""
-        return {
-            name: len(self._file.rows(name)) if self.has(name) else 0
-            for name in (*COLUMNS, *TRACKS, *TIMING)
-        }

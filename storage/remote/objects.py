@@ -1,8 +1,9 @@
-"""A place for stores on shared or object storage, reached through fsspec: ``s3://``, ``file://``...
+"""Objects on shared or object storage, reached through fsspec: ``s3://``, ``file://`` and others.
 
-Objects are put whole, read back and listed here, and nothing else; their meaning is in
-`storage.remote.manifest`. Where a server is, and by which keys it lets one in, stands in the
-environment or in fsspec's own configuration (docs/scale.md), never in a URL and never in a store.
+Objects are written complete, read back and listed here; their meaning is in
+`storage.remote.manifest`. Address and keys of a server stand in the environment or in fsspec's own
+configuration (docs/scale.md), never in a URL and never in a store. Requests that fail are repeated
+by the library that makes them, by its own settings.
 """
 
 from __future__ import annotations
@@ -10,40 +11,70 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.shown import is_secret
-from sliplab.storage.errors import NoStore, StoreError
+from sliplab.protocols.shown import MASK, is_secret
+from sliplab.storage.errors import NoStore, StoreError, masked
 from sliplab.storage.files import json_text, make_folder, read_blocks, write_blocks
-from sliplab.storage.streams import Json
-from sliplab.storage.urls import check_url
+from sliplab.storage.trials.checksums import Checksum
 
 LAYOUT_FILE, LAYOUT = "sliplab.json", 1
 SMALL_BYTES = 8_000_000
-"""Objects up to this are fetched in one request."""
+"""Limit of objects that are read at once."""
 _BLOCK = 8_000_000
+_URL = re.compile(r"([a-z][a-z0-9+.-]*)://.+")
 _SECRET_VARIABLES = ("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_ACCESS_KEY_ID")
-_ANSWERS = 200
-"""Characters that are passed on of what a server said."""
+_ANSWER_CHARACTERS = 200
+"""Limit of what is passed on of a server's message."""
 
 OnBytes = Callable[[int], None]
 
 
 class RemoteError(StoreError):
-    """Shared or object storage did not do what it was asked; the message names the object."""
+    """Shared or object storage failed; the message names the object."""
 
 
 class RemoteMissing(RemoteError):
-    """An object is not there."""
+    """An object does not exist."""
+
+
+class RemoteDamaged(RemoteError):
+    """An object does not match its checksum."""
 
 
 class NoPushedStore(NoStore, RemoteMissing):
     """Nothing was ever pushed to the URL that was given."""
+
+
+def is_url(place: str | os.PathLike[str]) -> bool:
+    """Return whether `place` is a URL rather than a folder."""
+    return _URL.fullmatch(os.fspath(place)) is not None
+
+
+def check_url(url: str) -> str:
+    """Return `url` without a slash at its end.
+
+    Raises:
+        InputError: it is no URL, is of a kind that chains others, or carries a secret.
+    """
+    if not is_url(url):
+        raise InputError("URL", "", url, "must be a URL such as s3://bucket/folder")
+    parts = urlsplit(url)
+    if parts.username or parts.password or parts.query or parts.fragment:
+        shown = f"{parts.scheme}://.../{parts.path.lstrip('/')}"
+        raise InputError(
+            "URL", "", shown, "must not carry keys, passwords or options: put them into the "
+            "environment or fsspec's configuration",
+        )  # fmt: skip
+    if "::" in url or ".." in parts.path.split("/"):
+        raise InputError("URL", "", url, "must name one place, without '::' and '..'")
+    return url.rstrip("/")
 
 
 class Remote:
@@ -52,7 +83,7 @@ class Remote:
     def __init__(self, url: str) -> None:
         """
         Raises:
-            InputError: not a URL that can be used, or the package that speaks it is missing.
+            InputError: not a URL that can be used, or the package for it is missing.
             RemoteError: the place cannot be reached.
         """
         import fsspec
@@ -60,7 +91,7 @@ class Remote:
         self.url = check_url(url)
         try:
             # what another program put there meanwhile must be seen
-            self._fs, self._root = fsspec.url_to_fs(
+            self._fs, root = fsspec.url_to_fs(
                 self.url, use_listings_cache=False, skip_instance_cache=True
             )
         except ImportError as error:
@@ -71,16 +102,16 @@ class Remote:
             ) from None  # fmt: skip
         except ValueError as error:
             raise InputError("URL", "", self.url, f"cannot be used: {error}") from None
-        self._root = str(self._root).rstrip("/")
+        self._root = str(root).rstrip("/")
         kinds = self._fs.protocol
-        self.local = "file" in ((kinds,) if isinstance(kinds, str) else kinds)
+        self._local = "file" in ((kinds,) if isinstance(kinds, str) else kinds)
 
     def where(self, key: str) -> str:
-        """The full URL of an object, for messages."""
+        """Return the full URL of an object, for messages."""
         return f"{self.url}/{key}"
 
     def begin(self) -> None:
-        """Make the place one of ours if it is empty.
+        """Make an empty place one of ours.
 
         Raises:
             RemoteError: it holds other things, or is of a newer version.
@@ -93,12 +124,13 @@ class Remote:
                     f"{self.url}: holds other things; give an empty place, or one that "
                     "`sliplab push` made"
                 ) from None
-            self.put_bytes(LAYOUT_FILE, json_text({"layout": LAYOUT}).encode())
+            self.put(LAYOUT_FILE, json_text({"layout": LAYOUT}).encode())
 
     def check(self) -> None:
-        """
+        """Check that a store was pushed here.
+
         Raises:
-            NoPushedStore: nothing was ever pushed there.
+            NoPushedStore: nothing was ever pushed here.
             RemoteError: it is of a newer version, or damaged.
         """
         try:
@@ -119,7 +151,7 @@ class Remote:
             )
 
     def sizes(self, folder: str) -> dict[str, int]:
-        """Bytes of each object right below `folder`, by its name."""
+        """Return the bytes of each object right below `folder`, by its name."""
         return {
             str(entry["name"]).rpartition("/")[2]: int(entry["size"] or 0)
             for entry in self._list(folder)
@@ -127,26 +159,33 @@ class Remote:
         }
 
     def folders(self, folder: str) -> list[str]:
-        """Names of the folders right below `folder`."""
+        """Return the names of the folders right below `folder`."""
         found = (entry for entry in self._list(folder) if entry["type"] == "directory")
         return sorted(str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in found)
 
-    def read(self, key: str, most: int = SMALL_BYTES) -> bytes:
-        """A small object.
+    def size(self, key: str) -> int:
+        """Return the bytes of an object.
 
         Raises:
-            RemoteMissing: it is not there.
-            RemoteError: it cannot be read, or has more than `most` bytes.
+            RemoteMissing: it does not exist.
         """
-        data = b""
-        for block in self._blocks(key, most + 1):
-            data += block
-        if len(data) > most:
-            raise RemoteError(f"{self.where(key)}: has more than {most} bytes")
+        with self._errors_translated(key, "read"):
+            return int(self._fs.info(self._path(key))["size"])
+
+    def read(self, key: str) -> bytes:
+        """Read a small object.
+
+        Raises:
+            RemoteMissing: it does not exist.
+            RemoteError: it cannot be read, or has more than `SMALL_BYTES`.
+        """
+        data = b"".join(self._blocks(key, SMALL_BYTES + 1))
+        if len(data) > SMALL_BYTES:
+            raise RemoteError(f"{self.where(key)}: has more than {SMALL_BYTES} bytes")
         return data
 
     def read_many(self, keys: Sequence[str]) -> dict[str, bytes | RemoteError]:
-        """Small objects, side by side where the storage can; an error in place of one it lacks."""
+        """Read small objects, side by side where the storage can; an error stands for a bad one."""
         if not keys:
             return {}
         paths = {self._path(key): key for key in keys}
@@ -166,84 +205,65 @@ class Remote:
                 read[key] = error
         return read
 
-    def matches(self, key: str, said: Json, on_bytes: OnBytes | None = None) -> bool:
-        """Whether an object has the ``bytes`` and the ``sha256`` of `said`; all of it is read.
+    def matches(self, key: str, known: Checksum, on_bytes: OnBytes | None = None) -> bool:
+        """Read all of an object and return whether it matches its checksum.
 
         Raises:
-            RemoteMissing: it is not there.
+            RemoteMissing: it does not exist.
         """
-        digest, size = hashlib.sha256(), 0
-        for block in self._blocks(key, said["bytes"] and said["bytes"] + 1):
-            digest.update(block)
-            size += len(block)
-            if on_bytes is not None:
-                on_bytes(len(block))
-        return bool(size == said["bytes"] and digest.hexdigest() == said["sha256"])
+        try:
+            for block in self._checked(key, known):
+                if on_bytes is not None:
+                    on_bytes(len(block))
+        except RemoteDamaged:
+            return False
+        return True
 
-    def size(self, key: str) -> int:
-        """Bytes of an object.
-
-        Raises:
-            RemoteMissing: it is not there.
-        """
-        with self._errors_translated(key, "read"):
-            return int(self._fs.info(self._path(key))["size"])
-
-    def put_bytes(self, key: str, data: bytes) -> None:
-        """Put a small object, in one step as far as the storage can."""
-        self._put(key, lambda: (data,), lambda: self._fs.pipe_file(self._path(key), data))
-
-    def put_file(self, key: str, path: Path) -> None:
-        """Put a file."""
-        self._put(
-            key, lambda: read_blocks(path), lambda: self._fs.put_file(str(path), self._path(key))
-        )
-
-    def get_file(self, key: str, path: Path, said: Json) -> None:
-        """Fetch an object into `path`, which appears once all of it is there and as it should be.
-
-        Args:
-            said: its ``bytes`` and ``sha256``.
+    def get(self, key: str, path: Path, known: Checksum) -> None:
+        """Fetch an object into `path`, which appears once all of it matches its checksum.
 
         Raises:
-            RemoteMissing: it is not there.
+            RemoteMissing: it does not exist.
             RemoteError: it cannot be read, or does not match its checksum.
             OSError: `path` cannot be written.
         """
+        write_blocks(path, self._checked(key, known))
 
-        def checked() -> Iterator[bytes]:
-            digest, size = hashlib.sha256(), 0
-            for block in self._blocks(key, said["bytes"] and said["bytes"] + 1):
-                digest.update(block)
-                size += len(block)
-                yield block
-            if size != said["bytes"] or digest.hexdigest() != said["sha256"]:
-                raise RemoteError(f"{self.where(key)}: does not match its checksum")
-
-        write_blocks(path, checked())
+    def put(self, key: str, source: bytes | Path) -> None:
+        """Write an object from bytes or a file, in one step as far as the storage can."""
+        path = self._path(key)
+        with self._errors_translated(key, "written"):
+            if self._local:  # fsspec neither flushes to the disk nor renames into place
+                make_folder(Path(path).parent)
+                blocks = (source,) if isinstance(source, bytes) else read_blocks(source)
+                write_blocks(Path(path), blocks)
+            elif isinstance(source, bytes):
+                self._fs.pipe_file(path, source)
+            else:
+                self._fs.put_file(str(source), path)
 
     def remove(self, key: str) -> None:
-        """Take an object away; nothing happens if it is gone."""
+        """Remove an object; nothing happens if it does not exist."""
         try:
             with self._errors_translated(key, "removed"):
                 self._fs.rm_file(self._path(key))
         except RemoteMissing:
             pass
 
-    def _put(self, key: str, blocks: Callable[[], Iterable[bytes]], put: Callable[[], Any]) -> None:
-        with self._errors_translated(key, "written"):
-            if self.local:  # fsspec neither flushes to the disk nor writes aside
-                path = Path(self._path(key))
-                make_folder(path.parent)
-                write_blocks(path, blocks())
-            else:
-                put()
+    def _checked(self, key: str, known: Checksum) -> Iterator[bytes]:
+        """Yield an object's bytes, and raise `RemoteDamaged` at their end if they do not match."""
+        digest, size = hashlib.sha256(), 0
+        for block in self._blocks(key, known.bytes and known.bytes + 1):
+            digest.update(block)
+            size += len(block)
+            yield block
+        if size != known.bytes or digest.hexdigest() != known.sha256:
+            raise RemoteDamaged(f"{self.where(key)}: does not match its checksum")
 
-    def _blocks(self, key: str, most: int | None = None) -> Iterator[bytes]:
-        """An object's bytes, the first `most` of them; who knows how many saves asking for it."""
+    def _blocks(self, key: str, most: int) -> Iterator[bytes]:
+        """Yield an object's first `most` bytes; 0 asks for its size and yields all of them."""
         path = self._path(key)
-        if not most:
-            most = self.size(key)
+        most = most or self.size(key)
         for start in range(0, most, _BLOCK):
             end = min(most, start + _BLOCK)
             with self._errors_translated(key, "read"):
@@ -268,7 +288,7 @@ class Remote:
 
     @contextmanager
     def _errors_translated(self, key: str, done: str) -> Iterator[None]:
-        """Translate errors to one line, without anything that is secret."""
+        """Translate errors to one line without secrets."""
         try:
             yield
         except StoreError:
@@ -278,18 +298,14 @@ class Remote:
         except Exception as error:  # each storage has its own kinds
             what = self._without_secrets(" ".join(str(error).split()) or type(error).__name__)
             raise RemoteError(
-                f"{self.where(key)}: cannot be {done}: {what[:_ANSWERS]}; see to that, then run "
-                "the same command to go on"
+                f"{self.where(key)}: cannot be {done}: {what[:_ANSWER_CHARACTERS]}; see to that, "
+                "then run the same command to go on"
             ) from None
 
     def _without_secrets(self, text: str) -> str:
-        options = self._fs.storage_options
-        known = [
-            str(value)
-            for name, value in options.items()
-            if isinstance(value, str) and is_secret(name)
-        ]
+        options = self._fs.storage_options.items()
+        known = [value for name, value in options if isinstance(value, str) and is_secret(name)]
         known += [os.environ.get(name, "") for name in _SECRET_VARIABLES]
-        for value in known:
-            text = text.replace(value, "***") if value else text
-        return text
+        for value in filter(None, known):
+            text = text.replace(value, MASK)
+        return masked(text)
