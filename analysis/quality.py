@@ -24,10 +24,10 @@ from sliplab.protocols.settings import Labelling
 from sliplab.protocols.timing import Timing
 from sliplab.storage.schema.trial import Clocks, Counts, Gate
 from sliplab.storage.streams import F64, I64, PathSegment
-from sliplab.storage.trials.columns import TRACKS
-from sliplab.storage.trials.hdf5 import StreamReader
+from sliplab.storage.trials.checksums import DATA
+from sliplab.storage.trials.hdf5_reader import StreamReader
+from sliplab.storage.trials.hdf5_writer import TRACKS
 from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.writer import DATA
 
 UNVOUCHED_S = 0.3
 """A recording may begin and end this much before and after the pulses on which a clock's fit

@@ -35,9 +35,9 @@ def import_(
     from dataclasses import replace
 
     from sliplab.flows.collecting.requests import store_lock
+    from sliplab.storage.files import safe_name
     from sliplab.storage.formats.find import KINDS, kind_of, trials_in
     from sliplab.storage.formats.import_trials import import_trials
-    from sliplab.storage.names import safe_name
     from sliplab.storage.trials.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path
@@ -132,7 +132,7 @@ def export_model(
 ) -> None:
     """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
     from sliplab.flows.detecting.detect_order import load_model
-    from sliplab.storage.trials.store import Store
+    from sliplab.storage.remote.mirror import open_store
 
     if out.exists() and not out.is_dir():
         raise InputError("--out", "", str(out), "must be a folder")
@@ -140,7 +140,7 @@ def export_model(
     folder = store or model.resolve().parent.parent
     if store is None and not (folder / "store.json").exists():
         raise InputError("--store", "", None, f"is needed: {model} lies in no store")
-    opened = Store.open(folder)
+    opened = open_store(folder)
     prepare_store(folder)
     from sliplab.flows.learning.model_export import export_model as run
 

@@ -79,7 +79,7 @@ def rigs(
 def _about(path: Path, ask: bool) -> dict[str, Any]:
     """Describe one rig file."""
     from sliplab.rigs.rig_file import load_rig_file
-    from sliplab.storage.secrets import masked
+    from sliplab.storage.errors import masked
 
     try:
         file, _ = load_rig_file(path)

@@ -295,7 +295,7 @@ class Session:
         if not found.passed:
             cause = {"cause": f"gate: {found.causes}", "trial": trial.id, "attempt": number}
             target = self.campaign.quarantine_path(trial.id)
-            writer.set_aside(target, record, provenance, cause)
+            writer.quarantine(target, record, provenance, cause)
             return False
         try:
             writer.commit(record, provenance)

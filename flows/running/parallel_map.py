@@ -24,7 +24,7 @@ from prefect.settings import PREFECT_API_URL
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, Pickled, run
 from sliplab.flows.running.run_records import timed
-from sliplab.storage.remote.mirror import place_of, reach
+from sliplab.storage.remote.mirror import open_for_trial, place_of
 from sliplab.storage.schema.document import Document
 from sliplab.storage.schema.trial import SyncResult
 from sliplab.storage.streams import Json
@@ -297,7 +297,7 @@ def _make(job: _Job) -> Any:
 
 
 def _recording(job: _Job) -> Recording:
-    store = reach(job.place, job.campaign, job.trial)
+    store = open_for_trial(job.place, job.campaign, job.trial)
     recording = store.campaign(job.campaign).recording(job.trial)
     recording.use_clocks(job.clocks)
     if recording.checksum != job.checksum:

@@ -38,9 +38,10 @@ from sliplab.flows.study_defaults import LABELS_CHECKED, study_protocols
 from sliplab.protocols import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage.errors import disk_error
+from sliplab.storage.remote.mirror import open_store
 from sliplab.storage.trials import control
 from sliplab.storage.trials.lock import Locked
-from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.store import StoreError
 
 LOOK_S = 2.0
 """How often a rig that is in use is asked for again."""
@@ -306,14 +307,14 @@ def _study(wanted: Study, here: Service, run: Any) -> str:
 def _steps(here: Service, campaigns: list[str], name: str, **options: Any) -> str:
     from sliplab.analysis.campaigns import collected
 
-    store = Store.open(here.folder)
+    store = open_store(here.folder)
     step = getattr(import_module(STEPS[name]), name)
     result = step(store, collected(store, campaigns or None), **options)
     return f"{name}: {result['done']} done, {result['fresh']} were fresh"
 
 
 def _ask(kind: control.Kind, wanted: Ask, here: Service, run: Any) -> str:
-    store = Store.open(here.folder)
+    store = open_store(here.folder)
     who = wanted.who or "Prefect's page"
     if kind == "stop":
         outcome = requests.stop_collection(store, who=who, why=wanted.why, limit_s=wanted.wait_s)

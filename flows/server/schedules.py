@@ -333,7 +333,7 @@ def _protocol(path: Path, name: Path, enable: list[str]) -> str:
 
 
 def _check_campaign(path: Path, name: str | None) -> None:
-    from sliplab.storage.names import safe_name
+    from sliplab.storage.files import safe_name
     from sliplab.storage.trials.store import StoreError
 
     try:

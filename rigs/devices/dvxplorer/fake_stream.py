@@ -4,7 +4,7 @@ The library's own writer (2.0.4) cannot stand in for a camera here: each of its 
 sockets without ever resting and takes a core, and events go in one by one, at 0.7 million a second.
 On the wire there is a header and then packets. A header is a length and a flatbuffer `IOHE` with
 the stream's description; a packet is stream and length (int32 each) and a flatbuffer with its
-length in front (`storage.formats.dv_buffers`).
+length in front (`storage.formats.flatbuffers`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import threading
 from collections import deque
 from contextlib import suppress
 
-from sliplab.storage.formats.dv_buffers import events_buffer, header_buffer, triggers_buffer
+from sliplab.storage.formats.flatbuffers import events_buffer, header_buffer, triggers_buffer
 from sliplab.storage.streams import I64, EventChunk, PulseChunk
 
 RISING_EDGE = 1

@@ -14,7 +14,8 @@ import pytest
 
 from sliplab.flows.collecting.session import Session
 from sliplab.rigs.core.capabilities import ArmFault, RigError
-from sliplab.storage.files import disk_full, write_json
+from sliplab.storage.errors import disk_full
+from sliplab.storage.files import write_json
 from sliplab.storage.schema.trial import TrialRecord
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
