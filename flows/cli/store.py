@@ -41,11 +41,11 @@ def trials(
 ) -> None:
     """The catalogue of committed trials as a table, and what was set aside, with causes."""
     from sliplab.flows.planning.campaign_trials import all_excluded, print_excluded
+    from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import catalogue, query
-    from sliplab.storage.trials.store import Store
 
     unreadable: list[str] = []
-    opened = Store.open(located(store))
+    opened = open_store(located(store))
     table = catalogue(opened, unreadable)
     whole = None
     if not unreadable and len(table):  # else what is whole may be more than what can be read
@@ -94,10 +94,10 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Check every checksum, count and clock of a store; changes nothing unless told to."""
+    from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
-    from sliplab.storage.trials.verify import set_aside, trial_folders
+    from sliplab.storage.trials.verify import quarantine_damaged, trial_folders
     from sliplab.storage.trials.verify import verify as look
-    from sliplab.storage.urls import is_url
 
     if is_url(store):
         _verify_pushed(store, quarantine, as_json)
@@ -111,7 +111,7 @@ def verify(
         from sliplab.flows.collecting.requests import store_lock
 
         with store_lock(opened):
-            moved = set_aside(opened, problems)
+            moved = quarantine_damaged(opened, problems)
         console.say(f"{len(moved)} damaged trials are in quarantine; `sliplab collect` takes them")
     if as_json:
         damaged = len({(item.campaign, item.trial) for item in problems if item.trial})
@@ -198,7 +198,7 @@ def push(
     """
     from sliplab.flows.collecting.requests import holder_of
     from sliplab.flows.running import stopping
-    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.push import PushOptions
     from sliplab.storage.remote.push import push as send
     from sliplab.storage.trials.store import Store
@@ -206,14 +206,14 @@ def push(
     opened = Store.open(store)
     chosen = _chosen(opened, campaign)
     remote = Remote(url)
-    wishes = PushOptions(quarantine, replace, not sizes_only, check)
+    options = PushOptions(quarantine, replace, not sizes_only, check)
     done = None
     while True:
         collects = follow and _collects(holder_of(store))
         total = sum(len(item.committed()) for item in chosen)
         with console.bar(f"push {store} (trials)", total) as bar:
             now = send(
-                opened, remote, chosen, wishes,
+                opened, remote, chosen, options,
                 lambda name: bar.advance(1, name), lambda _: stopping.check(),
             )  # fmt: skip
         if done is None:
@@ -235,7 +235,7 @@ def pull(
     as_json: JsonOption = False,
 ) -> None:
     """Bring pushed trials into a store, each checked; run it again to bring what is new."""
-    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.pull import pull as pull_trials
 
     with console.bar(f"pull {url} (trials)", 0) as bar:
@@ -258,7 +258,7 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
         InputError: something was to be set aside there.
     """
     from sliplab.flows.running import stopping
-    from sliplab.storage.objects import Remote
+    from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.verify import verify_remote
 
     if quarantine:

@@ -212,8 +212,9 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
 def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
     """Fit every clock that needs no frames, as a trial's clocks are fitted."""
     from sliplab.analysis.clocks.synchronise import streams_of, synchronise
-    from sliplab.storage.trials.hdf5 import StreamReader
-    from sliplab.storage.trials.writer import DATA, TrialWriter
+    from sliplab.storage.trials.checksums import DATA
+    from sliplab.storage.trials.hdf5_reader import StreamReader
+    from sliplab.storage.trials.writer import TrialWriter
 
     rate = run_request.plan.protocol.collection.recording.sync_rate
     with TemporaryDirectory() as folder:
