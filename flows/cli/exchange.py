@@ -36,8 +36,7 @@ def import_(
 
     from sliplab.flows.collecting.requests import store_lock
     from sliplab.storage.files import safe_name
-    from sliplab.storage.formats.find import KINDS, kind_of, trials_in
-    from sliplab.storage.formats.import_trials import import_trials
+    from sliplab.storage.formats.import_trials import KINDS, import_trials, kind_of, trials_in
     from sliplab.storage.trials.store import Store, StoreError
 
     where = Path(kind_or_path) if path is None else path
@@ -73,8 +72,12 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trials as files that other programs read, or their labels as a table."""
-    from sliplab.storage.formats.export_trials import SUFFIXES, export_trials
-    from sliplab.storage.formats.tables import label_table, write_table
+    from sliplab.storage.formats.export_trials import (
+        SUFFIXES,
+        export_trials,
+        label_table,
+        write_table,
+    )
     from sliplab.storage.remote.mirror import open_store
 
     opened = open_store(store)

@@ -22,7 +22,7 @@ from sliplab.rigs.core.capabilities import RigError
 from sliplab.storage import process
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.streams import Json
-from sliplab.storage.trials import control, decisions
+from sliplab.storage.trials import control
 from sliplab.storage.trials.control import Kind, Request
 from sliplab.storage.trials.lock import STORE_LOCK, Locked, exclusive
 from sliplab.storage.trials.migrate import migrate
@@ -74,7 +74,7 @@ def carry_out(store: Store, running: bool = False) -> list[tuple[Request, Json]]
         elif request.kind == "stop":
             did = {"stopped": running, "running": running}
         else:
-            change = decisions.skip if request.kind == "skip" else decisions.again
+            change = control.skip if request.kind == "skip" else control.again
             where = store.campaign(request.campaign)
             if where.begun:
                 trials = change(where, request.trials, request.by)

@@ -46,7 +46,7 @@ from sliplab.storage.schema.trial import (
     TrialRecord,
 )
 from sliplab.storage.streams import Json
-from sliplab.storage.trials import control, decisions
+from sliplab.storage.trials import control
 from sliplab.storage.trials.control import Request
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.writer import TrialWriter
@@ -418,7 +418,7 @@ class TrialGate:
         self.clock: Callable[[], float] = time.time
         self._seen: frozenset[str] = frozenset()
         self._paused: Request | None = None
-        self._skipped = frozenset(decisions.skipped(campaign))
+        self._skipped = frozenset(control.skipped(campaign))
         self._wanted: set[str] = set()
 
     def begin(self) -> None:
@@ -480,7 +480,7 @@ class TrialGate:
             stopping.stop()
         if request.kind in {"pause", "resume"} or request.campaign != self._campaign.name:
             return
-        self._skipped = frozenset(decisions.skipped(self._campaign))
+        self._skipped = frozenset(control.skipped(self._campaign))
         if request.kind == "again":
             self._wanted |= set(request.trials)
         for trial, did in answer["did"].get("trials", {}).items():

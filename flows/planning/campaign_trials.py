@@ -11,7 +11,7 @@ from typing import Any
 from sliplab.analysis.campaigns import Collected
 from sliplab.flows.running import console
 from sliplab.protocols import InputError, Plan, Trial
-from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import FORGIVEN, IMPORTED, Campaign, Store, StoreError
 
 

@@ -1,22 +1,26 @@
-"""Export of committed trials to files of other formats, one a trial; the store is only read."""
+"""Export of committed trials to files of other formats, and of tables; the store is only read."""
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
+from sliplab.storage.files import make_folder, sync_file, sync_folder, write_bytes, write_json
 from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.formats.dsec import write_dsec
-from sliplab.storage.formats.foreign import Triggers
-from sliplab.storage.formats.import_trials import RISING
-from sliplab.storage.formats.manifest import FORMAT, MANIFEST
+from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST, RISING, Triggers
+from sliplab.storage.schema.label import LABELS
 from sliplab.storage.streams import I64, EventChunk, Json
+from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store
 
 SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
 """Of the files of each format."""
@@ -56,8 +60,8 @@ def export_trials(
         listed.append(_listed(recording, path.name, counts))
     sync_folder(folder)
     simulated = any(recording.simulated for recording in recordings)
-    about = {"sliplab_export": FORMAT, "campaign": campaign, "format": kind, "simulated": simulated}
-    write_json(folder / MANIFEST, {**about, "trials": listed})
+    about = {"campaign": campaign, "format": kind, "simulated": simulated, "trials": listed}
+    write_json(folder / EXPORT_MANIFEST, {"sliplab_export": EXPORT_FORMAT, **about})
     totals = {name: sum(item[name] for item in listed) for name in ("events", "frames", "triggers")}
     return {"trials": len(listed), **totals, "files": [item["file"] for item in listed]}
 
@@ -151,3 +155,52 @@ def _size(recording: Recording) -> tuple[int, int]:
         int(events.x.max(initial=0)) + 1,
         int(events.y.max(initial=0)) + 1,
     )
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table atomically in the format that its name ends in.
+
+    Raises:
+        InputError: it ends in something else than .csv, .parquet or .json.
+    """
+    kinds: dict[str, Callable[[], bytes]] = {
+        ".csv": lambda: table.to_csv(index=False).encode(),
+        ".parquet": lambda: _parquet(table),
+        ".json": lambda: table.to_json(orient="records").encode(),
+    }
+    if path.suffix not in kinds:
+        raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
+    write_bytes(path, kinds[path.suffix]())
+
+
+def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
+    """One row a labelled trial: what its label says in single values, times in integer ns.
+
+    Nested values become columns with a dot in their names; lists are left out. Values that are not
+    in every label are missing, and integers stay integers.
+    """
+    kept = Derived.of(store, LABELS, campaign)
+    rows: list[dict[str, Any]] = []
+    for trial in trials:
+        try:
+            found = kept.read(trial)
+        except FileNotFoundError:
+            continue
+        rows.append({"campaign": campaign, "trial": trial, **_flat(found, "")})
+    return pd.DataFrame(rows).convert_dtypes()
+
+
+def _flat(data: dict[str, Any], before: str) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{before}{key}.")
+        elif not isinstance(value, list):
+            flat[f"{before}{key}"] = value
+    return flat
+
+
+def _parquet(table: pd.DataFrame) -> bytes:
+    made = io.BytesIO()
+    table.to_parquet(made, index=False, engine="pyarrow")
+    return made.getvalue()

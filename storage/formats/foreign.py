@@ -12,6 +12,10 @@ import numpy as np
 from sliplab.protocols.errors import InputError
 from sliplab.storage.streams import I64, U8, EventChunk, FrameChunk, Json
 
+RISING = 1
+"""A rising edge of the external input, as AEDAT4 numbers triggers."""
+EXPORT_MANIFEST, EXPORT_FORMAT = "sliplab-export.json", 1
+"""File beside exported trials, from which they are imported again as they were."""
 _HEAD_BYTES = 1 << 14
 MOST_PX = 1 << 14
 LATEST_US = 1 << 53

@@ -1,23 +1,41 @@
-"""Import of foreign trials into a campaign of their own: each one whole or not at all.
+"""Import of foreign trials into a campaign of their own: each one complete or not at all.
+
+Formats are recognised by how a file begins. Where that says nothing the name's ending does, so that
+a damaged file is refused instead of left out.
 
 A trial is committed by the store's own rename after all of it was read and found right. What nobody
-knows of it (clocks against one another, poses, what was asked for) is said to be unknown and not
-made up: its time line is the event camera's own clock.
+knows of it (clocks against one another, poses, conditions) is said to be unknown and not made up:
+its time line is the event camera's own clock.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
 from sliplab.protocols.errors import InputError
 from sliplab.storage.clockmap import IDENTITY
-from sliplab.storage.files import json_text, safe_name
-from sliplab.storage.formats.foreign import ForeignTrial, FormatError
+from sliplab.storage.errors import StoreError
+from sliplab.storage.files import json_text, read_json, safe_name
+from sliplab.storage.formats.aedat4 import LINE, read_aedat4
+from sliplab.storage.formats.dsec import is_lab_hdf5, read_dsec, read_lab_hdf5
+from sliplab.storage.formats.foreign import (
+    EXPORT_FORMAT,
+    EXPORT_MANIFEST,
+    RISING,
+    ForeignTrial,
+    FormatError,
+    read_head,
+)
+from sliplab.storage.formats.lab_pickles import pairs, read_pair
+from sliplab.storage.formats.prophesee import faery_type, read_by_faery
 from sliplab.storage.process import now
 from sliplab.storage.schema.document import first_fault
 from sliplab.storage.schema.trial import (
@@ -33,11 +51,174 @@ from sliplab.storage.streams import EventChunk, Json, PulseChunk
 from sliplab.storage.trials.store import IMPORTED, Campaign, Store
 from sliplab.storage.trials.writer import TrialWriter
 
-RISING = 1
-"""A rising edge of the external input, as AEDAT4 numbers triggers."""
+Reader = Callable[[Path, str], ForeignTrial]
+READERS: dict[str, tuple[tuple[str, ...], Reader]] = {
+    "aedat4": ((".aedat4",), read_aedat4),
+    "dsec": ((".h5", ".hdf5"), read_dsec),
+    "lab-hdf5": ((".h5", ".hdf5"), read_lab_hdf5),
+    "raw": ((".raw", ".dat"), read_by_faery),
+    "es": ((".es",), read_by_faery),
+}
+LAB_PICKLES = "lab-pickles"
+KINDS = (*READERS, LAB_PICKLES)
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _LONG_GAP_US = 3_600_000_000
 _FRAME_RATE = 100
 """Of the video's own time base only; when frames were taken stands in their times."""
+
+
+def kind_of(path: Path) -> str:
+    """The format of a file, or of the files in a folder.
+
+    Raises:
+        InputError: none of them is known, or they are of several.
+    """
+    files = _files(path)
+    found = {_kind(file) for file in files} - {None}
+    if pairs(files):
+        found.add(LAB_PICKLES)
+    if len(found) == 1:
+        return str(found.pop())
+    what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
+    raise InputError(
+        path, "", None,
+        f"{what if found else 'holds no file of a known format'}; name one of {', '.join(KINDS)}",
+    )  # fmt: skip
+
+
+def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
+    """The trials of a file or folder, in the order of their names.
+
+    Raises:
+        InputError: there is none, or a file is damaged.
+    """
+    files = _files(path)
+    if kind == LAB_PICKLES:
+        found = pairs(files)
+        if not found:
+            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
+        for pair in found:
+            yield read_pair(pair, name_of(pair.stem))
+        return
+    suffixes, reader = READERS[kind]
+    told = _read_manifest(path) if path.is_dir() else None
+    if told is not None:
+        for item in told["trials"]:
+            file = path / item["file"]
+            if file.is_symlink() or not file.is_file():
+                raise InputError(file, "", None, "is missing, or no plain file")
+            yield _as_exported(_read(reader, file, item["trial"]), item, told["simulated"])
+        return
+    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
+    if not wanted:
+        raise InputError(
+            path, "", None, f"holds no {kind} file; such files end in {' or '.join(suffixes)}"
+        )
+    for file in wanted:
+        yield _read(reader, file, name_of(_stem(file)))
+
+
+def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
+    try:
+        return reader(file, name)
+    except FormatError as error:
+        raise InputError(file, "", None, str(error)) from None
+
+
+def _stem(file: Path) -> str:
+    """A file's name without its ending; a name without one may have dots in it."""
+    known = {ending for endings, _ in READERS.values() for ending in endings}
+    return file.stem if file.suffix.lower() in known else file.name
+
+
+def name_of(stem: str) -> str:
+    """A file's name as that of a trial: what cannot stand in one becomes ``_``."""
+    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
+    return plain or "trial"
+
+
+def _files(path: Path) -> list[Path]:
+    """Plain files; links are left out, for they may lead anywhere."""
+    if path.is_dir():
+        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
+    elif path.is_file():
+        found = [path]
+    else:
+        raise InputError(path, "", None, "no such file or folder")
+    return found
+
+
+def _possible(file: Path) -> tuple[str, ...]:
+    """Formats that a file may have: by how it begins, else by its name's ending."""
+    head = read_head(file)
+    if head.startswith(LINE):
+        return ("aedat4",)
+    if head.startswith(_HDF5):
+        return ("dsec", "lab-hdf5")
+    if form := faery_type(head):
+        return ("es",) if form == "es" else ("raw",)
+    suffix = file.suffix.lower()
+    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
+
+
+def _kind(file: Path) -> str | None:
+    kinds = _possible(file)
+    if "dsec" in kinds:
+        try:
+            return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
+        except FormatError as error:
+            raise InputError(file, "", None, str(error)) from None
+    return kinds[0] if kinds else None
+
+
+def _read_manifest(folder: Path) -> Json | None:
+    """The description of an exported campaign, checked; None where there is none.
+
+    Raises:
+        InputError: it is damaged, or names a file outside of its folder.
+    """
+    path = folder / EXPORT_MANIFEST
+    if not path.is_file() or path.is_symlink():
+        return None
+    try:
+        found = read_json(path)
+        if found.get("sliplab_export") != EXPORT_FORMAT:
+            raise ValueError(f"{path}: sliplab_export must be {EXPORT_FORMAT}")
+        if not isinstance(found.get("simulated"), bool):
+            raise ValueError(f"{path}: simulated must be true or false")
+        for item in found["trials"]:
+            safe_name(item["trial"])
+            safe_name(item["file"])
+            _check_exported(item, path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, StoreError) as error:
+        text = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, "", None, f"is damaged: {text}") from None
+    return found
+
+
+def _check_exported(item: Json, path: Path) -> None:
+    texts = item["condition"]
+    if not isinstance(texts, dict) or not all(isinstance(t, str) for t in texts.values()):
+        raise ValueError(f"{path}: a condition that is no text")
+    for name in ("events", "frames", "triggers", "repetition"):
+        if type(item[name]) is not int:
+            raise ValueError(f"{path}: {name} must be an integer")
+
+
+def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
+    """A trial with what the manifest says of it."""
+    about: dict[str, Any] = {**trial.about, "exported": item.get("record", {})}
+    return replace(
+        trial,
+        condition=dict(item["condition"]),
+        repetition=item["repetition"],
+        simulated=simulated or trial.simulated,
+        about=about,
+        unknown=tuple(what for what in trial.unknown if what != "condition"),
+    )
 
 
 def import_trials(

@@ -34,7 +34,7 @@ from sliplab.storage.trials.checksums import (
     as_json,
     read_sums,
 )
-from sliplab.storage.trials.decisions import SKIPPED
+from sliplab.storage.trials.control import SKIPPED
 from sliplab.storage.trials.store import CAUSE, INFO, PROTOCOL, RIG, Campaign, StoreError
 
 Kind = Literal["about", "trials", "quarantine"]

@@ -1,65 +1,53 @@
-"""What people asked of a store from another terminal: one small file a request, kept for good.
+"""Requests of people to a store, and those that change which trials a campaign still takes.
 
-    STORE/control/000001.json        what was asked, by whom, when and why
-    STORE/control/000001.done.json   when and by whom it was carried out, and what came of it
+    STORE/control/000001.json        a request: who, when, why
+    STORE/control/000001.done.json   its answer: when and by whom it was carried out, and the result
+    campaigns/NAME/skipped.json      trials that a person skipped: who, when, why
+    campaigns/NAME/quarantine/ID.N/cause.json   who took a committed trial away again
 
-Any program may ask. Whoever holds the store's lock carries out: a collection between two trials,
-or, while nobody collects, the program that asks.
+Any program may ask. The holder of the store's lock carries out: a collection between two trials,
+or, while nobody collects, the program that asks. Nothing is deleted.
 """
 
 from __future__ import annotations
 
-import re
-import socket
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 from sliplab.storage.errors import StoreError
-from sliplab.storage.files import make_folder, read_json, safe_name, write_new_json
+from sliplab.storage.files import read_json, safe_name, write_json, write_new_json
 from sliplab.storage.process import now, user_name
 from sliplab.storage.streams import Json
-from sliplab.storage.trials.store import Store
+from sliplab.storage.trials.journal import Entry, Journal, signature
+from sliplab.storage.trials.store import AGAIN, CAUSE, FORGIVEN, Campaign, Store
 
 Kind = Literal["pause", "resume", "stop", "skip", "again"]
-FOLDER = "control"
-_REQUEST = re.compile(r"(\d{6,12})\.json")
+FOLDER, SKIPPED = "control", "skipped.json"
 _MOST_TRIES = 1000
 
 
-@dataclass(frozen=True)
-class Request:
-    """One thing that was asked for.
+@dataclass(frozen=True, kw_only=True)
+class Request(Entry):
+    """One request.
 
     Attributes:
-        number: its place among the requests, from 1.
-        when: UTC, ISO 8601.
-        campaign: whose trials; empty where the whole store is meant.
+        campaign: campaign of the trials; empty where the whole store is meant.
     """
 
-    number: int
     kind: Kind
-    who: str
-    when: str
-    why: str = ""
-    host: str = ""
     campaign: str = ""
     trials: tuple[str, ...] = ()
 
     @property
     def by(self) -> Json:
         """Who, when and why, to be kept with what follows from it."""
-        return {
-            "who": self.who,
-            "when": self.when,
-            "why": self.why,
-            "host": self.host,
-            "request": self.number,
-        }
+        names = ("who", "when", "why", "host")
+        return {**{name: getattr(self, name) for name in names}, "request": self.number}
 
     def __str__(self) -> str:
-        why = f" ({self.why})" if self.why else ""
-        return f"{self.kind} by {self.who}, {self.when}{why}"
+        return self._told(self.kind)
 
 
 def ask(
@@ -71,42 +59,40 @@ def ask(
     campaign: str = "",
     trials: tuple[str, ...] = (),
 ) -> Request:
-    """Put a request into the store; it stands after every one that was there before.
+    """Put a request into the store, after every one that exists.
 
     Raises:
         OSError: it cannot be written.
     """
-    folder = store.folder / FOLDER
-    make_folder(folder)
-    number = max((n for n, _ in _files(store)), default=0)
+    journal = _journal(store)
+    number = max(journal.numbers(), default=0)
     for _ in range(_MOST_TRIES):
         number += 1
         made = Request(
-            number, kind, who or user_name(), now(), why, socket.gethostname(), campaign, trials
+            number=number, kind=kind, campaign=campaign, trials=trials, **signature(who, why)
         )
-        data = {name: value for name, value in vars(made).items() if name != "number"}
-        if write_new_json(folder / f"{number:06d}.json", data):
+        if journal.add(number, {k: value for k, value in vars(made).items() if k != "number"}):
             return made
-    raise OSError(f"{folder}: no number is free")
+    raise OSError(f"{journal.folder}: no number is free")
 
 
 def requests(store: Store, after: int = 0) -> list[Request]:
-    """Requests in their order, those with a number above `after` only; unreadable ones left out."""
-    found = []
-    for number, path in _files(store):
+    """Return the requests with a number above `after`, in order; unreadable ones are left out."""
+    journal, found = _journal(store), []
+    for number in journal.numbers():
         if number <= after:
             continue
         try:
-            data = read_json(path)
+            data = read_json(journal.path(number))
             made = Request(
-                number,
-                data["kind"],
-                str(data["who"]),
-                str(data["when"]),
-                str(data.get("why", "")),
-                str(data.get("host", "")),
-                safe_name(name) if (name := str(data.get("campaign", ""))) else "",
-                tuple(safe_name(str(trial)) for trial in data.get("trials", ())),
+                number=number,
+                kind=data["kind"],
+                who=str(data["who"]),
+                when=str(data["when"]),
+                why=str(data.get("why", "")),
+                host=str(data.get("host", "")),
+                campaign=safe_name(name) if (name := str(data.get("campaign", ""))) else "",
+                trials=tuple(safe_name(str(trial)) for trial in data.get("trials", ())),
             )
         except (OSError, ValueError, KeyError, TypeError, StoreError):
             continue
@@ -116,14 +102,13 @@ def requests(store: Store, after: int = 0) -> list[Request]:
 
 
 def answer(store: Store, request: Request, did: Json) -> Json:
-    """Keep what came of a request; an answer that is there already stands."""
-    path = _answer_path(store, request)
-    write_new_json(path, {"when": now(), "by": user_name(), "did": did})
+    """Keep the result of a request; an answer that exists stands."""
+    write_new_json(_answer_path(store, request), {"when": now(), "by": user_name(), "did": did})
     return answered(store, request) or {"did": {}}
 
 
 def answered(store: Store, request: Request) -> Json | None:
-    """What came of a request, None while it is open."""
+    """Return the answer to a request; None while it is open."""
     try:
         found = read_json(_answer_path(store, request))
     except FileNotFoundError:
@@ -134,26 +119,103 @@ def answered(store: Store, request: Request) -> Json | None:
 
 
 def open_requests(store: Store, after: int = 0) -> list[Request]:
-    """Requests that nobody has carried out yet, in their order."""
+    """Return the requests that nobody has carried out yet, in order."""
     return [item for item in requests(store, after) if answered(store, item) is None]
 
 
 def paused(store: Store) -> Request | None:
-    """The request by which the store is paused, if it is: the last word counts."""
-    last = None
-    for item in requests(store):
-        if item.kind in {"pause", "resume"}:
-            last = item
-    return last if last is not None and last.kind == "pause" else None
+    """Return the request by which the store is paused, if it is: the last one counts."""
+    both = [item for item in requests(store) if item.kind in {"pause", "resume"}]
+    return both[-1] if both and both[-1].kind == "pause" else None
 
 
-def _files(store: Store) -> list[tuple[int, Path]]:
-    folder = store.folder / FOLDER
-    if not folder.is_dir():
-        return []
-    found = [(_REQUEST.fullmatch(path.name), path) for path in folder.iterdir()]
-    return sorted((int(match[1]), path) for match, path in found if match)
+def skipped(campaign: Campaign) -> dict[str, Json]:
+    """Return the trials that a person skipped: ``who``, ``when``, ``why`` by id.
+
+    Raises:
+        StoreError: the list is damaged.
+    """
+    path = campaign.folder / SKIPPED
+    try:
+        found = read_json(path)
+        if not all(isinstance(by, dict) for by in found.values()):
+            raise ValueError(f"{path}: does not say who set which trial aside")
+        return found
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise StoreError(
+            f"{error}; it is damaged: put it back from a copy, or delete it to take those trials "
+            "after all (who asked for what is in control/)"
+        ) from None
+
+
+def skip(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]:
+    """Skip trials, so that no collection takes them; the caller holds the store's lock.
+
+    Args:
+        by: who, when and why.
+
+    Returns:
+        The result for each trial, in words.
+    """
+    committed, known, did = campaign.committed(), skipped(campaign), {}
+    for trial in trials:
+        if trial in committed:
+            did[trial] = "is committed: left as it is"
+        elif trial in known:
+            did[trial] = "was set aside already"
+        else:
+            known[trial] = by
+            did[trial] = "set aside"
+    if "set aside" in did.values():
+        write_json(campaign.folder / SKIPPED, known)
+    return did
+
+
+def again(campaign: Campaign, trials: Iterable[str], by: Json) -> dict[str, str]:
+    """Make trials pending again; the caller holds the store's lock.
+
+    Committed ones go to quarantine, with who, when and why. Those skipped by a person, or after too
+    many retakes, are skipped no longer.
+
+    Returns:
+        The result for each trial, in words.
+    """
+    committed, known, did = campaign.committed(), skipped(campaign), {}
+    before = len(known)
+    for trial in trials:
+        done = []
+        if trial in committed:
+            folder = campaign.folder / "trials" / trial
+            cause = f"{AGAIN}: {by.get('why') or 'no reason given'}"
+            target = campaign.quarantine(folder, cause, asked=by)
+            done.append(f"moved to quarantine/{target.name}")
+        if known.pop(trial, None) is not None:
+            done.append("no longer set aside")
+        if count := _reset_attempts(campaign, trial, by):
+            done.append(f"{count} failed attempts count no longer")
+        did[trial] = "; ".join([*done, "will be taken again"] if done else ["was pending already"])
+    if len(known) < before:
+        write_json(campaign.folder / SKIPPED, known)
+    return did
+
+
+def _reset_attempts(campaign: Campaign, trial: str, by: Json) -> int:
+    """Mark the failed attempts at a trial, so that they count no longer; return how many."""
+    count = 0
+    for item in campaign.quarantined():
+        gate = item["trial"] == trial and str(item["cause"]).startswith("gate")
+        if gate and FORGIVEN not in item:
+            path = campaign.folder / "quarantine" / item["folder"] / CAUSE
+            write_json(path, {**read_json(path), FORGIVEN: by})
+            count += 1
+    return count
+
+
+def _journal(store: Store) -> Journal:
+    return Journal(store.folder / FOLDER)
 
 
 def _answer_path(store: Store, request: Request) -> Path:
-    return store.folder / FOLDER / f"{request.number:06d}.done.json"
+    return _journal(store).path(request.number, ".done")

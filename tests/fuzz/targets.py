@@ -113,8 +113,7 @@ def look_through(folder: Path, with_trials: bool = True) -> None:
     from sliplab.protocols.errors import InputError
     from sliplab.storage.errors import StoreError
     from sliplab.storage.trials.catalogue import catalogue
-    from sliplab.storage.trials.control import open_requests, paused
-    from sliplab.storage.trials.decisions import skipped
+    from sliplab.storage.trials.control import open_requests, paused, skipped
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import verify
 
@@ -181,8 +180,8 @@ def _read_pickles_here() -> None:
 def read_foreign(box: Path, name: str, data: bytes) -> None:
     """A file of another program, found by its name and read to its end."""
     from sliplab.protocols.errors import InputError
-    from sliplab.storage.formats.find import kind_of, trials_in
     from sliplab.storage.formats.foreign import FormatError
+    from sliplab.storage.formats.import_trials import kind_of, trials_in
 
     _read_pickles_here()
     folder = box / "foreign"
@@ -249,7 +248,7 @@ def pickle_seeds() -> dict[str, bytes]:
 
 def make_small_store(folder: Path) -> None:
     """A store with a bit of everything that may stand in one."""
-    from sliplab.storage.trials import control, decisions
+    from sliplab.storage.trials import control
     from tests.storage.trial_files import campaign, commit
 
     made = campaign(folder)
@@ -258,7 +257,7 @@ def make_small_store(folder: Path) -> None:
     steps = [{"index": 0, "phase": "slide", "start_ns": 10, "end_ns": 500}]
     commit(made, "a,r=1", steps=steps)
     by = {"who": "somebody", "when": "2026-01-01T00:00:00Z", "why": "because"}
-    decisions.skip(made, ["c,r=1"], by)
+    control.skip(made, ["c,r=1"], by)
     made.quarantine(commit(made, "d,r=1"), "gate sync_uncertainty")
     made.add_bench_record({"operator": "somebody", "temperature": 21.5})
     store_of = made.folder.parents[1]

@@ -16,7 +16,7 @@ from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
 from sliplab.storage.trials import control
-from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
 from tests.flows.collecting.test_session import checksums, session, short

@@ -14,8 +14,7 @@ from sliplab.flows.reviewing.review_list import TrialList, chosen, doubts_of
 from sliplab.flows.reviewing.review_trial import load
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
-from sliplab.storage.formats.find import trials_in
-from sliplab.storage.formats.import_trials import import_trials
+from sliplab.storage.formats.import_trials import import_trials, trials_in
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived

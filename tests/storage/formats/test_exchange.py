@@ -22,13 +22,10 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.formats import lab_pickles as lab
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
-from sliplab.storage.formats.export_trials import export_trials
-from sliplab.storage.formats.find import kind_of, name_of, trials_in
+from sliplab.storage.formats.export_trials import export_trials, label_table, write_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
-from sliplab.storage.formats.foreign import FormatError, Triggers
-from sliplab.storage.formats.import_trials import import_trials
-from sliplab.storage.formats.manifest import MANIFEST
-from sliplab.storage.formats.tables import label_table, write_table
+from sliplab.storage.formats.foreign import EXPORT_MANIFEST, FormatError, Triggers
+from sliplab.storage.formats.import_trials import import_trials, kind_of, name_of, trials_in
 from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.derived import Derived
@@ -534,9 +531,9 @@ def test_a_manifest_leads_nowhere(tmp_path: Path, store: Store, file: str) -> No
     export_trials([store.campaign("c").recording("depth=2.4mm,r=1")], out, "dsec", "c")
     (tmp_path / "t.h5").write_bytes((out / "depth=2.4mm,r=1.h5").read_bytes())
     os.symlink(tmp_path / "t.h5", out / "link.h5")
-    told = read_json(out / MANIFEST)
+    told = read_json(out / EXPORT_MANIFEST)
     told["trials"][0]["file"] = file
-    (out / MANIFEST).write_text(json.dumps(told))
+    (out / EXPORT_MANIFEST).write_text(json.dumps(told))
     with pytest.raises(InputError):
         _import(tmp_path / "store", out, "dsec")
     assert Store.open(tmp_path / "store").campaigns() == []

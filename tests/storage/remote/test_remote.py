@@ -32,7 +32,7 @@ from sliplab.storage.remote.push import PushOptions, push
 from sliplab.storage.remote.verify import verify_remote
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import Checksum
-from sliplab.storage.trials.decisions import again
+from sliplab.storage.trials.control import again
 from sliplab.storage.trials.store import Campaign, Store, StoreError
 from sliplab.storage.trials.verify import verify
 from tests.storage.remote.remotes import new_bucket, s3_server, tree

@@ -1,22 +1,20 @@
-"""Requests from other terminals: whole files, in order, answered once."""
+"""Requests from other terminals: complete, in order, answered once; nothing is deleted by them."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from sliplab.storage import process
+from sliplab.storage.files import read_json
 from sliplab.storage.trials import control
-from sliplab.storage.trials.lock import Locked, exclusive
-from sliplab.storage.trials.store import Store
-from tests.conftest import ROOT
+from sliplab.storage.trials.control import SKIPPED, again, skip, skipped
+from sliplab.storage.trials.store import Store, StoreError
+from sliplab.storage.trials.verify import verify
+from tests.storage.trial_files import campaign, commit, fail
 
 
 def test_requests_keep_who_when_why_and_their_order(tmp_path: Path) -> None:
@@ -57,70 +55,45 @@ def test_what_is_no_request_is_passed_over(tmp_path: Path) -> None:
     assert control.ask(store, "resume").number == 6
 
 
-HOLDER = """
-import sys
-from pathlib import Path
-from sliplab.storage.trials.lock import exclusive
-with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
+BY = {"who": "anna", "when": "2026-01-02T03:04:05+00:00", "why": "skin was dirty"}
 
 
-def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, path], cwd=ROOT, text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    )  # fmt: skip
-    assert holder.stdout is not None
-    assert holder.stdin is not None
-    try:
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(Locked) as refused, exclusive(path, "the rig"):
-            pass
-        who = refused.value.holder
-        assert who["pid"] == holder.pid
-        assert (
-            f"the rig is in use by another program (pid {holder.pid} of {process.user_name()} on "
-            in str(refused)
-        )
-        assert "for the store somewhere, since 20" in str(refused.value)
-        assert process.is_here(who)
-        # another start with this number is another process, and gets no signal
-        assert not process.send({**who, "ticks": who["ticks"] + 1}, signal.SIGTERM)
-        assert not process.send({**who, "boot": "another"}, signal.SIGTERM)
-        assert holder.poll() is None
-        assert process.send(who, signal.SIGKILL)
-        assert holder.wait(timeout=60) == -signal.SIGKILL
-    finally:
-        holder.kill()
-        holder.wait(timeout=60)
-        holder.stdin.close()
-        holder.stdout.close()
-    assert not process.is_here(who)
-    assert not process.send(who, signal.SIGTERM)
-    with exclusive(path, "the rig"):
-        assert json.loads(path.read_text())["pid"] == os.getpid()
-    assert path.read_text() == ""
+def test_a_committed_trial_that_is_wanted_again_is_kept_aside(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    sums = read_json(commit(where, "t") / "checksums.json")
+    assert again(where, ["t"], BY) == {"t": "moved to quarantine/t.1; will be taken again"}
+    assert where.committed() == set()
+    (kept,) = where.quarantined()
+    assert kept["cause"] == "again: skin was dirty"
+    assert kept["asked"] == BY
+    assert read_json(where.folder / "quarantine" / "t.1" / "checksums.json") == sums
+    assert (where.attempts(), where.failed_attempts()) == ({"t": 1}, {})
+    assert again(where, ["t"], BY) == {"t": "was pending already"}
+    commit(where, "t")
+    assert verify(Store.open(tmp_path / "s")) == []
 
 
-def test_who_is_done_at_once_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sliplab.storage.trials.lock.PATIENCE_S", 0.2)
-    path = tmp_path / "lock"
-    with (
-        exclusive(path, "it", brief=True),
-        pytest.raises(Locked, match="it is in use"),
-        exclusive(path, "it"),
-    ):
-        pass
-    with ThreadPoolExecutor(1) as pool:
-        monkeypatch.setattr("sliplab.storage.trials.lock.PATIENCE_S", 60.0)
-        with exclusive(path, "it", brief=True):
+def test_failed_attempts_are_forgiven_once_and_stay(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    for attempt in range(2):
+        fail(where, "t", attempt)
+    assert again(where, ["t"], BY) == {
+        "t": "2 failed attempts count no longer; will be taken again"
+    }
+    assert (where.failed_attempts(), where.attempts()) == ({}, {"t": 2})
+    assert [item["cause"] for item in where.quarantined()] == ["gate: frames_lost = 3"] * 2
+    assert all(item["forgiven"] == BY for item in where.quarantined())
 
-            def second() -> str:
-                with exclusive(path, "it"):
-                    return "held"
 
-            waiting = pool.submit(second)
-        assert waiting.result(timeout=60) == "held"
+def test_skipping_and_thinking_better_of_it(tmp_path: Path) -> None:
+    where = campaign(tmp_path / "s")
+    commit(where, "t")
+    did = skip(where, ["t", "u", "v"], BY)
+    assert did == {"t": "is committed: left as it is", "u": "set aside", "v": "set aside"}
+    assert skip(where, ["u"], {**BY, "who": "ben"}) == {"u": "was set aside already"}
+    assert skipped(where) == {"u": BY, "v": BY}
+    assert again(where, ["u"], BY) == {"u": "no longer set aside; will be taken again"}
+    assert skipped(where) == {"v": BY}
+    (where.folder / SKIPPED).write_text("{")
+    with pytest.raises(StoreError, match="is damaged"):
+        skipped(where)

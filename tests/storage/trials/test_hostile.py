@@ -18,7 +18,7 @@ from sliplab.storage.files import read_json, sha256
 from sliplab.storage.trials import control
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import read_sums
-from sliplab.storage.trials.decisions import skipped
+from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Campaign, Store

@@ -1,4 +1,4 @@
-"""File systems without locks: none of them may pass for one that has them."""
+"""Locks: freed when their holder is killed, and refused on file systems that keep none."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import errno
 import fcntl
 import json
 import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -13,6 +17,7 @@ import pytest
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.rigs.rig_lock import ENVIRONMENT, held
+from sliplab.storage import process
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import lock
 from sliplab.storage.trials.lock import STORE_LOCK, Locked, NoLocks, exclusive
@@ -141,3 +146,72 @@ def test_a_store_on_such_a_share_says_whose_it_is(
     done = here("migrate", store.folder)
     assert done.returncode == 1
     assert "pid 12 on nas" in done.stderr
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from sliplab.storage.trials.lock import exclusive
+with exclusive(Path(sys.argv[1]), "the rig", about={"store": "somewhere"}):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_lock_of_a_killed_holder_is_free_and_a_live_one_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, path], cwd=ROOT, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    assert holder.stdout is not None
+    assert holder.stdin is not None
+    try:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(Locked) as refused, exclusive(path, "the rig"):
+            pass
+        who = refused.value.holder
+        assert who["pid"] == holder.pid
+        assert (
+            f"the rig is in use by another program (pid {holder.pid} of {process.user_name()} on "
+            in str(refused)
+        )
+        assert "for the store somewhere, since 20" in str(refused.value)
+        assert process.is_here(who)
+        # another start with this number is another process, and gets no signal
+        assert not process.send({**who, "ticks": who["ticks"] + 1}, signal.SIGTERM)
+        assert not process.send({**who, "boot": "another"}, signal.SIGTERM)
+        assert holder.poll() is None
+        assert process.send(who, signal.SIGKILL)
+        assert holder.wait(timeout=60) == -signal.SIGKILL
+    finally:
+        holder.kill()
+        holder.wait(timeout=60)
+        holder.stdin.close()
+        holder.stdout.close()
+    assert not process.is_here(who)
+    assert not process.send(who, signal.SIGTERM)
+    with exclusive(path, "the rig"):
+        assert json.loads(path.read_text())["pid"] == os.getpid()
+    assert path.read_text() == ""
+
+
+def test_who_is_done_at_once_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sliplab.storage.trials.lock.PATIENCE_S", 0.2)
+    path = tmp_path / "lock"
+    with (
+        exclusive(path, "it", brief=True),
+        pytest.raises(Locked, match="it is in use"),
+        exclusive(path, "it"),
+    ):
+        pass
+    with ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr("sliplab.storage.trials.lock.PATIENCE_S", 60.0)
+        with exclusive(path, "it", brief=True):
+
+            def second() -> str:
+                with exclusive(path, "it"):
+                    return "held"
+
+            waiting = pool.submit(second)
+        assert waiting.result(timeout=60) == "held"
