@@ -16,7 +16,7 @@ STEPS = {
     "judge_model": "sliplab.flows.learning.other_networks",
     "window_baselines": "sliplab.flows.learning.window_baselines",
     "window_checks": "sliplab.flows.learning.window_checks",
-    "report": "sliplab.flows.reporting.report",
+    "report": "sliplab.flows.report",
 }
 """Where each step stands: the module whose function has the step's name."""
 

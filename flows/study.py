@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.analysis.sweeps.sensitivity import value_of
@@ -30,8 +31,7 @@ from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_baselines import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting.report import report
-from sliplab.flows.reporting.report_extras import FILES
+from sliplab.flows.report import report
 from sliplab.flows.searching.tradeoff import tradeoff
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.syncing.sync import sync

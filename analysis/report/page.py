@@ -1,4 +1,8 @@
-"""The report as one self-contained HTML page, put together from sections."""
+"""Pages: what their sections show, and one self-contained HTML file of it.
+
+Each section has a template in `templates/sections` that holds its words. Python hands it values: a
+dataclass that names the template and whose figures are also written beside the page.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,21 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 
-_TEMPLATES = Path(__file__).parent / "templates"
+from sliplab.storage.files import make_folder, safe_name, write_text
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture (SVG text) and what to see in it.
+    """A picture (SVG text), its data, and what to see in it where no template says that.
 
     Attributes:
         name: of its files beside the page, without an ending; none are written without a name.
@@ -27,7 +33,7 @@ class Figure:
     """
 
     svg: str
-    caption: str
+    caption: str = ""
     name: str = ""
     data: Mapping[str, Sequence[object]] = field(default_factory=dict)
     paper: str = ""
@@ -72,22 +78,6 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Section:
-    """One part of the report.
-
-    Attributes:
-        commands: to be copied, each with what it does.
-    """
-
-    title: str
-    text: Sequence[str] = ()
-    figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = field(default=())
-    links: Sequence[Link] = ()
-    commands: Sequence[tuple[str, str]] = ()
-
-
-@dataclass(frozen=True)
 class Number:
     """One headline number."""
 
@@ -96,39 +86,97 @@ class Number:
     note: str = ""
 
 
-def render(
-    campaigns: Sequence[str],
-    headline: Sequence[Number],
-    sections: Sequence[Section],
-    *,
-    simulated: bool,
-) -> str:
-    """The page as text; everything in it is escaped but the figures' SVG."""
-    return render_page(
-        "report.html", sections, simulated=simulated, campaigns=campaigns, headline=headline
-    )
+@dataclass(frozen=True)
+class Content:
+    """Base of the values that a section shows."""
+
+    template: ClassVar[str]
+    """The section's file in `templates/sections`."""
+
+    def all_figures(self) -> Iterable[Figure]:
+        """Every figure among the values."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            values = value if isinstance(value, list | tuple) else [value]
+            yield from (found for found in values if isinstance(found, Figure))
 
 
-def render_page(
-    template: str, sections: Sequence[Section], *, simulated: bool, **values: object
-) -> str:
-    """A page of sections as text, under the top that `template` and its `values` give it.
+@dataclass(frozen=True)
+class Section(Content):
+    """A section whose words were put together in Python.
 
-    Everything in it is escaped but the figures' SVG.
+    Attributes:
+        commands: to be copied, each with what it does.
     """
+
+    template: ClassVar[str] = "plain.html"
+    title: str
+    text: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = field(default=())
+    links: Sequence[Link] = ()
+    commands: Sequence[tuple[str, str]] = ()
+
+
+@lru_cache(maxsize=1)
+def _environment() -> Environment:
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=select_autoescape(),
         undefined=StrictUndefined,
         trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return environment.get_template(template).render(
-        sections=sections, simulated=simulated, **values
-    )
+    environment.filters |= {"number": number, "percent": percent, "one_line": one_line}
+    return environment
+
+
+def render_page(
+    template: str, sections: Sequence[Content], *, simulated: bool, **values: object
+) -> str:
+    """Render a page of sections under the top that `template` and its `values` give it.
+
+    Everything in it is escaped but the figures' SVG.
+    """
+    rendered = [render_section(section, simulated=simulated) for section in sections]
+    page = _environment().get_template(template)
+    return page.render(sections=rendered, simulated=simulated, **values)
+
+
+def render_section(content: Content, *, simulated: bool) -> tuple[str, Markup]:
+    """Render one section: its title, and its HTML."""
+    template = _environment().get_template(f"sections/{content.template}")
+    module: Any = template.make_module({"v": content, "simulated": simulated})
+    return module.title, Markup(str(module))
+
+
+def write_figures(folder: Path, sections: Sequence[Content], *, simulated: bool) -> None:
+    """Write each named figure and its data as files of their own; those of an older page go.
+
+    Raises:
+        ValueError: two figures of one name.
+    """
+    named = [figure for section in sections for figure in section.all_figures() if figure.name]
+    if len({figure.name for figure in named}) < len(named):
+        raise ValueError(f"two figures of one name among {[figure.name for figure in named]}")
+    kept: set[Path] = set()
+    for figure in named:
+        name = safe_name(figure.name)
+        files = {
+            folder / "figures" / f"{name}.svg": figure.svg,
+            folder / "data" / f"{name}.csv": csv_text(figure.data, simulated=simulated),
+        }
+        for path, text in files.items():
+            make_folder(path.parent)
+            write_text(path, text)
+            kept.add(path)
+    for old in (*(folder / "figures").glob("*.svg"), *(folder / "data").glob("*.csv")):
+        if old not in kept:
+            old.unlink()
 
 
 def csv_text(data: Mapping[str, Sequence[object]], *, simulated: bool) -> str:
-    """A figure's data as CSV: headings first, then rows; what is missing is empty.
+    """Return a figure's data as CSV: headings first, then rows; what is missing is empty.
 
     A last column says of every row whether it is simulated, so that no table loses it.
     """
@@ -142,7 +190,7 @@ def csv_text(data: Mapping[str, Sequence[object]], *, simulated: bool) -> str:
 
 
 def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
-    """A number for people: fixed digits, a dash where there is none."""
+    """Return a number for people: fixed digits, a dash where there is none."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
     text = str(value) if isinstance(value, int) else f"{value:.{digits}f}"
@@ -150,5 +198,10 @@ def number(value: float | int | None, digits: int = 1, unit: str = "") -> str:
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A share as a percentage."""
+    """Return a share as a percentage."""
     return "–" if value is None else f"{100 * value:.{digits}f} %"
+
+
+def one_line(text: str) -> str:
+    """Join the lines of a text."""
+    return type(text)(" ").join(text.split())

@@ -30,15 +30,15 @@ def holdout(
     store = open_store(folder)
     prepare_store(folder)
     from sliplab.analysis.campaigns import collected
+    from sliplab.analysis.report.holdout import COLUMNS, holdout_part, holdout_rows
     from sliplab.flows.holdout import measure_holdout
-    from sliplab.flows.reporting.holdout_section import COLUMNS, rows_of
 
     done = measure_holdout(store, collected(store, campaign), trials, again)
     if as_json:
         console.print_json(done)
         return
     result = done["result"]
-    console.print_table("hold-out, simulated", COLUMNS, rows_of(result))
+    console.print_table("hold-out, simulated", COLUMNS, holdout_rows(holdout_part(result)))
     console.say(f"kept in {done['file']}, with its ledger; the next report shows it")
 
 

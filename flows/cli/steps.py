@@ -185,20 +185,21 @@ def report(
     """Write report/index.html and report/summary.json, and compare with another report."""
     folder = located(store)
     if against is not None:
-        from sliplab.flows.reporting.report_against import load_other
+        from sliplab.analysis.report.against import load_other
 
         load_other(against)  # wrong input is told before anything is made
     result = run_step(folder, campaign, "report")
     if against is not None:
-        from sliplab.flows.reporting import report, report_against_page
+        from sliplab.analysis.report.against import short_table
+        from sliplab.flows import report as reports
         from sliplab.storage.remote.mirror import open_store
 
-        compared = report.against(open_store(folder), against)
+        compared, page = reports.against(open_store(folder), against)
         if as_json:
-            result["against"] = compared
+            result["against"] = {**compared.to_json(), "page": str(page)}
         else:
-            title = "Two reports" + (" (simulated)" if any(compared["simulated"].values()) else "")
-            console.print_table(title, *report_against_page.short_table(compared["figures"]))
-            console.show(f"Page: {compared['page']}")
+            title = "Two reports" + (" (simulated)" if any(compared.simulated) else "")
+            console.print_table(title, *short_table(compared.figures))
+            console.show(f"Page: {page}")
     finish(result, f"report {store}", as_json)
     console.say(f"report: {folder / 'report' / 'index.html'}")

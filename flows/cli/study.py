@@ -111,7 +111,7 @@ def _chain(
     run_requests = [make_request(file, rig, folder, enable=on) for file, on in protocols.items()]
     check_disk(run_requests)
     prepare_store(folder)
-    from sliplab.flows.reporting.report import read_summary
+    from sliplab.flows.report import read_summary
     from sliplab.flows.study import searches
     from sliplab.flows.study import study as run
     from sliplab.storage.trials.store import Store
@@ -126,20 +126,20 @@ def _chain(
                 "collected": outcome.collected,
                 "steps": outcome.steps,
                 "took": [vars(row) for row in outcome.rows],
-                "summary": summary,
+                "summary": summary.to_json(),
             }
         )
         return
-    from sliplab.flows.reporting.sections import headline
+    from sliplab.analysis.report.report import headline
     from sliplab.flows.study_ledger import print_rows
 
     print_rows(outcome.rows)
-    simulated = " (simulated)" if summary["simulated"] else ""
+    simulated = " (simulated)" if summary.simulated else ""
     rows = [[item.name, item.value, item.note] for item in headline(summary)]
-    for name, value in summary["kinematic"]["baselines"].items():
+    for name, value in summary.kinematic.baselines.items():
         shown = "-" if value is None else f"{100 * value:.1f} %"
         rows.append([f"baseline: {name.replace('_', ' ')}", shown, "argmax, same windows"])
-    argmax = summary["kinematic"]["accuracy"]["argmax"]
+    argmax = summary.kinematic.accuracy.argmax
     rows.append(["network", "-" if argmax is None else f"{100 * argmax:.1f} %", "argmax"])
     console.print_table(f"Results{simulated}", ["figure", "value", "note"], rows)
     console.show(f"Report{simulated}: {page.resolve()}")

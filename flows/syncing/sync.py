@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.clocks import synchronise
+from sliplab.analysis.report.clocks import PAGE
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
 from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.flows.syncing.sync_numbers import campaign_numbers
-from sliplab.flows.syncing.sync_page import PAGE, render
+from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import TrialClocks, read_trials
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key

@@ -19,8 +19,11 @@ os.environ["PREFECT_HOME"] = _HOME
 
 from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
+from sliplab.flows.report import report_folder  # noqa: E402
 from sliplab.flows.running.orchestration import prepare  # noqa: E402
 from sliplab.flows.study import Outcome, study  # noqa: E402
+from sliplab.storage.files import read_json  # noqa: E402
+from sliplab.storage.trials.store import Store  # noqa: E402
 
 prepare(Path(_HOME))
 
@@ -44,6 +47,11 @@ def tiny() -> dict[str, Any]:
     }
     data["analysis"]["training"] = {"epochs": 2}
     return data
+
+
+def summary_json(store: Store) -> dict[str, Any]:
+    """The last report's numbers, as they stand in the file."""
+    return read_json(report_folder(store) / "summary.json")
 
 
 def six_trials(folder: Path, rig: Path) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps import generalisation
 from sliplab.analysis.sweeps.generalisation import markdown
 from sliplab.analysis.sweeps.runner import Json, Task, task_sweep
@@ -18,7 +19,6 @@ from sliplab.flows.generalise import Generalisation, measure_generalisation
 from sliplab.flows.learning.evaluate import choose_model
 from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store, StoreError
@@ -57,7 +57,7 @@ def test_another_skin_is_another_skin_and_leaves_no_store(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = store.folder / "derived" / "generalisation"
-    row = extras(store)["generalisation"]["results"]["skin 101"]
+    row = read_programs(store)["generalisation"]["results"]["skin 101"]
     assert row["trials"] == 4
     assert not (folder / "skin101").exists()
     seen: list[str] = []

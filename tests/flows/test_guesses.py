@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.sweeps.sensitivity import AS_IT_IS, FIGURES, Setting, changes, figures
 from sliplab.flows import guesses
 from sliplab.flows.guesses import Guesses, measure_guesses
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting import guesses_section
-from sliplab.flows.reporting.report import report
+from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.derived import Derived
@@ -112,7 +112,7 @@ def test_another_network_is_another_measurement(
 def test_the_report_shows_them(store: Store) -> None:
     report(store, collected(store))
     page = (store.folder / "report" / "index.html").read_text()
-    assert guesses_section.TITLE in page
+    assert "What the guesses of the scene decide" in page
     assert "contrast of the markers" in page
     data = (store.folder / "report/data/guesses.csv").read_text().splitlines()
     assert data[0].startswith("simulated,guess") or "guess" in data[0]
@@ -121,7 +121,7 @@ def test_the_report_shows_them(store: Store) -> None:
 
 def test_a_file_of_another_shape_is_named(store: Store) -> None:
     with pytest.raises(StoreError, match=r"derived/guesses/results\.json"):
-        guesses_section.section(store, {"settings": {AS_IT_IS: {}}})
+        sensitivity_section({"settings": {AS_IT_IS: {}}}, "sliplab guesses STORE")
 
 
 def test_how_it_is_said_on_the_command_line(store: Store) -> None:

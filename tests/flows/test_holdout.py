@@ -9,17 +9,18 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.report.holdout import holdout_part, holdout_rows
 from sliplab.flows import generalise, holdout
 from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.labelling.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting import holdout_section
-from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
+from tests.flows.conftest import summary_json
 
 SEEDS = (5, 6)
 """Not the release's: no test may look at its trials."""
@@ -99,24 +100,24 @@ def test_it_is_judged_once_a_version_and_written_down(
 
 def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None:
     report(store, collected(store))
-    summary = read_summary(store)["holdout"]
+    summary = summary_json(store)["holdout"]
     kept = read_json(store.folder / "holdout/results.json")
     assert summary["trials"] == len(kept["rows"]) == 4
     assert summary["windows"]["strict"]["trials"] == 4
     latency = summary["latency_ms"]["incipient"]
     assert latency["n"] + latency["missed"] + latency["late"] + latency["false_early"] == 4
     assert "at" not in json.dumps(summary["versions"])
-    page = (store.folder / "report" / "index.html").read_text()
-    assert holdout_section.TITLE in page
+    page = " ".join((store.folder / "report" / "index.html").read_text().split())
+    assert "Another skin and seed, which chose nothing" in page
     assert "They were judged 1 time here" in page
-    rows = holdout_section.rows_of(kept)
+    rows = holdout_rows(holdout_part(kept))
     assert rows[0][0] == "windows right, strict"
     assert rows[0][2] == f"4 trials, {summary['windows']['strict']['n']} windows"
 
 
 def test_a_file_of_another_shape_is_named(store: Store) -> None:
     with pytest.raises(StoreError, match=r"holdout/results\.json"):
-        holdout_section.section(store, {"rows": []}, read_summary(store))
+        holdout_part({"rows": []})
 
 
 def test_real_slides_need_a_campaign_of_their_own(

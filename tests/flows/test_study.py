@@ -26,7 +26,7 @@ from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.samples import by_id, load_samples, split_trials
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest, make_request
-from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.report import report
 from sliplab.flows.running import parallel_map
 from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
@@ -34,7 +34,7 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
-from tests.flows.conftest import tiny, tiny_gravity, write
+from tests.flows.conftest import summary_json, tiny, tiny_gravity, write
 
 pytestmark = pytest.mark.programs
 
@@ -53,7 +53,7 @@ def test_every_step_did_its_work(ran: tuple[list[RunRequest], Outcome]) -> None:
 
 
 def test_labels_are_within_a_frame_of_the_truth(ran: tuple[list[RunRequest], Outcome]) -> None:
-    errors = read_summary(store_of(ran))["labels"]["error_ms"]
+    errors = summary_json(store_of(ran))["labels"]["error_ms"]
     for kind in ("incipient", "gross"):
         assert errors[kind]["n"] >= 7
         assert errors[kind]["median_abs"] <= 10.0
@@ -80,7 +80,7 @@ def test_labels_of_tracks_are_checked_with_video(
 
 
 def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest], Outcome]) -> None:
-    summary = read_summary(store_of(ran))
+    summary = summary_json(store_of(ran))
     assert summary["simulated"] is True
     kinematic = summary["kinematic"]
     assert set(kinematic["accuracy"]) == {"argmax", "strict", "margin", "n"}
@@ -114,7 +114,7 @@ def test_the_summary_has_its_keys_and_says_simulated(ran: tuple[list[RunRequest]
 
 
 def test_plan_and_collection_agree(ran: tuple[list[RunRequest], Outcome]) -> None:
-    for known in read_summary(store_of(ran))["planned"].values():
+    for known in summary_json(store_of(ran))["planned"].values():
         assert known["seconds_collected"] == pytest.approx(known["seconds"], rel=0.1)
         # without a video these are events, and the plan reckons with the mean of all conditions;
         # what frames take is held to a quarter in test_levels
@@ -161,12 +161,12 @@ def test_another_margin_is_evaluation_and_report_only(
         ("sync", 0), ("label", 0), ("train", 0), ("evaluate", 1), ("report", 1),
     ]  # fmt: skip
     assert before == {path: path.stat().st_mtime_ns for path in counts.iterdir()}
-    assert read_summary(store)["detection"]["tiny"]["margin"] == 3.0
+    assert summary_json(store)["detection"]["tiny"]["margin"] == 3.0
     study(ran[0])  # back to what the other tests know
 
 
 def test_windows_are_looked_at_from_every_side(ran: tuple[list[RunRequest], Outcome]) -> None:
-    summary = read_summary(store_of(ran))
+    summary = summary_json(store_of(ran))
     kinematic = summary["kinematic"]
     n = kinematic["accuracy"]["n"]
     strict = kinematic["accuracy"]["strict"]
@@ -228,7 +228,7 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
     assert (first["done"], first["fresh"]) == (2, 0)
     assert window_baselines.window_baselines(store, campaigns)["done"] == 0
     assert report(store, campaigns)["done"] == 1
-    kinematic = read_summary(store)["kinematic"]
+    kinematic = summary_json(store)["kinematic"]
     for name, share in first["argmax"].items():
         assert kinematic["trained_baselines"][name]["argmax"] == pytest.approx(share)
     text = (store.folder / "report" / "index.html").read_text()
@@ -269,7 +269,7 @@ def test_a_check_that_fails_ends_the_command(
 
 def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outcome]) -> None:
     store = store_of(ran)
-    summary = read_summary(store)
+    summary = summary_json(store)
     compared = summary["detectors"]
     assert compared["trials"] == {"train": 2, "validation": 2, "test": 2}
     assert compared["strides_ms"] == [10, 30]
@@ -305,7 +305,7 @@ def test_smoothing_can_be_chosen_and_windows_can_overlap(
     ]  # fmt: skip
     # kept predictions are not made again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
-    summary = read_summary(store)
+    summary = summary_json(store)
     choice = summary["choices"]["tiny"]
     assert (choice["split"], choice["trials"]) == ("validation", 2)
     assert summary["choices"]["tiny_gravity"]["split"] == "test"
@@ -333,7 +333,7 @@ def test_a_margin_by_option_is_not_kept(ran: tuple[list[RunRequest], Outcome]) -
     assert report(store, campaigns)["done"] == 1
     assert evaluate(store, campaigns)["done"] == 1
     assert report(store, campaigns)["done"] == 1
-    assert read_summary(store)["detection"]["tiny"]["margin"] == 8.0
+    assert summary_json(store)["detection"]["tiny"]["margin"] == 8.0
 
 
 def test_the_same_seed_gives_the_same_summary(
@@ -346,7 +346,7 @@ def test_the_same_seed_gives_the_same_summary(
         for run_request in ran[0]
     ]
     study(run_requests)
-    first, second = (read_summary(Store.open(folder)) for folder in (
+    first, second = (summary_json(Store.open(folder)) for folder in (
         store_of(ran).folder, tmp_path / "store"
     ))  # fmt: skip
     for summary in (first, second):
@@ -429,7 +429,7 @@ def test_the_model_goes_out_as_what_it_is(
     assert kinematic["trials"] == {"train": 2, "validation": 2, "test": 2}
     assert gravity["experiment"] == "gravity"
     # the same windows and the same network as in the evaluation
-    summary = read_summary(store)
+    summary = summary_json(store)
     assert card["figures"]["test"]["accuracy"] == summary["kinematic"]["accuracy"]
     assert card["detection"]["kinematic"]["latency_ms"] == summary["kinematic"]["latency_ms"]
     speck = json.loads((tmp_path / "out" / "seed0.speck.json").read_text())

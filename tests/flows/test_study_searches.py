@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.flows import study as chain
 from sliplab.flows.generalise import measure_generalisation
 from sliplab.flows.learning import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting.report_extras import extras
 from sliplab.flows.study import Outcome, expected, searches, study
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.store import Store
@@ -71,7 +71,7 @@ def test_each_is_done_once_and_reported(
         "report": 1,
     }  # fmt: skip
     assert {"generalisation", "guesses", "scene", "detector"} <= set(
-        extras(Store.open(run_requests[0].store))
+        read_programs(Store.open(run_requests[0].store))
     )
     page = (run_requests[0].store / "report" / "index.html").read_text()
     for whose in ("scene", "detector"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -20,6 +19,7 @@ from sliplab.analysis.report.figures.style import (
     name_cells,
     svg_text,
 )
+from sliplab.storage.schema.summary import Reliability, Tenth
 
 
 def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simulated: bool) -> str:
@@ -71,22 +71,22 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
         return svg_text(figure, simulated)
 
 
-def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simulated: bool) -> str:
+def recall_by_tenth(tenths: Mapping[str, Sequence[Tenth]], *, simulated: bool) -> str:
     """Recall of each class over its phase, a panel a class.
 
     Args:
-        tenths: from `analysis.metrics.window_groups.by_tenth`.
+        tenths: ten rows a class.
     """
     with plt.rc_context(STYLE):
         figure, grid = plt.subplots(1, len(tenths), figsize=(6.4, 2.4), sharey=True)
         for axes, name, word, colour in zip(grid, CLASSES, CLASS_WORDS, CLASS_COLOURS, strict=True):
             for row in tenths[name]:
-                if row["share"] is None:
+                if row.share is None:
                     continue
-                middle = 10 * row["tenth"] - 5
-                axes.plot(middle, 100 * row["share"], "o", ms=4, color=colour)
-                if row["low"] is not None:
-                    axes.plot([middle] * 2, [100 * row["low"], 100 * row["high"]], color=colour)
+                middle = 10 * row.tenth - 5
+                axes.plot(middle, 100 * row.share, "o", ms=4, color=colour)
+                if row.low is not None and row.high is not None:
+                    axes.plot([middle] * 2, [100 * row.low, 100 * row.high], color=colour)
             axes.set_title(word)
             axes.set_xlim(0, 100)
             axes.set_ylim(-3, 103)
@@ -95,26 +95,21 @@ def recall_by_tenth(tenths: Mapping[str, Sequence[Mapping[str, Any]]], *, simula
         return svg_text(figure, simulated)
 
 
-def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
+def reliability(rows: Sequence[Reliability], *, simulated: bool) -> str:
     """Share right by lead with its interval, and how many windows there are of each.
 
     Args:
-        rows: from `analysis.metrics.reliability.by_lead`.
+        rows: by lead, in order.
     """
     with plt.rc_context(STYLE):
         figure, (top, low) = plt.subplots(
             2, 1, figsize=(6.2, 3.8), sharex=True, height_ratios=(2.2, 1)
         )
         places = range(len(rows))
-        shares = np.array([row["share"] for row in rows])
-        off = np.array(
-            [
-                [0.0, 0.0]
-                if row["low"] is None
-                else [row["share"] - row["low"], row["high"] - row["share"]]
-                for row in rows
-            ]
-        )
+        shares = np.array([row.share for row in rows])
+        spans = [(row.share, row.share) if row.low is None else (row.low, row.high) for row in rows]
+        low_high = np.array(spans, np.float64)
+        off = np.column_stack([shares - low_high[:, 0], low_high[:, 1] - shares])
         top.errorbar(
             places,
             100 * shares,
@@ -127,12 +122,10 @@ def reliability(rows: Sequence[Mapping[str, Any]], *, simulated: bool) -> str:
         )
         top.set_ylabel("windows called\nrightly (%)")
         top.set_ylim(-3, 103)
-        low.bar(places, [row["n"] for row in rows], color=GREY, width=0.7)
+        low.bar(places, [row.n for row in rows], color=GREY, width=0.7)
         low.set_ylabel("windows")
         low.set_xlabel("lead of the winner over the next class (spikes)")
-        low.set_xticks(
-            places, [_from_to(row["lead"], row["to"]) for row in rows], fontsize="x-small"
-        )
+        low.set_xticks(places, [_from_to(row.lead, row.to) for row in rows], fontsize="x-small")
         return svg_text(figure, simulated)
 
 

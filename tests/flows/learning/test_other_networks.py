@@ -24,7 +24,7 @@ from sliplab.flows.learning.other_networks import STEP, judge_model
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.reporting.report import read_summary, report
+from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
@@ -32,6 +32,7 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 from tests.analysis.networks.test_external_model import OURS, by_hand, papers
 from tests.command_line import here
+from tests.flows.conftest import summary_json
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
     assert {name: found["windows"][name] for name in expected} == json.loads(json.dumps(expected))
     assert len(found["trials"]) == 4
     assert (
-        read_summary(store)["networks"]["preset-paper"]["kinematic"]["accuracy"]
+        summary_json(store)["networks"]["preset-paper"]["kinematic"]["accuracy"]
         == (expected["accuracy"])
     )
 
@@ -91,7 +92,7 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
     assert found["windows"]["accuracy"] == comparison["windows"]["accuracy"]
     assert found["trials"] == comparison["trials"]
     report(alone, campaigns)
-    said = read_summary(alone)["paper"]
+    said = summary_json(alone)["paper"]
     assert (said["preset"], said["differences"]) == ("paper", [])
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.report import clocks
 from sliplab.analysis.report.figures.clocks import pooled
-from sliplab.flows.reporting import clock_words
 from sliplab.flows.syncing.sync_page import render
 from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 from sliplab.storage.files import write_json
+from sliplab.storage.schema.summary import Sync
 from sliplab.storage.trials.checksums import RECORD
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Campaign
@@ -157,27 +158,25 @@ def test_pooled_residuals_are_the_quantiles_of_every_stretch() -> None:
     np.testing.assert_allclose(high - low, 2 * 1.96 * 2.0, rtol=0.1)
 
 
-def summary(grade: str, uncertainty: float) -> dict[str, Any]:
+def sync(grade: str, uncertainty: float) -> Sync:
     """The clocks of a summary."""
-    return {
-        "sync": {
-            "grade": grade,
-            "grades": {"events": "trigger input", "frames": grade, "arm": "digital input"},
-            "worst_uncertainty_us": uncertainty,
-            "worst_against_events_us": {"events": 0.5, "frames": uncertainty, "arm": 1.0},
-        }
-    }
+    return Sync(
+        grade=grade,
+        grades={"events": "trigger input", "frames": grade, "arm": "digital input"},
+        worst_uncertainty_us=uncertainty,
+        worst_against_events_us={"events": 0.5, "frames": uncertainty, "arm": 1.0},
+    )
 
 
 def test_a_latency_without_a_wire_says_so() -> None:
-    wired, unwired = summary("hardware trigger", 2.0), summary("host arrival", 12_345.6)
-    assert clock_words.short_note(wired) == "frames: hardware trigger"
-    assert "No wire" not in clock_words.latency_note(wired)
-    assert clock_words.figure_note(wired) == ""
-    assert clock_words.short_note(unwired) == "frames: host arrival, within 12345.6 µs"
-    for note in (clock_words.latency_note(unwired), clock_words.figure_note(unwired)):
+    wired, unwired = sync("hardware trigger", 2.0), sync("host arrival", 12_345.6)
+    assert clocks.short_note(wired) == "frames: hardware trigger"
+    assert "No wire" not in clocks.latency_note(wired)
+    assert clocks.figure_note(wired) == ""
+    assert clocks.short_note(unwired) == "frames: host arrival, within 12345.6 µs"
+    for note in (clocks.latency_note(unwired), clocks.figure_note(unwired)):
         assert "host arrival" in note
         assert "within 12345.6 µs" in note
         assert "No wire ties these frames to the events" in note
-    assert clock_words.unwired(summary("hardware trigger or host arrival", 1.0))
-    assert clock_words.worst(unwired) == ("12345.6 µs", "events against frames (host arrival)")
+    assert clocks.unwired(sync("hardware trigger or host arrival", 1.0))
+    assert clocks.worst_clock(unwired) == ("12345.6 µs", "events against frames (host arrival)")

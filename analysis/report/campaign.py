@@ -1,0 +1,270 @@
+"""Campaigns in the report: what was collected, how good it is over time, and wear of the skin."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.stats import theilslopes
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.quality import hold_rate
+from sliplab.analysis.report.figures import campaign as figures
+from sliplab.analysis.report.page import Content, Figure, Table, number
+from sliplab.protocols.factors import Level
+from sliplab.storage.schema.label import LABELS, TrialLabel
+from sliplab.storage.schema.summary import Quality, References, ReferenceTrial, Summary, Trend
+from sliplab.storage.schema.trial import Gate
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store
+
+FEWEST = 3
+"""Reference trials from which a slope can be told."""
+WEAR = {
+    "hold_events_per_s": ("event rate in the hold", "events in the hold\n(1/s)"),
+    "first_slip_ms": ("time to the first slip", "motion to first slip\n(ms)"),
+}
+"""What is compared of reference trials: in words, and its axis."""
+
+
+@dataclass(frozen=True)
+class CollectedSection(Content):
+    """What there is of what was planned.
+
+    Attributes:
+        source: what was kept of the outside camera, in words.
+        grids: trials by the first two factors of each campaign, with its name and theirs.
+    """
+
+    template: ClassVar[str] = "collected.html"
+    quality: Quality
+    source: str
+    grids: Sequence[tuple[str, str, str, Figure]]
+    table: Table
+
+    def all_figures(self) -> list[Figure]:
+        """Return the grids."""
+        return [figure for *_, figure in self.grids]
+
+
+def collected_section(campaigns: Sequence[Collected], summary: Summary) -> CollectedSection:
+    """Compare plans and committed trials."""
+    grids = [grid for item in campaigns if (grid := _grid(item, summary.simulated)) is not None]
+    rows = []
+    for item in campaigns:
+        known = summary.planned[item.name]
+        minutes = (known.seconds / 60, known.seconds_collected / 60)
+        megabytes = (known.bytes / 1e6, known.bytes_collected / 1e6)
+        rows.append([
+            item.name, item.experiment, str(len(item.plan)), str(len(item.trials)),
+            *(number(value, 2) for value in minutes), *(number(value, 1) for value in megabytes),
+        ])  # fmt: skip
+    columns = (
+        "campaign", "experiment", "planned", "committed", "planned (min)", "taken (min)",
+        "planned (MB)", "taken (MB)",
+    )  # fmt: skip
+    return CollectedSection(summary.quality, source_words(summary), grids, Table(columns, rows))
+
+
+def tracks_words(simulated: bool) -> str:
+    """Return tracks in words that nobody mistakes for a video."""
+    if simulated:
+        return "simulated tracks of the markers (no video was drawn)"
+    return "the camera's own tracks of the markers (no video was kept)"
+
+
+def source_words(summary: Summary) -> str:
+    """Return what the labels were read from."""
+    words = {"video": "the video", "tracks": tracks_words(summary.simulated)}
+    return " or ".join(words[name] for name, count in summary.labels.source.items() if count)
+
+
+def _grid(item: Collected, simulated: bool) -> tuple[str, str, str, Figure] | None:
+    """Draw the trials by the first two factors; None where there are fewer."""
+    factors = item.plan.protocol.collection.factors
+    names = list(factors)[:2]
+    if len(names) < 2:
+        return None
+    levels = [item.plan.enabled[name] for name in names]
+    shape = (len(levels[0]), len(levels[1]))
+    counts, planned = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+
+    def cell(condition: tuple[tuple[str, Level], ...]) -> tuple[int, int]:
+        there = dict(condition)
+        return levels[0].index(there[names[0]]), levels[1].index(there[names[1]])
+
+    for of, trials in ((planned, item.plan), (counts, [trial for trial, _ in item.trials])):
+        for trial in trials:
+            if trial.role == "measured":
+                of[cell(trial.condition)] += 1
+    axes = [f"{name} ({factors[name].unit})" if factors[name].unit else name for name in names]
+    data: dict[str, Sequence[object]] = {
+        axes[0]: [str(level) for level in levels[0] for _ in levels[1]],
+        axes[1]: [str(level) for _ in levels[0] for level in levels[1]],
+        "committed (trials)": counts.ravel().tolist(),
+        "planned (trials)": planned.ravel().tolist(),
+    }
+    svg = figures.collected_grid(
+        levels[0], levels[1], counts, planned, axes[0], axes[1], simulated=simulated
+    )
+    return item.name, names[0], names[1], Figure(svg, name=f"collected-{item.name}", data=data)
+
+
+@dataclass(frozen=True)
+class QualitySection(Content):
+    """Event rate, gates and retakes over each campaign, and its reference trials.
+
+    Attributes:
+        wear: campaign, figure in words, and its trend.
+        over: campaign and its trials one by one; references: the same of its reference trials.
+        gates: campaign and the worst trial of each gate; causes: the same of its quarantine.
+    """
+
+    template: ClassVar[str] = "quality.html"
+    wear: Sequence[tuple[str, str, Trend]]
+    over: Sequence[tuple[str, Figure]]
+    references: Sequence[tuple[str, Figure]]
+    tables: Sequence[Table]
+
+    def all_figures(self) -> list[Figure]:
+        """Return the figures of all campaigns."""
+        return [figure for _, figure in (*self.over, *self.references)]
+
+
+def quality_section(
+    campaigns: Sequence[Collected], references: Mapping[str, References], *, simulated: bool
+) -> QualitySection:
+    """Look at every campaign in the order in which it was taken."""
+    taken = [item for item in campaigns if item.trials]
+    return QualitySection(
+        [
+            (name, WEAR[key][0], trend)
+            for name, found in references.items()
+            for key, trend in found.wear.items()
+        ],
+        [(item.name, _over_campaign(item, simulated)) for item in taken],
+        [(name, _references(name, found.trials, simulated)) for name, found in references.items()],
+        [table for item in taken for table in _gates(item)],
+    )
+
+
+def _over_campaign(item: Collected, simulated: bool) -> Figure:
+    numbers = [trial.index + 1 for trial, _ in item.trials]
+    records = [recording.record for _, recording in item.trials]
+    rates = [record.counts.events / record.recorded_s for record in records]
+    nearest = [_nearest(record.quality.gates) for record in records]
+    places = {trial.id: trial.index + 1 for trial in item.plan}
+    failed = Counter(
+        places[known["trial"]] for known in item.campaign.quarantined() if known["trial"] in places
+    )
+    again = dict(sorted(failed.items()))
+    shares = [share for share, _ in nearest]
+    svg = figures.over_campaign(numbers, rates, shares, again, simulated=simulated)
+    data: dict[str, Sequence[object]] = {
+        "trial": [trial.id for trial, _ in item.trials],
+        "place in the plan": numbers,
+        "events (1/s)": rates,
+        "tightest gate": [name for _, name in nearest],
+        "tightest gate (share of its limit)": shares,
+        "failed attempts": [again.get(place, 0) for place in numbers],
+    }
+    return Figure(svg, name=f"quality-{item.name}", data=data)
+
+
+def _nearest(gates: Mapping[str, Gate]) -> tuple[float, str]:
+    """Return the largest share of its limit that any gate used, and which.
+
+    A limit of 0 uses nothing.
+    """
+    shares = [
+        (gate.value / gate.limit, name)
+        for name, gate in gates.items()
+        if gate.limit and gate.value is not None and not isinstance(gate.value, str)
+    ]
+    return max(shares, default=(0.0, ""))
+
+
+def _gates(item: Collected) -> list[Table]:
+    """List the worst committed trial of every gate, and why attempts are in quarantine."""
+    worst: dict[str, tuple[float, float, str]] = {}
+    for trial, recording in item.trials:
+        for name, gate in recording.record.quality.gates.items():
+            value, limit = gate.value, gate.limit
+            if value is None or isinstance(value, str) or limit is None:
+                continue
+            if name not in worst or value > worst[name][0]:
+                worst[name] = (value, limit, trial.id)
+    rows = [[name, f"{limit:g}", f"{value:.3g}", of] for name, (value, limit, of) in worst.items()]
+    caption = f"Campaign {item.name}: the committed trial that came nearest to each gate."
+    found = [Table(("gate", "limit", "worst", "trial"), rows, caption)]
+    causes = Counter(str(known["cause"]) for known in item.campaign.quarantined())
+    if causes:
+        listed = [[str(count), cause] for cause, count in causes.most_common()]
+        found.append(Table(("attempts", "cause"), listed, f"Campaign {item.name}: quarantine."))
+    return found
+
+
+def references_of(store: Store, campaigns: Sequence[Collected]) -> dict[str, References]:
+    """Return reference trials and wear by campaign, of those that take any."""
+    found = {item.name: reference_trials(store, item) for item in campaigns}
+    return {
+        name: References(trials=tuple(rows), wear=wear(rows))
+        for name, rows in found.items()
+        if rows
+    }
+
+
+def reference_trials(store: Store, item: Collected) -> list[ReferenceTrial]:
+    """Return what each committed reference trial measured, in the plan's order."""
+    labels = Derived.of(store, LABELS, item.name)
+    found = []
+    for trial, recording in item.trials:
+        if trial.role != "reference":
+            continue
+        known = labels.key(trial.id) is not None
+        onset = labels.load(trial.id, TrialLabel).incipient_ns if known else None
+        begin = recording.step(recording.motion_phase)[0]
+        found.append(
+            ReferenceTrial(
+                trial=trial.id,
+                place=trial.index + 1,
+                hold_events_per_s=hold_rate(recording),
+                first_slip_ms=None if onset is None else (onset - begin) / 1e6,
+            )
+        )
+    return found
+
+
+def wear(rows: Sequence[ReferenceTrial]) -> dict[str, Trend]:
+    """Return the change of each figure over 100 trials, in percent of its median, with 95 %.
+
+    The slope of Theil and Sen: one odd trial does not move it. None with fewer than three trials.
+    """
+    found = {}
+    for name in WEAR:
+        there = [(row.place, v) for row in rows if (v := getattr(row, name)) is not None]
+        middle = float(np.median([value for _, value in there])) if there else 0.0
+        slope: list[float | None] = [None, None, None]
+        if len(there) >= FEWEST and middle:
+            fit = theilslopes([value for _, value in there], [place for place, _ in there], 0.95)
+            slope = [1e4 * float(value) / middle for value in (fit[0], fit[2], fit[3])]
+        found[name] = Trend(
+            n=len(there), percent_per_100_trials=slope[0], low=slope[1], high=slope[2]
+        )
+    return found
+
+
+def _references(name: str, rows: Sequence[ReferenceTrial], simulated: bool) -> Figure:
+    places = [row.place for row in rows]
+    panels = {label: [getattr(row, key) for row in rows] for key, (_, label) in WEAR.items()}
+    data: dict[str, Sequence[object]] = {
+        "trial": [row.trial for row in rows],
+        "place in the plan": places,
+        "events in the hold (1/s)": [row.hold_events_per_s for row in rows],
+        "motion to first slip (ms)": [row.first_slip_ms for row in rows],
+    }
+    svg = figures.references(places, panels, simulated=simulated)
+    return Figure(svg, name=f"references-{name}", data=data)

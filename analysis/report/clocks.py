@@ -1,0 +1,118 @@
+"""Clocks in the report: their uncertainty by trial, and what it means for latencies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.report.figures.clocks import uncertainty_by_trial
+from sliplab.analysis.report.page import Content, Figure, number
+from sliplab.protocols.timing import WIRED
+from sliplab.storage.schema.summary import Sync
+from sliplab.storage.schema.trial import DEVICES
+
+PAGE = "sync.html"
+"""The page about clocks, beside the report."""
+
+
+def frames_grade(sync: Sync) -> str:
+    """Return how frames are timed, for onsets are read from frames."""
+    return sync.grade or "unknown clocks"
+
+
+def frames_uncertainty(sync: Sync) -> str:
+    """Return the worst trial's uncertainty of events against frames, in words."""
+    worst = sync.worst_against_events_us
+    return number(worst.get("frames", worst.get("arm")), 1, "µs")
+
+
+def unwired(sync: Sync) -> bool:
+    """Check if some trial's frames were timed through the host alone."""
+    return any(grade not in WIRED for grade in frames_grade(sync).split(" or "))
+
+
+def latency_note(sync: Sync) -> str:
+    """Return what stands under every table of latencies: the grade, and how far off it may be."""
+    note = (
+        f"Frames: {frames_grade(sync)}; events against them within {frames_uncertainty(sync)}, "
+        "worst trial."
+    )
+    if unwired(sync):
+        note += (
+            " No wire ties these frames to the events: every latency here may be off by that much."
+        )
+    return note
+
+
+def figure_note(sync: Sync) -> str:
+    """Return the same for a figure of latencies, where it can be seen in it; else nothing."""
+    return f" {latency_note(sync)}" if unwired(sync) else ""
+
+
+def short_note(sync: Sync) -> str:
+    """Return the same for a headline latency."""
+    within = f", within {frames_uncertainty(sync)}" if unwired(sync) else ""
+    return f"frames: {frames_grade(sync)}{within}"
+
+
+def worst_clock(sync: Sync) -> tuple[str, str]:
+    """Return the worst trial's uncertainty, and which device it is of, with its grade."""
+    value = number(sync.worst_uncertainty_us, 1, "µs")
+    known = sync.worst_against_events_us
+    if not known:
+        return value, "no clock"
+    device = max(known, key=lambda name: known[name])
+    against = "" if device == "events" else "events against "
+    return value, f"{against}{device} ({sync.grades[device]})"
+
+
+@dataclass(frozen=True)
+class ClockSection(Content):
+    """Uncertainty of every trial's clocks.
+
+    Attributes:
+        page: the file of the page about clocks, where there is one.
+    """
+
+    template: ClassVar[str] = "clocks.html"
+    sync: Sync
+    figure: Figure | None
+    page: str | None
+
+
+def clock_section(
+    campaigns: Sequence[Collected], sync: Sync, *, page: bool, simulated: bool
+) -> ClockSection:
+    """Draw the clocks of all trials.
+
+    Args:
+        page: the page about clocks stands beside the report.
+    """
+    figure = _figure(campaigns, sync, simulated) if sync.grades else None
+    return ClockSection(sync, figure, PAGE if page else None)
+
+
+def _figure(campaigns: Sequence[Collected], sync: Sync, simulated: bool) -> Figure:
+    """Draw the uncertainty of each device in each trial."""
+    starts: dict[str, int] = {}
+    names: list[str] = []
+    found: dict[str, list[float | None]] = {device: [] for device in DEVICES}
+    for item in campaigns:
+        if item.trials:
+            starts[item.name] = len(names) + 1
+        for trial, recording in item.trials:
+            names.append(trial.id)
+            for device in DEVICES:
+                known = recording.clocks.against_events_ns(device)
+                found[device].append(None if known is None else known / 1e3)
+    drawn = {}
+    for device, values in found.items():
+        there = [(k, value) for k, value in enumerate(values, start=1) if value]
+        if there:
+            title = f"{device}, {sync.grades[device]}" if device in sync.grades else device
+            drawn[title] = ([k for k, _ in there], [value for _, value in there])
+    data = {f"{device}, uncertainty (µs)": values for device, values in found.items()}
+    svg = uncertainty_by_trial(drawn, starts, simulated=simulated)
+    return Figure(svg, name="clocks", data={"trial": names, **data})

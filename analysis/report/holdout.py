@@ -1,0 +1,110 @@
+"""The hold-out campaign in the report, beside the test trials; nothing was chosen by it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from sliplab.analysis.metrics.intervals import exact_interval
+from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
+from sliplab.analysis.report.page import Content, Table, number, percent
+from sliplab.analysis.report.programs import shape_checked
+from sliplab.storage.schema.summary import (
+    ByOnset,
+    Holdout,
+    Kinematic,
+    Share,
+    Span,
+    Statistics,
+    TrialIntervals,
+)
+
+Json = dict[str, Any]
+
+COLUMNS = ("figure", "hold-out", "n")
+_OUT = {"missed": "missed", "late": "late", "false_early": "false early"}
+
+
+def holdout_part(found: Json) -> Holdout:
+    """Return the part of the summary: all but single trials and dates, with intervals.
+
+    Args:
+        found: `sliplab holdout`'s results.
+
+    Raises:
+        StoreError: they are of another shape.
+    """
+    numbers = ("trials", "protocol_seed", "skin_seed", "model", "windows")
+    with shape_checked("holdout"):
+        return Holdout.model_validate({
+            **{name: found[name] for name in numbers},
+            "versions": [each["version"] for each in found["evaluations"]],
+            **found["kinematic"],
+            "intervals": trial_intervals([trial_outcome(row) for row in found["rows"]]),
+        })  # fmt: skip
+
+
+def holdout_rows(holdout: Holdout) -> list[list[str]]:
+    """Return figures of the hold-out campaign as rows of `COLUMNS`."""
+    windows = {"strict": holdout.windows.strict, "argmax": holdout.windows.argmax}
+    return _rows(windows, holdout.latency_ms, holdout.intervals)
+
+
+@dataclass(frozen=True)
+class HoldoutSection(Content):
+    """Hold-out and test trials side by side, or how to measure it.
+
+    Attributes:
+        command: that measures it; file: which has the dates.
+    """
+
+    template: ClassVar[str] = "holdout.html"
+    holdout: Holdout | None
+    command: str
+    file: str
+    table: Table | None
+
+
+def holdout_section(
+    holdout: Holdout | None, kinematic: Kinematic, command: str, file: str
+) -> HoldoutSection:
+    """Compare hold-out and test trials."""
+    if holdout is None:
+        return HoldoutSection(None, command, file, None)
+    windows = {"strict": kinematic.interval, "argmax": kinematic.window_intervals["accuracy"]}
+    test = _rows(windows, kinematic.latency_ms, kinematic.intervals)
+    rows = [[*mine, *theirs[1:]] for mine, theirs in zip(holdout_rows(holdout), test, strict=True)]
+    columns = (COLUMNS[0], "hold-out (95 %)", "n", "test trials (95 %)", "n")
+    return HoldoutSection(holdout, command, file, Table(columns, rows))
+
+
+def _rows(
+    windows: Mapping[str, Share], latencies: ByOnset[Statistics], intervals: TrialIntervals
+) -> list[list[str]]:
+    rows = []
+    titles = {"strict": "windows right, strict", "argmax": "windows right, ties shared"}
+    for name, title in titles.items():
+        row = windows[name]
+        span = None if row.low is None or row.high is None else (100 * row.low, 100 * row.high)
+        n = f"{row.trials} trials, {row.n} windows"
+        rows.append([title, _with(percent(row.share), span, 1, "%"), n])
+    for kind, latency in (("incipient", latencies.incipient), ("gross", latencies.gross)):
+        known = intervals.of(f"latency_{kind}_ms")
+        for statistic in ("median", "mean"):
+            value = number(getattr(latency, statistic), 0, "ms")
+            said = _with(value, getattr(known, statistic), 0, "ms")
+            rows.append([f"{kind} latency, {statistic}", said, f"{latency.n} trials"])
+        counts = {word: getattr(latency, name) for name, word in _OUT.items()}
+        all_of = latency.n + sum(counts.values())
+        for word, count in counts.items():
+            low, high = exact_interval(count, all_of)
+            value = _with(str(count), (100 * low, 100 * high), 1, "%")
+            rows.append([f"{kind}: {word}", value, f"{all_of} trials"])
+    return rows
+
+
+def _with(value: str, span: Span | Sequence[float], digits: int, unit: str) -> str:
+    if span is None:
+        return value
+    return f"{value} ({span[0]:.{digits}f} to {span[1]:.{digits}f} {unit})"

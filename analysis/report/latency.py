@@ -1,0 +1,263 @@
+"""Latency and lead in the report: kinematic slides, falling plates, and disturbed ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
+from sliplab.analysis.report import clocks
+from sliplab.analysis.report.figures.intervals import Panel, by_condition
+from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
+from sliplab.analysis.report.outcomes import OUTCOMES, TIMES, WORDS, Conditions, times
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
+from sliplab.storage.schema.summary import Accounts, Experiment, Span, Summary, TrialOutcome
+
+Json = dict[str, Any]
+
+AXES = {
+    "duration_ms": ("incipient slip lasts (ms)", GREEN, ""),
+    "latency_incipient_ms": ("incipient latency (ms)", ORANGE, "true onset"),
+    "latency_gross_ms": ("gross latency (ms)", RED, "true onset"),
+    "lead_ms": ("lead before gross slip (ms)", BLUE, "gross slip"),
+}
+NAMES = {
+    "duration_ms": "length of incipient slip",
+    "latency_incipient_ms": "incipient latency",
+    "latency_gross_ms": "gross latency",
+    "lead_ms": "lead",
+}
+STATISTICS = {
+    "n": "n", "mean": "mean (95 %)", "median": "median (95 %)",
+    "p95": "95th percentile (95 %)", "std": "std", "min": "min", "max": "max",
+    "missed": "missed", "late": "late", "false_early": "false early",
+}  # fmt: skip
+_CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
+"""Which entry of a trial says why a time is missing."""
+_SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_onsets": "no onset"}
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Change of a time's mean from a factor's first to its last level, with its interval."""
+
+    first: str
+    last: str
+    change: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class LatencySection(Content):
+    """Detections of one experiment's test trials.
+
+    Attributes:
+        title: of the section.
+        by: the factors by which the figures have rows.
+        late: onset, number and range in ms of detections after their event.
+        choices: how smoothing and margin were chosen.
+        trends: by time, in words.
+        clock_note: under figures; nothing where it cannot be seen in them.
+    """
+
+    template: ClassVar[str] = "latency.html"
+    experiment: str
+    numbers: Experiment
+    paper: Mapping[str, Published]
+    paper_std_ms: float
+    by: Sequence[str]
+    late: Sequence[tuple[str, int, float, float]]
+    choices: Sequence[str]
+    trends: Mapping[str, Sequence[Trend]]
+    latency_note: str
+    clock_note: str
+    figures: Sequence[Figure]
+    statistics: Table
+    accounts: Table
+    levels: Sequence[Table]
+
+    @property
+    def lead_mean(self) -> str:
+        """Mean lead with its interval."""
+        return _with(self.numbers.lead_ms.mean, self.numbers.intervals.lead_ms.mean, 0)
+
+    @property
+    def others(self) -> list[tuple[int, str]]:
+        """How many trials were not detected first, by cause."""
+        counts = [(self.numbers.accounted.of(name), WORDS[name]) for name in OUTCOMES[1:]]
+        return [(count, words) for count, words in counts if count]
+
+
+def latency_section(
+    experiment: str, campaigns: Sequence[Collected], rows: Sequence[Json], summary: Summary
+) -> LatencySection | None:
+    """Show an experiment's detections by condition; None without trials, unless kinematic.
+
+    Args:
+        rows: of the evaluation.
+    """
+    numbers: Experiment = getattr(summary, experiment)
+    kinematic = experiment == "kinematic"
+    if not kinematic and not numbers.trials:
+        return None
+    found = Conditions(campaigns, rows, experiment)
+    by = found.varied() if kinematic else found.varied()[:2]
+    late = []
+    for kind in ("incipient", "gross"):
+        mine = [row for row in summary.trials if row.experiment == experiment]
+        if there := times(mine, f"late_{kind}_ms"):
+            late.append((kind, len(there), min(there), max(there)))
+    rules = [
+        summary.detection[item.name].choose
+        for item in campaigns
+        if item.experiment == experiment and item.name in summary.detection
+    ]
+    shown = TIMES[1:3] if kinematic else TIMES
+    kinds = ("incipient", "gross") if kinematic else ("incipient", "gross", "lead")
+    return LatencySection(
+        experiment, numbers, PAPER, DISTURBANCE_LEAD_STD_MS, by, late,
+        sorted({choice_note(rule) for rule in rules} - {""}),
+        {NAMES[name]: trends for name in shown if (trends := _trends(found, name))},
+        clocks.latency_note(summary.sync), clocks.figure_note(summary.sync),
+        _figures(experiment, found, by, summary.simulated), _statistics(numbers, kinds),
+        _accounts(experiment, numbers.accounted),
+        [] if kinematic else [_by_level(found, factor) for factor in found.varied()],
+    )  # fmt: skip
+
+
+def choice_note(chosen_by: str) -> str:
+    """Return how smoothing and margin were chosen, in words; nothing where the protocol says it."""
+    if chosen_by == "validation":
+        return "Smoothing and margin were chosen by validation trials."
+    if chosen_by == "test":
+        return (
+            "Smoothing and margin were chosen by the kinematic test trials themselves, as in the "
+            "paper: what is measured on them flatters."
+        )
+    return ""
+
+
+def _figures(
+    experiment: str, found: Conditions, by: Sequence[str], simulated: bool
+) -> list[Figure]:
+    """Draw the experiment's times by condition."""
+    value = {name: known.value for name, known in PAPER.items()}
+    if experiment == "kinematic":
+        groups, breaks = {"all test trials": found.trials}, []
+        for factor in by:
+            breaks.append(len(groups))
+            groups |= {f"{factor} {text}": found.at(**{factor: text})
+                       for text in found.factors[factor]}  # fmt: skip
+        lines = {
+            "latency_incipient_ms": (value["incipient_latency"], "paper's mean, 88 ms"),
+            "latency_gross_ms": (value["gross_latency"], "paper's mean, 70 ms"),
+        }
+        return [_draw(groups, TIMES[1:3], breaks, lines, "latency-kinematic", simulated)]
+    groups, breaks = found.cells(by), found.breaks(by)
+    if experiment == "disturbance":
+        line = {"lead_ms": (value["disturbance_lead"], "paper's mean")}
+        return [_draw(groups, TIMES[1:], breaks, line, "disturbance", simulated)]
+    line = {"lead_ms": (value["gravity_lead"], "paper's smallest, 360 ms")}
+    return [
+        _draw(groups, TIMES[:2], breaks, {}, "gravity-incipient", simulated),
+        _draw(groups, TIMES[2:], breaks, line, "gravity-gross", simulated),
+    ]
+
+
+def _draw(
+    groups: Mapping[str, Sequence[TrialOutcome]], shown: Sequence[str], breaks: Sequence[int],
+    lines: Mapping[str, tuple[float | None, str]], name: str, simulated: bool,
+) -> Figure:  # fmt: skip
+    panels = []
+    for time in shown:
+        label, colour, zero = AXES[time]
+        value, said = lines.get(time, (None, ""))
+        published = None if value is None else (value, said)
+        values = {row: times(found, time) for row, found in groups.items()}
+        notes = {row: _lacking(found, time) for row, found in groups.items()}
+        panels.append(Panel(label, values, colour, zero, published, notes))
+    svg = by_condition(list(groups), panels, simulated=simulated, breaks=breaks)
+    trials = [(row, trial) for row, found in groups.items() for trial in found]
+    data: dict[str, list[object]] = {
+        "row": [row for row, _ in trials],
+        "trial": [trial.trial for _, trial in trials],
+        **{AXES[time][0]: [getattr(trial, time) for _, trial in trials] for time in shown},
+    }
+    return Figure(svg, name=name, data=data)
+
+
+def _lacking(rows: Sequence[TrialOutcome], time: str) -> str:
+    """Return how many trials have no value, and why, in short."""
+    if not rows:
+        return "no trial"
+    without = [row for row in rows if getattr(row, time) is None]
+    if time not in _CAUSE:
+        return f"{len(without)} without onset" if without else ""
+    causes = [getattr(row, _CAUSE[time]) for row in without]
+    return ", ".join(f"{causes.count(k)} {word}" for k, word in _SHORT.items() if k in causes)
+
+
+def _trends(found: Conditions, name: str) -> list[Trend]:
+    """Compare the means at each factor's first and last level."""
+    trends = []
+    for factor in found.varied():
+        levels = found.factors[factor]
+        if len(levels) < 2 or levels[0].endswith(" deg"):  # an angle has no first and last
+            continue
+        first, last = (times(found.at(**{factor: levels[k]}), name) for k in (0, -1))
+        span = difference(last, first)
+        if span is not None:
+            change = sum(last) / len(last) - sum(first) / len(first)
+            trends.append(Trend(levels[0], levels[-1], change, *span))
+    return trends
+
+
+def _by_level(found: Conditions, factor: str) -> Table:
+    rows = []
+    for text in found.factors[factor]:
+        there = found.at(**{factor: text})
+        known = [times(there, name) for name in TIMES]
+        means = [_with(sum(of) / len(of) if of else None, interval(of), 0) for of in known]
+        rows.append([text, str(len(there)), *means])
+    columns = [factor, "trials", *(f"{NAMES[name]} (ms)" for name in TIMES)]
+    return Table(columns, rows, "Means with 95 % intervals over trials.")
+
+
+def _statistics(numbers: Experiment, kinds: Sequence[str]) -> Table:
+    rows = []
+    for kind in kinds:
+        if kind == "lead":
+            name, found, spans = "lead", numbers.lead_ms, numbers.intervals.lead_ms
+        else:
+            name, found = f"{kind} latency", getattr(numbers.latency_ms, kind)
+            spans = numbers.intervals.of(f"latency_{kind}_ms")
+        cells = [
+            _with(getattr(found, key), getattr(spans, key))
+            if key in ("mean", "median", "p95")
+            else number(getattr(found, key))
+            for key in STATISTICS
+        ]
+        rows.append([name, *cells])
+    return Table(("", *STATISTICS.values()), rows)
+
+
+def _accounts(experiment: str, accounts: Accounts) -> Table:
+    cells = []
+    for name in OUTCOMES:
+        count = accounts.of(name)
+        low, high = exact_interval(count, accounts.planned)
+        shares = f" ({100 * low:.0f} to {percent(high, 0)})" if accounts.planned else ""
+        cells.append(f"{count}{shares}")
+    columns = ("trials", "planned for the test", *(WORDS[name] for name in OUTCOMES))
+    return Table(columns, [[experiment, str(accounts.planned), *cells]])
+
+
+def _with(value: float | None, span: Span, digits: int = 1) -> str:
+    """Return a value with its interval."""
+    if value is None or span is None:
+        return number(value, digits)
+    return f"{value:.{digits}f} ({span[0]:.{digits}f} to {span[1]:.{digits}f})"

@@ -1,0 +1,171 @@
+"""The report's figures beside those of the paper, in one table.
+
+The paper's were measured on a real robot with a real skin. Nothing here says that a simulated
+figure near a published one is right, or that one far from it is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.page import Content, Table, number, percent
+from sliplab.analysis.report.published import PAPER
+from sliplab.storage.schema.summary import (
+    Experiment,
+    Network,
+    NetworkWindows,
+    Paper,
+    Share,
+    Span,
+    Summary,
+)
+
+_SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
+"""A difference that no setting makes."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One published figure beside one network's."""
+
+    name: str
+    paper: str
+    value: str
+    interval: str = "–"
+    count: str = "–"
+
+    @property
+    def text(self) -> str:
+        """The value with its interval."""
+        return self.value if self.interval == "–" else f"{self.value} ({self.interval})"
+
+
+@dataclass(frozen=True)
+class PaperSection(Content):
+    """Every published figure beside this one's.
+
+    Attributes:
+        networks: others on the same trials: title, network and its margins.
+    """
+
+    template: ClassVar[str] = "paper.html"
+    paper: Paper
+    networks: Sequence[tuple[str, Network, str]]
+    rows: Table
+    counts: Table
+    differences: Table
+
+
+def paper_section(summary: Summary) -> PaperSection | None:
+    """Compare every network with the paper."""
+    if summary.paper is None:
+        return None
+    ending = " (simulated)" if summary.simulated else ""
+    networks: dict[str, Summary | Network] = {f"here{ending}": summary}
+    networks |= {f"{_title(found)}{ending}": found for found in summary.networks.values()}
+    each = [
+        [*_windows(of.kinematic), *_times(of.kinematic, of.gravity, of.disturbance)]
+        for of in networks.values()
+    ]
+    same = list(zip(*each, strict=True))
+    differences = [[it.setting, it.paper, it.here, it.source] for it in summary.paper.differences]
+    return PaperSection(
+        summary.paper,
+        [
+            (_title(found), found,
+             ", ".join(sorted({f"{rule.margin:g}" for rule in found.detection.values()})))
+            for found in summary.networks.values()
+        ],
+        Table(["figure", "paper", *networks],
+              [[of[0].name, of[0].paper, *(row.text for row in of)] for of in same]),
+        Table(["figure", *networks], [[of[0].name, *(row.count for row in of)] for of in same]),
+        Table(("setting", "paper", "here", "the paper's value is"), [*differences, _SCANNED]),
+    )  # fmt: skip
+
+
+def _title(network: Network) -> str:
+    """Return a column's heading."""
+    return f"{network.preset} preset" if network.preset else network.title
+
+
+def _windows(kinematic: NetworkWindows) -> list[Row]:
+    known = kinematic.window_intervals
+    right = kinematic.accuracy
+    count = _count(known.get("accuracy"))
+    rows = [
+        Row("test accuracy of windows", PAPER["accuracy"].text, percent(right.argmax),
+            _percents(known.get("accuracy")), count),
+        Row("the same, a tie wrong", "–", percent(right.strict), _percents(kinematic.interval),
+            count),
+        Row("the same, won by the margin", "–", percent(right.margin), count=count),
+    ]  # fmt: skip
+    for name, value in (
+        ("precision", kinematic.precision.incipient),
+        ("recall", kinematic.recall.incipient),
+    ):
+        row = known.get(f"incipient_{name}")
+        rows.append(
+            Row(f"incipient {name}", PAPER[f"incipient_{name}"].text, percent(value),
+                _percents(row), _count(row))
+        )  # fmt: skip
+    return [*rows, _confused(kinematic.confusion)]
+
+
+def _percents(row: Share | None) -> str:
+    if row is None or row.low is None:
+        return "–"
+    return f"{percent(row.low)} to {percent(row.high)}"
+
+
+def _count(row: Share | None) -> str:
+    return "–" if row is None else f"{row.n} windows, {row.trials} trials"
+
+
+def _confused(confusion: Sequence[Sequence[int]]) -> Row:
+    """Find the two classes that are most often taken for each other."""
+    pairs = {(a, b): confusion[a][b] + confusion[b][a] for a in range(3) for b in range(a + 1, 3)}
+    a, b = max(pairs, key=lambda pair: pairs[pair])
+    name, paper = "most confused pair", PAPER["confused"].text
+    if not pairs[a, b]:
+        return Row(name, paper, "none")
+    words = f"{CLASS_WORDS[a]} and {CLASS_WORDS[b]}"
+    return Row(name, paper, words, count=f"{pairs[a, b]} windows")
+
+
+def _times(kinematic: Experiment, gravity: Experiment, disturbance: Experiment) -> list[Row]:
+    rows = []
+    for kind, found in (
+        ("incipient", kinematic.latency_ms.incipient),
+        ("gross", kinematic.latency_ms.gross),
+    ):
+        rows.append(
+            Row(
+                f"kinematic latency, {kind}, mean",
+                f"{PAPER[f'{kind}_latency'].text} after onset",
+                number(found.mean, 0, "ms"),
+                _ms(kinematic.intervals.of(f"latency_{kind}_ms").mean),
+                f"{found.n} trials; {found.missed} missed, {found.late} late, "
+                f"{found.false_early} early",
+            )
+        )
+    first = "{0.detected_first} of {0.planned} trials detected first"
+    if gravity.accounted.planned:
+        rows.append(
+            Row("gravity lead, smallest", PAPER["gravity_lead"].text,
+                number(gravity.lead_ms.min, 0, "ms"), count=first.format(gravity.accounted))
+        )  # fmt: skip
+    if disturbance.accounted.planned:
+        lead = disturbance.lead_ms
+        rows.append(
+            Row("disturbance lead, mean ± standard deviation", PAPER["disturbance_lead"].text,
+                f"{number(lead.mean, 0)} ± {number(lead.std, 0, 'ms')}",
+                _ms(disturbance.intervals.lead_ms.mean), first.format(disturbance.accounted))
+        )  # fmt: skip
+    return rows
+
+
+def _ms(span: Span) -> str:
+    return "–" if span is None else f"{span[0]:.0f} to {span[1]:.0f} ms"

@@ -1,0 +1,168 @@
+"""The report: its sections in order, and the numbers on top of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report import clocks, windows
+from sliplab.analysis.report.campaign import collected_section, quality_section
+from sliplab.analysis.report.detectors import detector_section
+from sliplab.analysis.report.holdout import holdout_section
+from sliplab.analysis.report.labels import label_section
+from sliplab.analysis.report.latency import latency_section
+from sliplab.analysis.report.outcomes import failure_section
+from sliplab.analysis.report.page import (
+    Content,
+    Number,
+    Section,
+    Table,
+    number,
+    percent,
+    render_page,
+)
+from sliplab.analysis.report.paper import paper_section
+from sliplab.analysis.report.programs import (
+    FILES,
+    command,
+    skin_section,
+    tradeoff_section,
+)
+from sliplab.analysis.report.sensitivity import sensitivity_section
+from sliplab.analysis.report.summary import Sources
+from sliplab.analysis.report.trial import Example, output_section, trial_section
+from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.summary import SeedsUsed, Summary
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the page shows beside the summary's numbers.
+
+    Attributes:
+        example: the trial that is looked at, with its `counts` and `end_ns`.
+        distances: of each trial's onset from the truth, ms, by rule and onset.
+        scene: cost and error of the scene, where they were measured.
+    """
+
+    fitted: Fitted
+    example: tuple[Example, Mapping[str, Any]] | None
+    distances: Mapping[str, Mapping[str, Sequence[float]]]
+    scene: Section | None
+
+
+@dataclass(frozen=True)
+class ProvenanceSection(Content):
+    """Hashes, wall times and versions."""
+
+    template: ClassVar[str] = "provenance.html"
+    seeds: SeedsUsed
+    uncertainty: str
+    device: str
+    tables: Sequence[Table]
+
+
+def render(sources: Sources, summary: Summary, sections: Sequence[Content]) -> str:
+    """Render the page; everything in it is escaped but the figures' SVG."""
+    names = [item.name for item in sources.campaigns]
+    return render_page(
+        "report.html", sections, simulated=summary.simulated, campaigns=names,
+        headline=headline(summary),
+    )  # fmt: skip
+
+
+def headline(summary: Summary) -> list[Number]:
+    """Return the numbers on top of the page."""
+    accuracy, quality = summary.kinematic.accuracy, summary.quality
+    latency, lead = summary.kinematic.latency_ms.incipient, summary.gravity.lead_ms
+    uncertain, device = clocks.worst_clock(summary.sync)
+    note = clocks.short_note(summary.sync)
+    if any(rule.choose == "test" for rule in summary.detection.values()):
+        note += "; smoothing and margin chosen on test trials"
+    return [
+        Number("trials committed", str(quality.committed), f"of {quality.planned} planned"),
+        Number("window accuracy", percent(accuracy.strict), f"strict, n = {accuracy.n}"),
+        Number(
+            "incipient latency",
+            number(latency.median, 0, "ms"),
+            f"median of {latency.n}; {latency.missed} missed, {latency.late} late, "
+            f"{latency.false_early} false early; {note}",
+        ),
+        Number(
+            "gravity lead",
+            number(lead.median, 0, "ms"),
+            f"median; smallest {number(lead.min, 0, 'ms')}, n = {lead.n}, "
+            f"{lead.missed} missed, {lead.late} late; {note}",
+        ),
+        Number("clock uncertainty", uncertain, f"worst trial, {device}"),
+    ]
+
+
+def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Content]:
+    """Make all sections, in order.
+
+    Raises:
+        StoreError: another program's result is of another shape.
+    """
+    store, campaigns, programs = sources.store, sources.campaigns, sources.programs
+    simulated, kinematic = summary.simulated, summary.kinematic
+    rows = sources.evaluation["trials"]
+    trial, outputs = None, None
+    if shown.example is not None:
+        example, counts = shown.example
+        trial = trial_section(store, example, simulated=simulated)
+        rule = Detection.model_validate(sources.evaluation["detection"][example.item.name])
+        outputs = output_section(example, counts, rule, simulated=simulated)
+    holdout, sensitivity = None, None
+    if simulated:
+        how = command(store, "holdout")
+        holdout = holdout_section(summary.holdout, kinematic, how, FILES["holdout"])
+        found = programs.get("guesses")
+        sensitivity = sensitivity_section(found, command(store, "guesses"))
+    sections: list[Content | None] = [
+        paper_section(summary),
+        holdout,
+        collected_section(campaigns, summary),
+        quality_section(campaigns, summary.references, simulated=simulated),
+        trial,
+        windows.network_section(kinematic, shown.fitted, simulated=simulated),
+        windows.where_section(kinematic, simulated=simulated),
+        windows.lead_section(kinematic, simulated=simulated),
+        windows.work_section(kinematic),
+        outputs,
+        latency_section("kinematic", campaigns, rows, summary),
+        latency_section("gravity", campaigns, rows, summary),
+        latency_section("disturbance", campaigns, rows, summary),
+        failure_section(store.folder, summary.trials),
+        detector_section(summary.detectors, simulated=simulated),
+        label_section(store, campaigns, summary, shown.distances),
+        clocks.clock_section(
+            campaigns, summary.sync, page=(store.folder / "report" / clocks.PAGE).exists(),
+            simulated=simulated,
+        ),
+        skin_section(
+            programs.get("generalisation"), command(store, "generalisation"),
+            kinematic.accuracy.strict, simulated=simulated,
+        ),
+        sensitivity,
+        tradeoff_section(store, programs, shown.scene),
+        _provenance(summary),
+    ]  # fmt: skip
+    return [section for section in sections if section is not None]
+
+
+def _provenance(summary: Summary) -> ProvenanceSection:
+    hashes = [
+        [name, value.collection[:16], value.analysis[:16]]
+        for name, value in summary.protocols.items()
+    ]
+    timing = [[name, number(value, 1)] for name, value in summary.timing_s.items()]
+    versions = [[name, value] for name, value in summary.versions.items()]
+    tables = [
+        Table(["protocol", "collection hash", "analysis hash"], hashes),
+        Table(["step", "wall time (s)"], timing),
+        Table(["package", "version"], versions),
+    ]
+    return ProvenanceSection(summary.seeds, *clocks.worst_clock(summary.sync), tables)

@@ -1,0 +1,238 @@
+"""The report's numbers, `report/summary.json`, put together from what earlier steps kept."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.report.campaign import references_of
+from sliplab.analysis.report.holdout import holdout_part
+from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
+from sliplab.protocols.phases import Press
+from sliplab.protocols.presets import PAPER, at
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.storage.schema.summary import Paper, Planned, Quality, Summary, Sync, TrialOutcome
+from sliplab.storage.trials.store import Store
+
+Json = dict[str, Any]
+
+_PACKAGES = (
+    "sliplab", "numpy", "numba", "scipy", "torch", "sinabs", "prefect", "pandas", "h5py",
+    "opencv-contrib-python-headless", "scikit-learn",
+)  # fmt: skip
+_WINDOWS = (
+    "accuracy", "confusion", "precision", "recall", "baselines", "samples", "interval", "seeds",
+    "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
+)  # fmt: skip
+"""What the summary takes over from the evaluation's windows as it is; docs/metrics.md."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a summary is made of.
+
+    Attributes:
+        settings: of training.
+        networks: results of other networks, by name.
+        baselines: of other methods, by name; window_intervals: of the test windows.
+        label_check: of labels with video; holds: slips in the hold, by campaign.
+        planned_bytes: of the committed trials, by campaign.
+        step_seconds: wall time of each step.
+        programs: results of other programs, by name.
+    """
+
+    store: Store
+    campaigns: Sequence[Collected]
+    settings: AnalysisSettings
+    evaluation: Json
+    networks: Mapping[str, Json]
+    baselines: Mapping[str, Json]
+    window_intervals: Mapping[str, Json]
+    label_check: Json | None
+    holds: Mapping[str, Json]
+    planned_bytes: Mapping[str, int]
+    step_seconds: Mapping[str, float]
+    programs: Mapping[str, Json]
+
+
+def make_summary(sources: Sources) -> Summary:
+    """Make the summary; only `timing_s` differs between equal runs.
+
+    Raises:
+        StoreError: another program's result is of another shape.
+    """
+    campaigns, evaluation = sources.campaigns, sources.evaluation
+    windows, experiments = evaluation["windows"], evaluation["experiments"]
+    trials = tuple(trial_outcome(row) for row in evaluation["trials"])
+    judged = {
+        name: {**experiments[name], **_judged(campaigns, trials, name)} for name in experiments
+    }
+    kinematic = {
+        **{name: windows[name] for name in _WINDOWS},
+        "trained_baselines": sources.baselines,
+        "window_intervals": sources.window_intervals,
+        **judged["kinematic"],
+    }
+    holdout = sources.programs.get("holdout")
+    return Summary.model_validate({
+        "simulated": sources.store.simulated,
+        **judged,
+        "kinematic": kinematic,
+        "networks": {name: _network(campaigns, of) for name, of in sources.networks.items()},
+        "paper": _paper(sources.settings, campaigns),
+        "trials": trials,
+        "references": references_of(sources.store, campaigns),
+        "labels": {
+            "error_ms": evaluation["label_error_ms"],
+            "rules_ms": evaluation["label_rules_ms"],
+            "source": _sources(campaigns),
+            "reviewed": evaluation.get("reviewed"),
+            "check": sources.label_check,
+            "holds": sources.holds,
+        },
+        "detection": evaluation["detection"],
+        "choices": evaluation["choices"],
+        "detectors": evaluation["detectors"],
+        "holdout": None if holdout is None else holdout_part(holdout),
+        "sync": sync_part(campaigns),
+        "quality": _quality(campaigns),
+        "planned": {
+            item.name: _planned(item, sources.planned_bytes[item.name]) for item in campaigns
+        },
+        "timing_s": sources.step_seconds,
+        "versions": {name: version(name) for name in _PACKAGES},
+        "protocols": {
+            item.name: {
+                "collection": item.plan.collection_hash, "analysis": item.plan.analysis_hash
+            }
+            for item in campaigns
+        },
+        "seeds": {
+            "network": sources.settings.training.seeds,
+            "chosen": evaluation["seed"],
+            "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
+        },
+    })  # fmt: skip
+
+
+def _judged(
+    campaigns: Sequence[Collected], trials: Sequence[TrialOutcome], experiment: str
+) -> Json:
+    """Return outcomes of an experiment's trials, and how sure its figures are."""
+    ours = [row for row in trials if row.experiment == experiment]
+    return {
+        "accounted": account(campaigns, ours, experiment),
+        "intervals": trial_intervals(ours),
+    }
+
+
+def _network(campaigns: Sequence[Collected], found: Json) -> Json:
+    """Return another network's figures, under the keys that the store's own have."""
+    trials = [trial_outcome(row) for row in found["trials"]]
+    experiments = found["experiments"]
+    experiments = {
+        **experiments, "kinematic": {**found["windows"], **experiments["kinematic"]}
+    }  # fmt: skip
+    return {
+        **{key: found[key] for key in ("title", "preset", "seed", "engine", "exact", "detection")},
+        **{
+            name: {**figures, **_judged(campaigns, trials, name)}
+            for name, figures in experiments.items()
+        },
+    }
+
+
+def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
+    """Find in which settings this differs from the paper, and which of them it does not say."""
+    depths = {
+        f"{phase.depth} mm"
+        for item in campaigns
+        if item.experiment != "kinematic"
+        for phase in item.plan.protocol.collection.motion
+        if isinstance(phase, Press)
+    }
+    rows = [
+        {"setting": each.words, "key": each.key, "paper": _said(each.value), "here": _said(here),
+         "source": each.source}
+        for each, here in settings.overrides
+    ]  # fmt: skip
+    assumed = [f"{each.words}: {_said(at(settings, each.key))}" for each in PAPER
+               if each.source == "assumed"]  # fmt: skip
+    if depths:
+        assumed.append(
+            f"press depth of gravity and disturbance trials: {', '.join(sorted(depths))}"
+        )
+    found = {"preset": settings.preset, "differences": rows, "assumed": assumed}
+    return Paper.model_validate(found)
+
+
+def _said(value: Any) -> str:
+    """Return a setting's value in words."""
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case tuple():
+            return ", ".join(map(_said, value))
+        case None:
+            return "the window's length"
+        case int() | float():
+            return f"{value:g}"
+        case _:
+            return str(value)
+
+
+def _sources(campaigns: Sequence[Collected]) -> dict[str, int]:
+    """Count trials with a video, and with tracks in its place."""
+    found = Counter(recording.frame_source for item in campaigns for _, recording in item.trials)
+    return {name: found[name] for name in ("video", "tracks")}
+
+
+def sync_part(campaigns: Sequence[Collected]) -> Sync:
+    """Find how devices were timed, and the worst uncertainty of events against each."""
+    grades: dict[str, set[str]] = {}
+    worst: dict[str, float] = {}
+    for item in campaigns:
+        for _, recording in item.trials:
+            clocks = recording.clocks
+            for device, known in clocks.devices().items():
+                grades.setdefault(device, set()).add(known.grade)
+                if (both := clocks.against_events_ns(device)) is not None:
+                    worst[device] = max(worst.get(device, 0.0), both / 1e3)
+    named = {device: " or ".join(sorted(found)) for device, found in grades.items()}
+    return Sync(
+        grade=named.get("frames", named.get("arm")),
+        grades=named,
+        worst_uncertainty_us=max(worst.values(), default=None),
+        worst_against_events_us=worst,
+    )
+
+
+def _quality(campaigns: Sequence[Collected]) -> Quality:
+    aside = [known for item in campaigns for known in item.campaign.quarantined()]
+    broken_off = sum(known["cause"] == "interrupted" for known in aside)
+    return Quality(
+        planned=sum(len(item.plan) for item in campaigns),
+        committed=sum(len(item.trials) for item in campaigns),
+        retaken=sum(str(known["cause"]).startswith("gate") for known in aside),
+        quarantined=len(aside) - broken_off,
+        interrupted=broken_off,
+    )
+
+
+def _planned(item: Collected, planned_bytes: int) -> Planned:
+    """Compare the plan's seconds and bytes with what the committed trials really took."""
+    return Planned(
+        seconds=sum(item.plan.seconds(trial) for trial, _ in item.trials),
+        seconds_collected=sum(r.record.motion_s or 0.0 for _, r in item.trials),
+        bytes=planned_bytes,
+        bytes_collected=sum(
+            path.stat().st_size
+            for _, r in item.trials
+            for path in r.folder.iterdir()
+            if path.name != "provenance.json"
+        ),
+    )

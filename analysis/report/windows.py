@@ -1,0 +1,342 @@
+"""Windows in the report: the network beside other methods, where it errs, and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import fmean
+from typing import ClassVar
+
+import numpy as np
+import pandas as pd
+
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.networks.training import Fitted
+from sliplab.analysis.report.figures import intervals
+from sliplab.analysis.report.figures import windows as figures
+from sliplab.analysis.report.figures.style import CLASS_WORDS
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.analysis.report.published import PAPER, Published
+from sliplab.protocols.quantity import level_order
+from sliplab.storage.schema.summary import (
+    Accuracy,
+    Calibration,
+    Compared,
+    Kinematic,
+    Seeds,
+    Share,
+    Work,
+)
+
+METHODS = {
+    "majority": "majority class",
+    "rate_threshold": "event-rate threshold",
+    "logistic": "logistic regression on the event count",
+    "logistic_cells": "logistic regression on each cell's events",
+    "boosting": "gradient boosting on counts",
+    "cnn_frame": "ordinary convolutions on the summed frame",
+    "cnn_volume": "ordinary convolutions on space and time",
+    "gru": "gated recurrent unit over the steps",
+}
+"""Other methods in words, by name."""
+WORST = 10
+"""Trials that are listed with their errors."""
+
+
+@dataclass(frozen=True)
+class NetworkSection(Content):
+    """Accuracy on windows of test trials, with the other methods beside it."""
+
+    template: ClassVar[str] = "network.html"
+    length_ms: int
+    accuracy: Accuracy
+    interval: Share
+    seeds: Seeds
+    strong: bool
+    """Stronger methods were trained."""
+    warnings: Sequence[str]
+    paper: Mapping[str, Published]
+    confusion: Figure
+    training: Figure
+    methods: Table
+    classes: Table
+
+    @property
+    def strict(self) -> str:
+        """Strict accuracy with its interval."""
+        return share_words(self.interval)
+
+
+def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) -> NetworkSection:
+    """Compare the network with other methods on the same windows."""
+    accuracy, baselines = kinematic.accuracy, kinematic.trained_baselines
+    own = [percent(value) for value in (accuracy.argmax, accuracy.strict, accuracy.margin)]
+    methods = [
+        [METHODS[name], percent(found.argmax), "", "", _points(found.network_ahead)]
+        for name, found in {**kinematic.beside, **baselines}.items()
+    ]
+    confusion = np.asarray(kinematic.confusion)
+    called = {
+        f"called {word} (windows)": confusion[:, k].tolist()
+        for k, word in enumerate((*CLASS_WORDS, "undecided"))
+    }
+    history = [vars(record) for record in fitted.history]
+    headings = {
+        "epoch": "epoch",
+        "loss": "training loss (nats)",
+        "val_loss": "validation loss (nats)",
+        "train_argmax": "training accuracy, argmax (share)",
+        "val_argmax": "validation accuracy, argmax (share)",
+        "val_strict": "validation accuracy, strict (share)",
+    }
+    return NetworkSection(
+        fitted.windows.length_ms, accuracy, kinematic.interval, kinematic.seeds, bool(baselines),
+        fitted.warnings, PAPER,
+        Figure(
+            figures.confusion(confusion, simulated=simulated),
+            name="confusion",
+            data={"true class": list(CLASS_WORDS), **called},
+        ),
+        Figure(
+            figures.training_curves(history, fitted.chosen_epoch, simulated=simulated),
+            name="training",
+            data={heading: [row[name] for row in history] for name, heading in headings.items()},
+        ),
+        Table(
+            ["method", "argmax", "strict", "margin", "network ahead by (points)"],
+            [["spiking network", *own, ""], *methods],
+        ),
+        Table(
+            ["class", "precision", "recall"],
+            [[word, percent(getattr(kinematic.precision, name)),
+              percent(getattr(kinematic.recall, name))]
+             for name, word in zip(CLASSES, CLASS_WORDS, strict=True)],
+        ),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WhereSection(Content):
+    """Accuracy by condition, phase and trial.
+
+    Attributes:
+        all_trials: how many `worst` is of.
+    """
+
+    template: ClassVar[str] = "where.html"
+    tenths: Figure
+    factors: Figure | None
+    levels: Table
+    still: Table
+    worst: Table
+    all_trials: int
+
+
+def where_section(kinematic: Kinematic, *, simulated: bool) -> WhereSection:
+    """Look for where the network errs."""
+    levels = [
+        [factor, level, str(row.trials), str(row.n), share_words(row)]
+        for factor, rows in kinematic.by_factor.items()
+        for level, row in _in_order(rows)
+    ]
+    still = kinematic.no_slip
+    phases = [] if still is None else [
+        ("while holding", still.hold), ("while moving, before the first slip", still.loading)
+    ]  # fmt: skip
+    worst = [
+        [
+            row.trial, f"{row.errors} of {row.n}",
+            ", ".join(f"{count} {what.replace('_', ' ')}" for what, count in row.taken.items()),
+        ]
+        for row in kinematic.by_trial[:WORST] if row.errors
+    ]  # fmt: skip
+    tenths = pd.DataFrame(
+        [
+            {"class": name, "phase, from (%)": 10 * row.tenth - 10, "recall (share)": row.share,
+             "95 % interval, low (share)": row.low, "95 % interval, high (share)": row.high,
+             "windows": row.n}
+            for name, rows in kinematic.by_tenth.items() for row in rows
+        ],
+        dtype=object,
+    )  # fmt: skip
+    return WhereSection(
+        Figure(
+            figures.recall_by_tenth(kinematic.by_tenth, simulated=simulated),
+            name="recall-by-tenth",
+            data=tenths.to_dict("list"),
+        ),
+        _factors(kinematic, simulated) if kinematic.by_factor else None,
+        Table(["factor", "level", "trials", "windows", "right"], levels),
+        Table(
+            ["no slip", "trials", "windows", "right"],
+            [[word, str(row.trials), str(row.n), share_words(row)] for word, row in phases],
+        ),
+        Table(["trial", "wrong", "what was called what"], worst),
+        len(kinematic.by_trial),
+    )
+
+
+def _factors(kinematic: Kinematic, simulated: bool) -> Figure:
+    """Draw accuracy by each factor's levels."""
+    strict = kinematic.accuracy.strict
+    groups = {
+        factor: [
+            intervals.Share(level, row.share, row.low, row.high) for level, row in _in_order(rows)
+        ]
+        for factor, rows in kinematic.by_factor.items()
+    }
+    line = None if strict is None else (strict, "all test windows")
+    named = [replace(it, name=f"{factor} {it.name}") for factor, of in groups.items() for it in of]
+    return Figure(
+        intervals.shares(groups, "windows called rightly (%)", simulated=simulated, line=line),
+        name="accuracy-by-factor",
+        data=share_data(named),
+    )
+
+
+def share_data(rows: Sequence[intervals.Share]) -> dict[str, Sequence[object]]:
+    """Return drawn shares as columns."""
+    return {
+        "name": [row.name for row in rows],
+        "strict accuracy (share)": [row.value for row in rows],
+        "95 % interval, low (share)": [row.low for row in rows],
+        "95 % interval, high (share)": [row.high for row in rows],
+    }
+
+
+def _in_order(rows: Mapping[str, Share]) -> list[tuple[str, Share]]:
+    """Sort a factor's levels by their number, words after numbers."""
+    return sorted(rows.items(), key=lambda item: level_order(item[0]))
+
+
+@dataclass(frozen=True)
+class LeadSection(Content):
+    """What a lead in spikes means."""
+
+    template: ClassVar[str] = "lead.html"
+    calibration: Calibration
+    figure: Figure
+
+
+def lead_section(kinematic: Kinematic, *, simulated: bool) -> LeadSection | None:
+    """Draw the share right by lead; None where there are no windows."""
+    if not kinematic.reliability:
+        return None
+    headings = {
+        "lead": "lead, from (spikes)",
+        "to": "lead, to (spikes)",
+        "n": "windows",
+        "share": "right (share)",
+        "low": "95 % interval, low (share)",
+        "high": "95 % interval, high (share)",
+    }
+    rows = kinematic.reliability
+    data = {heading: [getattr(row, key) for row in rows] for key, heading in headings.items()}
+    svg = figures.reliability(rows, simulated=simulated)
+    return LeadSection(kinematic.calibration, Figure(svg, name="lead-reliability", data=data))
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The best other method on these windows.
+
+    Attributes:
+        shares: argmax accuracy with each seed.
+    """
+
+    title: str
+    found: Compared
+    multiply_adds: int | None
+    shares: Sequence[float]
+
+    @property
+    def mean(self) -> float:
+        """Mean of the seeds."""
+        return fmean(self.shares)
+
+
+@dataclass(frozen=True)
+class WorkSection(Content):
+    """What spiking buys, and what it costs.
+
+    Attributes:
+        seeds: of the spiking network.
+    """
+
+    template: ClassVar[str] = "work.html"
+    work: Work
+    seeds: Seeds
+    rival: Rival | None
+    layers: Table
+    fired: Table
+    others: Table
+
+
+def work_section(kinematic: Kinematic) -> WorkSection | None:
+    """Compare computation and accuracy; None where the work was not counted."""
+    work = kinematic.work
+    if work is None:
+        return None
+    synaptic, dense = work.synaptic_operations, work.dense_multiply_adds
+    layers = [
+        [name, f"{synaptic[name]:,.0f}", f"{dense[name]:,}", percent(synaptic[name] / dense[name])]
+        for name in synaptic
+    ]
+    fired = [
+        [name, number(work.spikes[name], 1), percent(rate, 2)] for name, rate in work.rates.items()
+    ]
+    return WorkSection(
+        work, kinematic.seeds, _rival(kinematic),
+        Table(["layer", "synaptic operations", "dense multiply-adds", "share"], layers),
+        Table(["spiking layer", "spikes a window", "of neurons and steps"], fired),
+        _others(kinematic.trained_baselines),
+    )  # fmt: skip
+
+
+def _rival(kinematic: Kinematic) -> Rival | None:
+    """Find the best other method, where stronger ones were trained."""
+    every = {**kinematic.beside, **kinematic.trained_baselines}
+    known = {name: row for name, row in every.items() if row.argmax is not None}
+    if not kinematic.trained_baselines or not known:
+        return None
+    best = max(known, key=lambda name: known[name].argmax or 0.0)
+    found = known[best]
+    return Rival(METHODS[best], found, found.made.get("multiply_adds"), _shares(found))
+
+
+def _others(baselines: Mapping[str, Compared]) -> Table:
+    """List what the other methods are."""
+    rows = []
+    for name, found in baselines.items():
+        made, shares = found.made, _shares(found)
+        ran = made.get("epochs", made.get("rounds", made.get("iterations")))
+        most = made.get("most_rounds")
+        spread = "–"
+        if shares:
+            spread = f"{percent(fmean(shares))} ({percent(min(shares))} to {percent(max(shares))})"
+        rows.append([
+            METHODS[name],
+            *("–" if key not in made else f"{made[key]:,}" for key in ("weights", "multiply_adds")),
+            f"{ran} of at most {most}" if most is not None else str(ran),
+            spread,
+        ])  # fmt: skip
+    columns = ["method", "weights", "multiply-adds a window", "epochs or rounds", "argmax of seeds"]
+    return Table(columns, rows)
+
+
+def _shares(found: Compared) -> list[float]:
+    """Return argmax accuracy with each seed; none for what has nothing random."""
+    return [row["argmax"] for row in found.made.get("seeds", ()) if row["argmax"] is not None]
+
+
+def share_words(row: Share) -> str:
+    """Return a share with its interval."""
+    if row.share is None or row.low is None:
+        return percent(row.share)
+    return f"{percent(row.share)} ({percent(row.low)} to {percent(row.high)})"
+
+
+def _points(row: Share) -> str:
+    if row.share is None or row.low is None or row.high is None:
+        return number(None if row.share is None else 100 * row.share)
+    return f"{100 * row.share:+.1f} ({100 * row.low:+.1f} to {100 * row.high:+.1f})"

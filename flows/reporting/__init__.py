@@ -1,1 +1,0 @@
-"""The report: its sections, its numbers, and two reports compared."""

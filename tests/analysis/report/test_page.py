@@ -1,0 +1,157 @@
+"""Pages, tables and figures: escaped, whole, with units, and never without "simulated"."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from xml.etree import ElementTree
+
+import pytest
+
+from sliplab.analysis.report.figures import campaign, clocks, trials
+from sliplab.analysis.report.figures.intervals import (
+    Panel,
+    Share,
+    by_condition,
+    differences,
+    shares,
+)
+from sliplab.analysis.report.figures.tradeoffs import Panel as Pair
+from sliplab.analysis.report.figures.tradeoffs import Point, cost_and_error
+from sliplab.analysis.report.page import Figure, Section, Table, csv_text, render_page
+
+SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
+ROWS = ["0.165 kg, 0.3 mm/s", "0.205 kg, 0.3 mm/s"]
+
+DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
+    "by_condition": (
+        lambda simulated: by_condition(
+            ROWS,
+            [Panel("lead (ms)", {ROWS[0]: [360.0, 420.0]}, zero="gross slip",
+                   published=(360.0, "paper's smallest"), notes={ROWS[0]: "2 missed"})],
+            simulated=simulated, breaks=[1],
+        ),
+        ("lead (ms)", *ROWS, "0: gross slip", "dotted: paper's smallest", "2 missed", "none"),
+    ),
+    "shares": (
+        lambda simulated: shares(
+            {"depth": [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]},
+            "windows called rightly (%)", simulated=simulated, line=(0.92, "all"),
+        ),
+        ("windows called rightly (%)", "depth", "2.4 mm", "2.6 mm", "all"),
+    ),
+    "differences": (
+        lambda simulated: differences([("lead", 12.0, 3.0, 20.0)], "ms", simulated=simulated),
+        ("lead", "ms"),
+    ),
+    "over_campaign": (
+        lambda simulated: campaign.over_campaign(
+            [1, 2, 4], [1e4, 2e4, 1e4], [0.1, 0.2, 0.1], {3: 2}, simulated=simulated
+        ),
+        ("(thousand/s)", "(% of its limit)", "attempts", "trial, in the plan's order"),
+    ),
+    "references": (
+        lambda simulated: campaign.references(
+            [1, 5], {"events (1/s)": [10.0, 11.0], "first slip (ms)": [None, 900.0]},
+            simulated=simulated,
+        ),
+        ("events (1/s)", "first slip (ms)"),
+    ),
+    "clocks": (
+        lambda simulated: clocks.uncertainty_by_trial(
+            {"events, trigger input": ([1, 2], [0.3, 0.4])}, {"kinematic": 1}, simulated=simulated
+        ),
+        ("uncertainty, 95 % (µs)", "kinematic", "events, trigger input"),
+    ),
+    "labels": (
+        lambda simulated: trials.label_uncertainty(
+            {"paper's rule": {"incipient": [1.0, 4.0], "gross": [2.0]}},
+            {"incipient": [3.0], "gross": []}, simulated=simulated,
+        ),
+        ("distance from the truth (ms)", "width of its 95 % interval (ms)"),
+    ),
+    "front": (
+        lambda simulated: cost_and_error(
+            [
+                Point({"x": 10.0, "y": 90.0}, True, False),
+                Point({"x": 20.0, "y": 95.0}, False, True),
+            ],
+            [Pair("x", "y", "work (µs/s)", "latency (ms)")],
+            simulated=simulated,
+        ),
+        ("work (µs/s)", "latency (ms)", "Pareto front", "paper's settings"),
+    ),
+}  # fmt: skip
+
+
+def render(campaigns: list[str], sections: list[Section], *, simulated: bool) -> str:
+    """The report's page without numbers on top."""
+    return render_page(
+        "report.html", sections, simulated=simulated, campaigns=campaigns, headline=[]
+    )
+
+
+@pytest.mark.parametrize("name", sorted(DRAWN))
+def test_figures_are_whole_and_say_what_they_are(name: str) -> None:
+    draw, words = DRAWN[name]
+    text = draw(True)
+    tree = ElementTree.fromstring(text)
+    found = "\n".join(item.text or "" for item in tree.iter() if item.tag.endswith("}text"))
+    for word in (*words, "simulated"):
+        assert word in found
+    assert text == draw(True)  # the same bytes again
+    assert "simulated" not in draw(False)
+
+
+def test_a_figures_data_are_columns_with_units() -> None:
+    text = csv_text({"trial": ["a, b", "c"], "latency (ms)": [1.5, None, 2.5]}, simulated=True)
+    rows = list(csv.reader(io.StringIO(text)))
+    assert rows == [
+        ["trial", "latency (ms)", "simulated"], ["a, b", "1.5", "yes"], ["c", "", "yes"],
+        ["", "2.5", "yes"],
+    ]  # fmt: skip
+    assert csv_text({"x (s)": [1]}, simulated=False).splitlines() == ["x (s),simulated", "1,no"]
+
+
+def test_a_page_escapes_everything_but_its_figures() -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    section = Section(
+        evil, [evil],
+        [Figure(SVG, evil, "name", {}, evil)],
+        [Table((evil, "command"), [[evil, f"sliplab view {evil}"]], evil, (1,))],
+        commands=[(evil, evil)],
+    )  # fmt: skip
+    page = render([evil], [section], simulated=True)
+    assert "<img" not in page
+    assert SVG in page
+    assert 'href="figures/name.svg"' in page
+    assert 'href="data/name.csv"' in page
+    assert "Paper, on its own robot:" in page
+    assert "What is drawn here is simulated." in page
+    assert '<td class="command"><code>sliplab view ' in page
+    plain = render([], [Section("a", (), [Figure(SVG, "seen")])], simulated=False)
+    assert "figures/" not in plain
+    assert "imulated" not in plain.split("</style>")[1]
+
+
+def test_words_read_from_the_left_and_commands_as_code() -> None:
+    table = Table(
+        ("trial", "cause", "lead (ms)", "none"),
+        [["a", "late", "12", ""], ["b", "", "–", "–"], ["c", "early", "-3", ""]],
+    )
+    assert table.texts == {0, 1}
+    page = render([], [Section("a", ["run `a <b>` or `c`"], tables=[table])], simulated=False)
+    assert "<p>run <code>a &lt;b&gt;</code> or <code>c</code></p>" in page
+    assert '<th class="text">cause</th><th>lead (ms)</th>' in page
+    assert '<td class="text">late</td><td>12</td>' in page
+    assert page.startswith("<!doctype html>")
+
+
+def test_a_column_with_a_sentence_has_its_heading_on_the_left() -> None:
+    sentence = "30 ms windows every 10 ms, one class of two spikes ahead"
+    table = Table(("", "detector", "ms"), [["a", sentence, "12"], ["b", "5 ms", "30"]])
+    assert table.texts == {0, 1}
+    page = render([], [Section("a", (), tables=[table])], simulated=False)
+    assert '<th class="text">detector</th><th>ms</th>' in page
+    assert f'<td class="words">{sentence}</td><td>12</td>' in page

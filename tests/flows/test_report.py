@@ -1,0 +1,439 @@
+"""The report of a small study: whole, self-contained, every trial in one place."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.metrics.classification import CLASSES
+from sliplab.analysis.report import campaign, programs
+from sliplab.analysis.report.against import compare
+from sliplab.analysis.report.outcomes import (
+    MOST_FAILURES,
+    OUTCOMES,
+    Conditions,
+    account,
+    failure_section,
+    trial_intervals,
+    trial_outcome,
+)
+from sliplab.analysis.report.page import render_section, write_figures
+from sliplab.analysis.report.programs import FILES
+from sliplab.analysis.sweeps.scene_windows import PHASES
+from sliplab.flows.collect import collect
+from sliplab.flows.labelling.label import label
+from sliplab.flows.planning.run_request import RunRequest, make_request
+from sliplab.flows.report import read_summary, report
+from sliplab.flows.searching.tradeoff_page import ERRORS
+from sliplab.flows.study import Outcome
+from sliplab.storage.files import json_text, read_json, write_json
+from sliplab.storage.schema.summary import ReferenceTrial, Seed, Seeds, Summary, TrialOutcome
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
+from tests.command_line import here
+from tests.flows.collecting.test_session import short
+from tests.flows.conftest import write
+
+Json = dict[str, Any]
+UNITLESS = {
+    "trial", "name", "row", "class", "detector", "stride", "true class", "tightest gate", "windows",
+    "failed attempts", "place in the plan", "epoch", "side", "simulated", "family", "variant",
+    "on the front", "precision", "width",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def store(ran: tuple[list[RunRequest], Outcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A copy of the small study, with its report."""
+    folder = tmp_path_factory.mktemp("report") / "store"
+    shutil.copytree(ran[0][0].store, folder)
+    found = Store.open(folder)
+    report(found, collected(found))
+    return found
+
+
+def page(store: Store) -> str:
+    return (store.folder / "report" / "index.html").read_text()
+
+
+def test_every_trial_is_counted_once(store: Store) -> None:
+    summary = read_summary(store)
+    for experiment, planned in (("kinematic", 2), ("gravity", 2), ("disturbance", 0)):
+        found = getattr(summary, experiment)
+        accounts, lead = found.accounted, found.lead_ms
+        assert accounts.planned == planned
+        assert sum(accounts.of(name) for name in OUTCOMES) == planned
+        for name in ("detected_first", "missed", "false_early", "late"):
+            assert accounts.of(name) == getattr(lead, name)
+    assert [row.campaign for row in summary.trials].count("tiny") == 2
+    known = [row.lead_ms for row in summary.trials if row.experiment == "gravity"]
+    least = min((value for value in known if value is not None), default=None)
+    assert least == summary.gravity.lead_ms.min
+
+
+def test_a_summary_is_read_and_written_to_the_byte(store: Store) -> None:
+    path = store.folder / "report" / "summary.json"
+    assert json_text(Summary.load(path).to_json()) == path.read_text()
+    known = Summary.load(path).model_fields_set
+    assert known == set(Summary.model_fields)
+
+
+def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
+    campaigns = collected(store)
+    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    others = [trial_outcome(row) for row in rows if row["campaign"] != "tiny"]
+    later = account(campaigns, others, "kinematic")
+    assert (later.planned, later.not_evaluated) == (2, 2)
+    lost = copy.copy(campaigns[0])
+    lost.__dict__["trials"] = lost.trials[:0]
+    missing = account([lost], [], "kinematic")
+    assert (missing.planned, missing.not_taken) == (2, 2)
+
+
+FOUND = {
+    "latency_incipient_ms": 90.0, "latency_gross_ms": 40.0, "lead_ms": 900.0,
+    "missed_incipient": False, "missed_gross": False, "false_early_incipient": False,
+    "false_early_gross": False, "late_incipient_ms": None, "late_gross_ms": None,
+}  # fmt: skip
+
+
+def judged(**changed: Any) -> Json:
+    """An evaluated trial."""
+    return {
+        "campaign": "g", "experiment": "gravity", "trial": "t", "condition": {},
+        "incipient_ns": 10**9, "gross_ns": 2 * 10**9, "latency": {**FOUND, **changed},
+    }  # fmt: skip
+
+
+def test_what_became_of_a_trial() -> None:
+    assert trial_outcome(judged()).outcome == "detected_first"
+    assert trial_outcome(judged()).duration_ms == 1000.0
+    assert trial_outcome(judged(late_incipient_ms=20.0, lead_ms=None)).outcome == "late"
+    late = trial_outcome(judged(late_gross_ms=299.0, latency_gross_ms=None))
+    assert (late.gross, late.late_gross_ms) == ("late", 299.0)
+    assert trial_outcome(judged(missed_incipient=True)).outcome == "missed"
+    assert trial_outcome(judged(false_early_incipient=True)).outcome == "false_early"
+    assert trial_outcome(judged(false_early_gross=True)).gross == "false_early"
+    assert trial_outcome(judged(missed_gross=True)).gross == "missed"
+    none = trial_outcome({**judged(), "latency": None, "gross_ns": None})
+    assert (none.outcome, none.gross, none.lead_ms) == (
+        "without_onsets", "without_onsets", None
+    )  # fmt: skip
+    found = trial_intervals([trial_outcome(judged()), trial_outcome(judged(lead_ms=1000.0)), none])
+    assert found.lead_ms.n == 2
+    half = 12.7062047 * 50  # Student's t of two trials
+    assert found.lead_ms.mean == pytest.approx([950 - half, 950 + half])
+
+
+def test_trials_stand_under_their_conditions(store: Store) -> None:
+    campaigns = collected(store)
+    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    found = Conditions(campaigns, rows, "gravity")
+    cells = found.cells(list(found.factors))
+    assert sum(map(len, cells.values())) == 2
+    for name, trials in cells.items():
+        levels = dict(zip(found.factors, name.split(", "), strict=True))
+        assert trials == found.at(**levels)
+    both = Conditions(campaigns, rows, "kinematic")
+    assert both.varied() == ["direction"]
+    assert both.breaks(["direction"]) == []
+    assert len(both.at(direction="240 deg")) == 1
+    both.factors = {"a": ["1", "2"], "b": ["x", "y", "z"]}
+    assert list(both.cells(["a", "b"])) == ["1, x", "1, y", "1, z", "2, x", "2, y", "2, z"]
+    assert both.breaks(["a", "b"]) == [3]
+
+
+def test_figures_stand_beside_the_page_with_their_data(store: Store) -> None:
+    folder = store.folder / "report"
+    text = page(store)
+    names = re.findall(r'<figure id="([^"]+)">', text)
+    assert len(names) == text.count("<figure") == len(set(names))
+    assert sorted(path.stem for path in (folder / "figures").iterdir()) == sorted(names)
+    assert sorted(path.stem for path in (folder / "data").iterdir()) == sorted(names)
+    assert {"trial", "confusion", "outputs", "latency-kinematic", "gravity-incipient",
+            "gravity-gross", "labels", "clocks", "quality-tiny"} <= set(names)  # fmt: skip
+    for name in names:
+        svg = (folder / "figures" / f"{name}.svg").read_text()
+        assert svg in text
+        with (folder / "data" / f"{name}.csv").open(newline="") as file:
+            head, *rows = list(csv.reader(file))
+        assert rows
+        assert all(row[-1] == "yes" for row in rows)
+        for heading in head:
+            assert heading in UNITLESS or re.search(r"\(.+\)$", heading), (name, heading)
+    lines = (folder / "data" / "gravity-incipient.csv").read_text().splitlines()
+    known = {row.trial: row for row in read_summary(store).trials}
+    for line in csv.DictReader(lines):
+        late = known[line["trial"]].latency_incipient_ms
+        assert line["incipient latency (ms)"] == ("" if late is None else str(late))
+
+
+def test_every_address_in_the_page_is_beside_it(store: Store) -> None:
+    folder = store.folder / "report"
+    text = page(store)
+    assert not re.search(r"<(script|img|iframe|link rel=.stylesheet)", text)
+    for address in re.findall(r'<a href="([^"]+)"', text):
+        if address.startswith("#"):
+            assert f'id="{address[1:]}"' in text
+        else:
+            assert (folder / address).is_file()
+    assert "88 ms after onset" in text
+    assert "measured by its authors on their own robot" in text
+    assert "here (simulated)" in text
+    assert f"sliplab review {store.folder.resolve()}" in text
+    assert "no campaign takes reference trials" in text
+    assert f"sliplab generalise {store.folder.resolve()}" in text
+
+
+def test_failures_have_a_command_that_shows_them(store: Store) -> None:
+    def changed(of: TrialOutcome, **values: str) -> TrialOutcome:
+        return of.model_copy(update=values)
+
+    first = read_summary(store).trials[0]
+    row = changed(first, trial="a=1,r=1", outcome="late", gross="missed")
+    early = changed(row, outcome="detected_first", gross="false_early", campaign="b")
+    fine = changed(row, trial="fine", outcome="detected_first", gross="detected")
+    found = failure_section(store.folder, [early, fine, row])
+    assert [line[1].split(":")[0] for line in found.table.rows] == [row.campaign, "b"]
+    assert "incipient detected late" in found.table.rows[0][1]
+    assert "gross missed" in found.table.rows[0][1]
+    command = f"sliplab view {store.folder.resolve()} a=1,r=1 --campaign {row.campaign}"
+    assert found.table.rows[0][0] == command  # two campaigns have this trial
+    assert "2 of 3 judged trials failed" in render_section(found, simulated=True)[1]
+    many = failure_section(store.folder, [row] * (MOST_FAILURES + 1))
+    assert len(many.table.rows) == MOST_FAILURES
+    assert "summary.json" in render_section(many, simulated=True)[1]
+    none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
+    assert "0 of 1 judged trials failed in some way." in none
+    assert "<table" not in none
+
+
+def scene() -> Json:
+    """Numbers of the shape that `sliplab tradeoff --scene` writes."""
+    error = {**dict.fromkeys(ERRORS, 0.5), "early_p95_us": 3.0}
+    variants = [
+        {"family": family, "name": name, "level": "L3", "step_ms": step, "path": "cubic",
+         "rows_per_s": 500, "wall_s": 0.2, "error": error}
+        for family, name, step in (("levels", "L3", 2), ("cubic", "4", 4))
+    ]  # fmt: skip
+    choice = {"level": "L1", "reason": "enough"}
+    windows = {
+        "samples": dict.fromkeys(CLASSES, 9), "silent_share": dict.fromkeys(CLASSES, 0.1),
+        "events_per_s": dict.fromkeys(PHASES, 1e3), "hold_share": 0.5, "ceiling": 0.8,
+    }  # fmt: skip
+    return {
+        "simulated": True, "protocol": "tiny", "rig": "r", "rig_step_ms": 2, "trials": ["a"],
+        "variants": variants, "seeds": error, "levels": {},
+        "choice": {"measured": choice, "closed_form": choice, "agree": True},
+        "windows": windows, "left_out": [],
+    }  # fmt: skip
+
+
+def detector() -> Json:
+    """Numbers of the shape that `analysis.report.programs` reads."""
+    rows = [
+        {"length_ms": 30, "step_ms": 1, "pool_px": 20, "width": 1.0, "precision": "as trained",
+         "stride_ms": 30, "smoothing": 4, "margin": 2.0, "front": paper, "paper": paper,
+         "test": {"strict": [0.9, 0.92], "mean_ms": [90.0, late], "p95_ms": [200.0, 210.0],
+                  "false_early_either": [0.0, 0.01], "lost_either": [0.0, 0.0]},
+         "work": {"us_per_s": [9e3, 1e4], "synaptic_operations_per_s": [1e7, 1e7]}}
+        for paper, late in ((True, 100.0), (False, None))
+    ]  # fmt: skip
+    return {"simulated": True, "rows": rows}
+
+
+def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    skin = {"share": 0.8, "low": 0.7, "high": 0.9, "n": 100, "trials": 4, "argmax": 0.81}
+    results = {"skin 101": skin, "depth 2.4 mm": {**skin, "seen": 0.9},
+               "speed 1 mm/s": {"left out": "no train trials"}}  # fmt: skip
+    found = {
+        "generalisation": {"simulated": True, "results": results},
+        "scene": scene(),
+        "labels": {"name": "labels", "figures": {"frame_ms": 0.0254, "error_px": 0.005}},
+        "labels_truth": {
+            "name": "labels_truth",
+            "figures": {"trials": 60.0, "slip_median_ms": 4.5},
+        },
+        "detector": detector(),
+    }
+    for name, data in found.items():
+        path = other.folder / FILES[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, data)
+    assert report(other, collected(other))["done"] == 1
+    assert report(other, collected(other))["done"] == 0
+    text = page(other)
+    for word in (
+        "skin 101",
+        "no train trials",
+        "SlipLab&#39;s tracker",
+        "0.0254",
+        "4.5",
+        "without a depth",
+    ):
+        assert word in text
+    assert "not done here" not in text
+    data = other.folder / "report" / "data"
+    assert (data / "skins.csv").read_text().splitlines()[2] == "skin 101,0.8,0.7,0.9,yes"
+    lines = list(csv.DictReader((data / "tradeoff-detector.csv").read_text().splitlines()))
+    assert [line["mean latency (ms)"] for line in lines] == ["95.0", ""]
+    assert [line["strict accuracy (%)"] for line in lines] == ["91.0", "91.0"]
+    assert (data / "tradeoff-scene.csv").exists()
+
+    path = other.folder / FILES["detector"]
+    path.write_text("{")
+    with pytest.raises(StoreError, match=r"delete .*detector_tradeoff\.json"):
+        report(other, collected(other))
+    with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
+        programs.tradeoff_section(other, {"detector": {"rows": [{}]}}, None)
+    path.unlink()
+    write_json(other.folder / FILES["scene"], {"variants": []})
+    with pytest.raises(StoreError, match=r"derived/tradeoff/tradeoff\.json: is not of the shape"):
+        report(other, collected(other))
+    with pytest.raises(StoreError, match=r"results\.json: is not of the shape"):
+        programs.skin_section({}, "sliplab generalise", 0.9, simulated=True)
+    absent = programs.tradeoff_section(other, {}, None)
+    assert absent.missing[0][1].startswith("sliplab tradeoff --scene PROTOCOL --out ")
+    write_figures(other.folder / "report", [absent], simulated=True)
+    assert list(data.iterdir()) == []  # an older report's figures go
+
+
+def test_an_evaluation_of_another_version_is_refused_by_name(store: Store, tmp_path: Path) -> None:
+    shutil.copytree(store.folder, tmp_path / "store")
+    other = Store.open(tmp_path / "store")
+    path = other.folder / "derived" / "evaluation" / "evaluation.json"
+    write_json(path, {**read_json(path), "format": [1, 1]})
+    with pytest.raises(StoreError, match=r"another version.*sliplab evaluate"):
+        report(other, collected(other))
+
+
+def test_wear_is_the_slope_of_reference_trials(tmp_path: Path, rig_path: Path) -> None:
+    rows = [
+        ReferenceTrial(trial=str(k), place=1 + 10 * k, hold_events_per_s=1000.0 + 2 * k,
+                       first_slip_ms=None if k else 900.0)
+        for k in range(8)
+    ]  # fmt: skip
+    found = campaign.wear(rows)
+    slope = found["hold_events_per_s"].percent_per_100_trials
+    assert slope == pytest.approx(100 * 20.0 / 1007.0)
+    assert found["hold_events_per_s"].low == pytest.approx(slope)
+    assert found["first_slip_ms"].to_json() == {
+        "n": 1, "percent_per_100_trials": None, "low": None, "high": None
+    }  # fmt: skip
+    data = short()
+    data["collection"]["factors"]["direction"]["values"] = [0, 120]
+    data["collection"]["references"] = {
+        "every": 1, "condition": {"depth": 2.4, "speed": 1.6, "direction": 0}
+    }  # fmt: skip
+    run_request = make_request(write(tmp_path / "p.yaml", data), rig_path, tmp_path / "store")
+    collect(run_request)
+    store = Store.open(run_request.store)
+    (item,) = collected(store)
+    before = campaign.reference_trials(store, item)
+    assert [row.first_slip_ms for row in before] == [None, None]
+    label(store, [item])
+    after = campaign.reference_trials(store, item)
+    assert [row.hold_events_per_s for row in after] == [row.hold_events_per_s for row in before]
+    slips = [row.first_slip_ms for row in after if row.first_slip_ms is not None]
+    assert len(slips) == len(after)
+    assert min(slips) > 0
+    assert max(slips) - min(slips) < 40.0  # the same condition: within some frames
+    known = campaign.references_of(store, [item])
+    section = campaign.quality_section([item], known, simulated=True)
+    names = [figure.name for figure in section.all_figures()]
+    assert names == ["quality-tiny", "references-tiny"]
+    words = "Campaign tiny: event rate in the hold: 2 reference trials, too few for a trend."
+    assert words in render_section(section, simulated=True)[1]
+    steep = {"tiny": known["tiny"].model_copy(update={"wear": found})}
+    said = render_section(campaign.quality_section([item], steep, simulated=True), simulated=True)
+    trend = f"changes by {slope:+.2f} % in 100 trials"
+    assert trend in " ".join(said[1].split())
+    assert "more than chance." in said[1]
+
+
+def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:
+    summary = read_summary(store)
+    found = compare(summary, copy.deepcopy(summary))
+    assert found.settings == []
+    assert len(found.figures) > 10
+    for row in found.figures:
+        assert row.difference == 0
+        assert row.beyond in {False, None}
+
+
+def several_seeds(summary: Summary, *shares: tuple[float, float]) -> Summary:
+    """The same with trained seeds of these accuracies, and margins."""
+    each = tuple(Seed(strict=share, argmax=share, margin=margin) for share, margin in shares)
+    kinematic = summary.kinematic.model_copy(update={"seeds": Seeds(each=each)})
+    return summary.model_copy(update={"kinematic": kinematic})
+
+
+def test_a_difference_is_more_than_noise_where_its_interval_says_so(store: Store) -> None:
+    summary = read_summary(store)
+    (first, *_) = [row for row in summary.trials if row.experiment == "gravity"]
+    rng = np.random.default_rng(1)
+    ours, theirs = (
+        summary.model_copy(update={"trials": tuple(
+            first.model_copy(update={
+                "trial": str(k), "outcome": "detected_first", "gross": "detected",
+                "latency_incipient_ms": late + noise, "latency_gross_ms": 50.0 + 400 * noise,
+                "lead_ms": None if k == 3 else 900.0 - noise,
+            })
+            for k, noise in enumerate(rng.normal(0, 10, 40))
+        )})
+        for late in (120.0, 80.0)
+    )  # fmt: skip
+    ours = several_seeds(ours, (0.9, 0.8))
+    theirs = several_seeds(theirs, *((share, share) for share in (0.88, 0.90, 0.91)))
+    theirs = theirs.model_copy(update={"versions": {**theirs.versions, "numpy": "0"}})
+    found = {row.name: row for row in compare(ours, theirs).figures}
+    late = found["gravity: incipient latency, mean"]
+    assert (late.basis, late.beyond) == ("same trials", True)
+    assert late.low is not None
+    assert late.high is not None
+    assert late.low < late.difference < late.high
+    assert late.difference == pytest.approx(40.0, abs=6)
+    assert found["gravity: gross latency, mean"].beyond is False
+    assert found["accuracy, strict, mean of seeds"].basis == "seeds"
+    assert found["accuracy, strict, mean of seeds"].beyond is False
+    assert found["accuracy, margin, mean of seeds"].beyond is True
+    assert compare(ours, theirs).to_json()["settings"] == [
+        {"what": "versions.numpy", "here": ours.versions["numpy"], "there": "0"}
+    ]
+    # trials of another protocol only have the same names
+    hashes = theirs.protocols["tiny_gravity"].model_copy(update={"collection": "another"})
+    protocols = {**theirs.protocols, "tiny_gravity": hashes}
+    theirs = theirs.model_copy(update={"protocols": protocols})
+    found = {row.name: row for row in compare(ours, theirs).figures}
+    assert found["gravity: incipient latency, mean"].basis == "trials"
+
+
+def test_against_is_a_page_and_a_command(store: Store, tmp_path: Path) -> None:
+    other = tmp_path / "summary.json"
+    shutil.copy(store.folder / "report" / "summary.json", other)
+    done = here("report", store.folder, "--against", other, "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["against"]
+    assert found["settings"] == []
+    text = (store.folder / "report" / "against.html").read_text()
+    assert "Both reports are simulated." in text
+    assert "Protocols, settings, seeds and versions are the same." in text
+    done = here("report", store.folder, "--against", store.folder)
+    assert done.returncode == 0
+    assert "Two reports (simulated)" in done.stdout
+    other.write_text('{"simulated": true}')
+    for wrong in (tmp_path / "nowhere", other):
+        done = here("report", store.folder, "--against", wrong)
+        assert done.returncode == 2
+        assert "--against" in done.stderr
