@@ -18,8 +18,7 @@ from statistics import median
 from typing import Any
 
 from sliplab.analysis.metrics.intervals import exact_interval
-from sliplab.flows.detecting.detect import detect
-from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
+from sliplab.flows.detect import DetectRequest, detect, make_detect_request
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Step
 from sliplab.rigs.build import build_rig
@@ -49,7 +48,7 @@ class Outcome:
     done: bool
 
 
-def outcome(order: DetectOrder) -> Outcome:
+def outcome(order: DetectRequest) -> Outcome:
     """Run one trial on the simulated rig."""
     begun: list[int] = []
     truths: list[dict[str, Any]] = []
@@ -120,7 +119,7 @@ def main() -> None:
     print("| --- | --- | --: | --- | --: | --- | --- |")
     for mass in MASSES:
         for reflex in REFLEXES:
-            order = make_detect_order(
+            order = make_detect_request(
                 RIG, asked.model, protocol=PROTOCOL, trial=f"mass={mass},speed={SPEED}",
                 reflex=reflex,
             )  # fmt: skip

@@ -25,7 +25,7 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
         "storage/trials/recording.py",
         "storage/schema/trial.py",
         "flows/labelling/label_errors.py",
-        "flows/reviewing/view_streams.py",  # drawn beside the label, and called simulated
+        "flows/ui/view.py",  # drawn beside the label, and called simulated
     }
 
 

@@ -31,6 +31,8 @@ from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk
 
+UNDECIDED = "undecided"
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -57,6 +59,54 @@ class Decision:
     last_event_us: int | None
     by_event: bool
     decided_ns: int = field(compare=False)
+
+
+@dataclass(frozen=True)
+class TimedDecision:
+    """A decision and its times.
+
+    Attributes:
+        trial_s: end of the window since the stream began, on the camera's clock.
+        phase: of the motion in which it was made; empty where nothing moves.
+        latency_ms: from the window's last event to the decision, on the rig's clock, the freshest
+            arrival counting as immediate; None in a window without events.
+        compute_ms: from when the events were read to the decision.
+    """
+
+    decision: Decision
+    trial_s: float
+    phase: str
+    latency_ms: float | None
+    compute_ms: float
+
+    @property
+    def state(self) -> str:
+        """The valid class by name, or `UNDECIDED`."""
+        return state_name(self.decision.valid_class)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as one line of the decisions' file."""
+        made = self.decision
+        return {
+            "window": made.number,
+            "start_us": made.start_us,
+            "end_us": made.end_us,
+            "trial_s": self.trial_s,
+            "phase": self.phase,
+            "state": self.state,
+            "onset": made.onset,
+            "counts": list(made.counts),
+            "smoothed": list(made.smoothed),
+            "events": made.events,
+            "by_event": made.by_event,
+            "latency_ms": self.latency_ms,
+            "compute_ms": self.compute_ms,
+        }
+
+
+def state_name(valid_class: int) -> str:
+    """Return the name of a valid class."""
+    return UNDECIDED if valid_class < 0 else CLASSES[valid_class]
 
 
 @dataclass

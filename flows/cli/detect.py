@@ -54,10 +54,10 @@ def detect(
     as_json: JsonOption = False,
 ) -> None:
     """Say what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
-    from sliplab.flows.detecting.detect import detect as run
-    from sliplab.flows.detecting.detect_order import make_detect_order
+    from sliplab.flows.detect import detect as run
+    from sliplab.flows.detect import make_detect_request
 
-    order = make_detect_order(
+    order = make_detect_request(
         rig,
         model,
         protocol=protocol,

@@ -134,7 +134,7 @@ def export_model(
     as_json: JsonOption = False,
 ) -> None:
     """Write a network as ONNX, what it takes on a Speck chip, and its model card."""
-    from sliplab.flows.detecting.detect_order import load_model
+    from sliplab.flows.detect import load_model
     from sliplab.storage.remote.mirror import open_store
 
     if out.exists() and not out.is_dir():

@@ -12,7 +12,7 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplab.flows.reviewing.review_list import TrialList
+    from sliplab.flows.ui.review import TrialList
 
 app = typer.Typer()
 
@@ -33,7 +33,7 @@ def review(
 
     Decisions are kept in STORE/review; `train` and `evaluate` use them with --reviewed.
     """
-    from sliplab.flows.reviewing.review_server import serve
+    from sliplab.flows.ui.review_server import serve
     from sliplab.storage.remote.mirror import open_store
 
     def ready(address: str, trials: TrialList) -> None:
@@ -61,7 +61,7 @@ def view(
     as_json: JsonOption = False,
 ) -> None:
     """Look at a trial in Rerun: events, frames, arm, pulses, onsets, network on one time line."""
-    from sliplab.flows.reviewing import view as looking
+    from sliplab.flows.ui import view as looking
     from sliplab.storage.remote.mirror import open_store
 
     subject = looking.find(open_store(store), trial, campaign)

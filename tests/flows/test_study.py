@@ -409,7 +409,7 @@ def test_the_model_goes_out_as_what_it_is(
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
     from sliplab.analysis.networks import onnx_file
-    from sliplab.flows.detecting.detect_order import load_model
+    from sliplab.flows.detect import load_model
     from sliplab.flows.learning.model_export import ExportFailed, export_model
 
     store = store_of(ran)

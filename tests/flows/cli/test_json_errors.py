@@ -152,7 +152,7 @@ def test_one_object_after_a_result_was_printed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Review prints its address first; what ends it later must not be a second object."""
-    from sliplab.flows.reviewing import review_server
+    from sliplab.flows.ui import review_server
 
     def serve(*arguments: Any) -> None:
         *_, ready = arguments
@@ -167,7 +167,7 @@ def test_one_object_after_a_result_was_printed(
 
 
 def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    from sliplab.flows.reviewing import view
+    from sliplab.flows.ui import view
 
     monkeypatch.setattr(view, "find", lambda *_: None)
     monkeypatch.setattr(view, "show", lambda _: None)

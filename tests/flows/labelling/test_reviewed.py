@@ -10,8 +10,7 @@ import pytest
 from sliplab.flows.labelling.label import STEP
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import evaluate, train
-from sliplab.flows.reviewing.review_list import TrialList, chosen, doubts_of
-from sliplab.flows.reviewing.review_trial import load
+from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.formats.import_trials import import_trials, trials_in
@@ -105,7 +104,7 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     )
     rows = TrialList(made.store).rows
     assert rows[0].state == "stale"
-    assert chosen(rows, state="stale") == [rows[0]]
+    assert filtered_rows(rows, state="stale") == [rows[0]]
 
 
 def test_models_and_evaluation_know_whose_labels_they_stand_on(made: Reviewable) -> None:
@@ -154,17 +153,17 @@ def test_the_list_follows_the_store(made: Reviewable) -> None:
     assert trials.refresh()
     assert [row.label for row in trials.rows[4:7]] == ["fresh", "stale", "missing"]
     assert trials.rows[5].reasons == ("no gross slip was found", "knocked")
-    first = chosen(trials.rows)
+    first = filtered_rows(trials.rows)
     assert first[0] == trials.rows[5]
     assert first[-1] == trials.rows[3]
-    assert [row.trial for row in chosen(trials.rows, doubtful_first=False)] == made.ids
-    assert chosen(trials.rows, state="doubtful") == [trials.rows[5]]
+    assert [row.trial for row in filtered_rows(trials.rows, doubtful_first=False)] == made.ids
+    assert filtered_rows(trials.rows, state="doubtful") == [trials.rows[5]]
 
 
 def test_doubts_are_told_once_and_gravest_first() -> None:
     data = {"incipient_ns": None, "gross_ns": None, "end_ns": 1, "markers_lost": 2, "plate_lost": 1,
             "doubts": {"incipient": None, "gross": "hidden"}}  # fmt: skip
-    assert [text for _, text in doubts_of(TrialLabel.model_validate(data))] == [
+    assert [text for _, text in reasons_for_doubt(TrialLabel.model_validate(data))] == [
         "gross: hidden", "no slip was found", "2 times a marker was not seen",
         "the plate's marker was not seen in 1 frames",
     ]  # fmt: skip
@@ -172,7 +171,7 @@ def test_doubts_are_told_once_and_gravest_first() -> None:
 
 def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     trials = TrialList(made.store)
-    shown = load(made.store, made.item, trials.rows[0])
+    shown = load_trial(made.store, made.item, trials.rows[0])
     assert shown.displacement_px == pytest.approx(displacements(), abs=1e-6)
     assert shown.xy_px is not None
     assert (shown.xy_px == places()).all()
@@ -188,7 +187,7 @@ def test_what_is_shown_is_what_was_stored(made: Reviewable) -> None:
     # without a label there are still events and frames to see
     Derived.of(made.store, STEP, NAME).folder.joinpath(f"{made.ids[1]}.json").unlink()
     assert trials.refresh()
-    bare = load(made.store, made.item, trials.rows[1])
+    bare = load_trial(made.store, made.item, trials.rows[1])
     assert bare.displacement_px.shape == (60, 0)
     assert bare.suggested == Onsets()
 

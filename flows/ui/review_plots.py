@@ -1,16 +1,27 @@
-"""The review page's plots over time: displacements with onset lines to drag, and the event rate."""
+"""The review page's plots: displacements with onset lines to drag, event rate, camera frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CustomJS, Label, NumeralTickFormatter, Range1d, Span
+from bokeh.models import (
+    ColumnDataSource,
+    CustomJS,
+    Label,
+    LinearColorMapper,
+    NumeralTickFormatter,
+    Range1d,
+    Span,
+)
+from bokeh.palettes import grey
 from bokeh.plotting import figure
 
-from sliplab.analysis.report.figures.style import BLUE, GREY, ORANGE, RED
-from sliplab.flows.reviewing.review_trial import Shown
+from sliplab.analysis.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED
+from sliplab.flows.ui.review import ShownTrial
+from sliplab.storage.schema.trial import Point
+from sliplab.storage.streams import U8
 from sliplab.storage.trials.review import Onsets
 
 Kind = Literal["incipient", "gross"]
@@ -18,7 +29,7 @@ KINDS: tuple[Kind, Kind] = ("incipient", "gross")
 COLOUR = {"incipient": ORANGE, "gross": RED}
 _FAINT = "#b8bec4"
 _CLOSE_S = 0.3
-"""Half of what is seen close by."""
+"""Half of the interval that is shown when zoomed in, s."""
 _DRAG = """
 const view = Bokeh.index.find_one(plot);
 if (!view || plot.sliplab_drag) return;
@@ -42,7 +53,7 @@ window.addEventListener("pointermove", (event) => {
 window.addEventListener("pointerup", () => { held = null; }, true);
 """
 """Bokeh's own editable lines are caught within 2 pixels only, and beside where they are drawn."""
-_STEP_NS = 100_000
+_RESOLUTION_NS = 100_000
 """Onsets set by hand are kept to a tenth of a millisecond."""
 
 
@@ -158,8 +169,8 @@ class TimePlots:
             self._held.discard(kind)
             self._on_move()
 
-    def show(self, shown: Shown, onsets: Onsets) -> None:
-        """Another trial, with the onset lines there."""
+    def show(self, shown: ShownTrial, onsets: Onsets) -> None:
+        """Show another trial, with these onset lines."""
         self.moved.title.text = "simulated" if shown.recording.simulated else ""
         moved = shown.displacement_px
         count = moved.shape[1]
@@ -191,7 +202,7 @@ class TimePlots:
         self.place(onsets)
 
     def zoom(self, time_s: float | None, threshold_px: float) -> None:
-        """Look closely at some time and at what is small, or at all of it again."""
+        """Zoom in to a time and to small displacements, or out to the whole trial."""
         start, end, top = self._whole
         if time_s is not None:
             start, end = max(start, time_s - _CLOSE_S), min(end, time_s + _CLOSE_S)
@@ -202,7 +213,7 @@ class TimePlots:
             text.y = 1.05 * top
 
     def place(self, onsets: Onsets) -> None:
-        """Put the lines there, without telling that somebody moved them."""
+        """Move the lines without calling `on_move`."""
         self._quiet = True
         try:
             self._exact = onsets
@@ -225,7 +236,7 @@ class TimePlots:
         self._on_move()
 
     def onsets(self) -> Onsets:
-        """Where the lines are; one that was not moved keeps its time to the nanosecond."""
+        """Return the lines' times; a line that was not moved keeps its time to the nanosecond."""
         found: dict[str, int | None] = {}
         for kind in KINDS:
             line = self.lines[kind]
@@ -249,11 +260,11 @@ def _line(colour: str, width: int, dash: str = "solid") -> Span:
 
 
 def _rounded(time_s: float) -> int:
-    return round(time_s * 1e9 / _STEP_NS) * _STEP_NS
+    return round(time_s * 1e9 / _RESOLUTION_NS) * _RESOLUTION_NS
 
 
-def _crossings(shown: Shown) -> dict[str, Any]:
-    """When each marker slips by the label, with its interval where the label has one."""
+def _crossings(shown: ShownTrial) -> dict[str, Any]:
+    """Return when each marker slips by the label, with its interval where the label has one."""
     label = shown.label
     times = np.asarray(() if label is None else label.per_marker_ns, np.float64)
     there = times >= 0
@@ -265,3 +276,113 @@ def _crossings(shown: Shown) -> dict[str, Any]:
     return {
         "x": times[there] / 1e9, "y": height, "low": low[there] / 1e9, "high": high[there] / 1e9
     }  # fmt: skip
+
+
+_TAIL_FRAMES = 60
+"""How many earlier frames a track is drawn through."""
+_RING = 0.2
+"""Radius of a ring around a marker, as a share of the skin's spacing."""
+_DARK = "#20262c"
+
+
+class FramePlot:
+    """The camera frame under the cursor with its tracks, or a sketch of the tracks."""
+
+    def __init__(self) -> None:
+        self.plot = figure(
+            height=400, width=400, match_aspect=True, tools="pan,wheel_zoom,reset",
+            x_range=Range1d(0, 1), y_range=Range1d(0, 1), toolbar_location="right",
+            background_fill_color=_DARK, active_scroll="wheel_zoom",
+        )  # fmt: skip
+        self.plot.axis.visible = False
+        self.plot.grid.visible = False
+        self._picture = ColumnDataSource({"image": [], "w": [], "h": []})
+        self.plot.image(
+            "image", x=0, y=0, dw="w", dh="h", source=self._picture,
+            color_mapper=LinearColorMapper(palette=grey(256), low=0, high=255),
+        )  # fmt: skip
+        self._tails = ColumnDataSource({"xs": [], "ys": []})
+        self.plot.multi_line("xs", "ys", source=self._tails, line_color=GREEN, line_width=1.5)
+        self._rings = ColumnDataSource({"x": [], "y": [], "r": [], "colour": []})
+        self.plot.circle(
+            "x", "y", radius="r", source=self._rings, fill_alpha=0.0, line_color="colour",
+            line_width=2,
+        )  # fmt: skip
+        self._plate = ColumnDataSource({"x": [], "y": []})
+        self.plot.scatter("x", "y", source=self._plate, marker="x", size=14, color=ORANGE)
+        self._size = (0, 0)
+
+    def frame_to(self, shown: ShownTrial) -> None:
+        """Fit the plot to another trial's frames."""
+        width, height = shown.recording.frame_px
+        self._size = (int(width), int(height))
+        for axis, size in ((self.plot.x_range, width), (self.plot.y_range, height)):
+            axis.update(start=0, end=int(size), reset_start=0, reset_end=int(size))
+        self.clear()
+
+    def clear(self) -> None:
+        """Empty the plot."""
+        self._picture.data = {"image": [], "w": [], "h": []}
+        self._tails.data = {"xs": [], "ys": []}
+        self._rings.data = {"x": [], "y": [], "r": [], "colour": []}
+        self._plate.data = {"x": [], "y": []}
+
+    def draw(self, shown: ShownTrial, index: int, picture: U8 | None) -> str:
+        """Show one frame, with its picture where there is one.
+
+        Returns:
+            the caption.
+        """
+        if picture is not None:
+            height, width = picture.shape
+            self._size = (width, height)
+            self._picture.data = {"image": [picture[::-1]], "w": [width], "h": [height]}
+        places = shown.places(index)
+        seen = np.isfinite(places).all(axis=1)
+        geometry = shown.recording.record.geometry
+        radius = _RING * (geometry.px_per_mm or 1.0) * _spacing_mm(geometry.skin_mm)
+        self._rings.data = {
+            **self._on_plot(places[seen]),
+            "r": np.full(int(seen.sum()), radius),
+            "colour": [_colour(shown, index, i) for i in np.flatnonzero(seen).tolist()],
+        }
+        tail = slice(max(0, index - _TAIL_FRAMES), index + 1)
+        past = np.empty((0, 0, 2)) if shown.xy_px is None else shown.xy_px[tail]
+        self._tails.data = {
+            "xs": [past[:, i, 0] + 0.5 for i in range(past.shape[1])],
+            "ys": [self._size[1] - past[:, i, 1] - 0.5 for i in range(past.shape[1])],
+        }
+        if shown.plate_px is not None:
+            plate = shown.plate_px[index : index + 1]
+            self._plate.data = self._on_plot(plate[np.isfinite(plate).all(axis=1)])
+        return _caption(shown, index, np.flatnonzero(~seen))
+
+    def _on_plot(self, places: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert pixels, rows downwards, to the plot's coordinates, y upwards."""
+        return {"x": places[:, 0] + 0.5, "y": self._size[1] - places[:, 1] - 0.5}
+
+
+def _spacing_mm(skin_mm: Sequence[Point]) -> float:
+    """Return the distance of the centre marker's nearest neighbour."""
+    skin = np.asarray(skin_mm)
+    away = np.hypot(*(skin[1:] - skin[0]).T) if len(skin) > 1 else np.array([5.6])
+    return float(away.min())
+
+
+def _colour(shown: ShownTrial, index: int, marker: int) -> str:
+    moved = shown.displacement_px
+    slipped = moved.shape[1] > marker and moved[index, marker] > shown.threshold_px
+    if not slipped:
+        return BLUE
+    return RED if marker == shown.centre else ORANGE
+
+
+def _caption(shown: ShownTrial, index: int, lost: np.ndarray) -> str:
+    text = f"frame {index} at {shown.frame_s[index]:.3f} s"
+    if not shown.recording.has_video:
+        text += ", a sketch of the camera's own tracks: no picture was kept"
+    elif shown.xy_px is None:
+        text += "; this label keeps no tracks: `sliplab label` makes a newer one"
+    if len(lost):
+        text += f"; markers not seen: {', '.join(map(str, lost))}"
+    return text

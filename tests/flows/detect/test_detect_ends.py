@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sliplab.flows.detecting.detect import detect
-from sliplab.flows.detecting.detect_order import choose_trial, make_detect_order
+from sliplab.flows.detect import choose_trial, detect, make_detect_request
 from sliplab.protocols import InputError, load_plan
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import Rig, StopRequested
@@ -21,7 +20,7 @@ from sliplab.rigs.rig_file import RigFile
 from tests.command_line import here
 from tests.conftest import ROOT
 from tests.flows.conftest import write
-from tests.flows.detecting.detecting import (
+from tests.flows.detect.detecting import (
     RIG,
     keeping,
     ordered,
@@ -78,7 +77,7 @@ def test_listening_moves_nothing_and_judges_silence(model: Path, tmp_path: Path)
         "name": "silent",
         "mock": {"event_camera": {"noise_hz": 0, "hot_pixels": 0}},
     }
-    order = make_detect_order(write(tmp_path / "r.yaml", silent), model, seconds=1.5)
+    order = make_detect_request(write(tmp_path / "r.yaml", silent), model, seconds=1.5)
     rigs: list[Rig] = []
     result = detect(order, counting=slip_when_busy(), build=keeping(rigs))
     assert result["trial"] is None
@@ -97,7 +96,7 @@ def test_listening_ends_when_somebody_asks(model: Path, monkeypatch: pytest.Monk
         return np.array([[9, 0, 0]])
 
     monkeypatch.setattr("sliplab.flows.running.stopping.requested", lambda: len(asked) > 5)
-    result = detect(make_detect_order(RIG, model, seconds=60), counting=counting)
+    result = detect(make_detect_request(RIG, model, seconds=60), counting=counting)
     assert result["interrupted"] is True
     assert result["windows"] < 10
 
@@ -108,7 +107,7 @@ def test_a_terminal_shows_bars_state_and_what_is_simulated(
     shown = io.StringIO()
     terminal = Console(file=shown, force_terminal=True, width=100, height=30)
     monkeypatch.setattr("sliplab.flows.running.console.messages", terminal)
-    detect(make_detect_order(RIG, model, seconds=0.6), counting=slip_when_busy())
+    detect(make_detect_request(RIG, model, seconds=0.6), counting=slip_when_busy())
     text = shown.getvalue()
     for part in ("simulated listening", "no slip", "9.00", "events/s", "gross"):
         assert part in text
@@ -136,14 +135,14 @@ def test_wrong_input_is_said(
     if "protocol" in options:
         options = {**options, "protocol": protocol}
     with pytest.raises(InputError, match=said):
-        make_detect_order(RIG, model, **options)
+        make_detect_request(RIG, model, **options)
 
 
 def test_a_model_that_is_none_is_said(protocol: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        make_detect_order(RIG, tmp_path / "no.pt", seconds=1.0)
+        make_detect_request(RIG, tmp_path / "no.pt", seconds=1.0)
     with pytest.raises(InputError, match="not a model file"):
-        make_detect_order(RIG, protocol, seconds=1.0)
+        make_detect_request(RIG, protocol, seconds=1.0)
 
 
 def test_a_file_without_a_folder_is_said_before_anything_moves(

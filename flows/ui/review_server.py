@@ -23,9 +23,9 @@ from bokeh.server.server import Server
 from tornado.ioloop import IOLoop
 from tornado.web import HTTPError
 
-from sliplab.flows.reviewing.review_list import TrialList
-from sliplab.flows.reviewing.review_page import Page
 from sliplab.flows.running.same_origin import own_hosts, refusal
+from sliplab.flows.ui.review import TrialList
+from sliplab.flows.ui.review_page import Page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.process import user_name
 from sliplab.storage.trials.store import Store
@@ -68,7 +68,7 @@ def serving(
 
 
 class _OwnPage(AuthProvider):
-    """Bokeh's hook before every page and connection: whoever knows the path is let in.
+    """Checks every page and connection before Bokeh answers; who knows the path may come in.
 
     Attributes:
         port: that the server listens on.
@@ -78,7 +78,7 @@ class _OwnPage(AuthProvider):
 
     @property
     def get_user_async(self) -> Callable[[Any], Awaitable[str]]:
-        """The check of one request; it raises what is answered."""
+        """The check of one request; it raises the HTTP error to answer with."""
         return self._check
 
     async def _check(self, handler: Any) -> str:
@@ -133,10 +133,10 @@ def serve(
     """Serve until the program is interrupted.
 
     Args:
-        ready: told the page's address once it can be opened.
+        ready: called with the page's address and the trials once it can be opened.
 
     Raises:
-        KeyboardInterrupt: the way it ends.
+        KeyboardInterrupt: how it ends.
     """
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)

@@ -13,7 +13,7 @@ from sliplab.analysis.detectors.live import Counting
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import SPIKING, build, weights
 from sliplab.analysis.networks.training import EpochRecord, Fitted
-from sliplab.flows.detecting.detect_order import DetectOrder, make_detect_order
+from sliplab.flows.detect import DetectRequest, make_detect_request
 from sliplab.protocols.settings import Network, Training, Windows
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig
@@ -57,9 +57,9 @@ def short_slide() -> dict[str, Any]:
     return quick()
 
 
-def ordered(model: Path, protocol: Path, **options: Any) -> DetectOrder:
+def ordered(model: Path, protocol: Path, **options: Any) -> DetectRequest:
     """The first trial of a protocol on the simulated rig."""
-    return make_detect_order(RIG, model, protocol=protocol, trial="", **options)
+    return make_detect_request(RIG, model, protocol=protocol, trial="", **options)
 
 
 def keeping(rigs: list[Rig]) -> Callable[[RigFile], Rig]:

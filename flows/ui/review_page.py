@@ -1,23 +1,36 @@
-"""The review page of one browser tab: what it is made of, and what its controls do."""
+"""The review page of one browser tab: what its controls do, and its work in the background."""
 
 from __future__ import annotations
 
 import json
-from concurrent.futures import Executor
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from functools import partial
 from html import escape
+from typing import Any
 
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 
-from sliplab.flows.reviewing import review_words as words
-from sliplab.flows.reviewing.review_aside import Aside
-from sliplab.flows.reviewing.review_decide import LabelChanged, keep
-from sliplab.flows.reviewing.review_frame import FramePlot
-from sliplab.flows.reviewing.review_list import Row, TrialList, as_columns, chosen
-from sliplab.flows.reviewing.review_plots import TimePlots
-from sliplab.flows.reviewing.review_trial import Shown, load
-from sliplab.flows.reviewing.review_widgets import ALL, Widgets
+from sliplab.flows.ui.review import (
+    LabelChanged,
+    Row,
+    ShownTrial,
+    TrialList,
+    as_columns,
+    filtered_rows,
+    load_trial,
+    record_verdict,
+)
+from sliplab.flows.ui.review_plots import FramePlot, TimePlots
+from sliplab.flows.ui.review_widgets import (
+    ALL,
+    Widgets,
+    flags_html,
+    heading_html,
+    history_html,
+    lines_html,
+)
 from sliplab.storage.errors import StoreError
 from sliplab.storage.streams import U8
 from sliplab.storage.trials import review
@@ -38,8 +51,8 @@ class Page:
 
     def __init__(self, doc: Document, trials: TrialList, pool: Executor, who: str) -> None:
         self.trials = trials
-        self.aside = Aside(doc, pool, self._say)
-        self.shown: Shown | None = None
+        self._background = Background(doc, pool, self._say)
+        self.shown: ShownTrial | None = None
         self._rows: list[Row] = []
         self._wanted: tuple[str, str] | None = None
         self._frame: int | None = None
@@ -60,7 +73,7 @@ class Page:
         doc.add_next_tick_callback(lambda: self._step(1))
 
     def _connect(self) -> None:
-        """What each control does."""
+        """Connect each control to what it does."""
         see = self.see
         for item in (see.campaign, see.state, see.text):
             item.on_change("value", lambda attr, old, new: self._fill())
@@ -78,10 +91,10 @@ class Page:
     # the list
 
     def _fill(self) -> None:
-        """Show the rows that the filters let through; the trial that is shown stays."""
+        """List the rows that pass the filters; the trial that is shown stays."""
         campaign = "" if self.see.campaign.value == ALL else self.see.campaign.value
         state = "" if self.see.state.value == ALL else self.see.state.value
-        self._rows = chosen(
+        self._rows = filtered_rows(
             self.trials.rows, campaign=campaign, state=state, text=self.see.text.value,
             doubtful_first=bool(self.see.first.active),
         )  # fmt: skip
@@ -97,7 +110,7 @@ class Page:
         if self.shown is not None:
             place = self._place()
             position = "" if place is None else f"{place + 1} of {len(self._rows)}"
-            self.see.heading.text = words.heading(self.shown, position)
+            self.see.heading.text = heading_html(self.shown, position)
 
     def _place(self) -> int | None:
         names = [item.name for item in self._rows]
@@ -109,14 +122,14 @@ class Page:
         self.see.source.selected.indices = [] if here is None else [here]
 
     def _picked(self, _: str, __: str, new: str) -> None:
-        """A row that was pressed in the browser, by its name: the list may be another by now."""
+        """Choose the row that was pressed in the browser, by name: the list may have changed."""
         campaign, trial, _count = json.loads(new)
         there = {item.name: item for item in self.trials.rows}
         if (campaign, trial) in there:
             self._choose(there[campaign, trial])
 
     def _step(self, by: int) -> None:
-        """The next row, or the one before."""
+        """Choose the next row, or the one before."""
         if not self._rows:
             return
         here = self._place()
@@ -124,10 +137,10 @@ class Page:
         self._choose(self._rows[there])
 
     def _look_again(self) -> None:
-        """Decisions of others and new trials, while nobody asked."""
+        """Look for decisions of others and for new trials."""
         if not self._looking:
             self._looking = True
-            self.aside.do(self.trials.refresh, self._renewed, otherwise=self._looked)
+            self._background.run(self.trials.refresh, self._renewed, otherwise=self._looked)
 
     def _looked(self) -> None:
         self._looking = False
@@ -150,10 +163,10 @@ class Page:
         """Read a trial in the background, then show it."""
         self._wanted = item.name
         self._mark()
-        self.aside.do(lambda: load(self.trials.store, self.trials.items[item.campaign], item),
-                    self._show)  # fmt: skip
+        campaign = self.trials.items[item.campaign]
+        self._background.run(lambda: load_trial(self.trials.store, campaign, item), self._show)
 
-    def _show(self, found: Shown) -> None:
+    def _show(self, found: ShownTrial) -> None:
         if found.row.name != self._wanted:
             self._drop(found)
             return
@@ -168,8 +181,8 @@ class Page:
         if not again:
             self.see.reason.value = ""
         self._head()
-        self.see.flags.text = words.flags(found)
-        self.see.past.text = words.past(decided, found.row.key)
+        self.see.flags.text = flags_html(found)
+        self.see.past.text = history_html(decided, found.row.key)
         self._moved()
         able = found.row.label == "fresh" and not found.row.problem
         for button in self.see.buttons.values():
@@ -185,8 +198,8 @@ class Page:
         except StoreError:
             return []  # the row says so
 
-    def _lines_of(self, shown: Shown, decided: list[review.Decision]) -> Onsets:
-        """Where the lines begin: as adjusted, or as the label has them, or suggests them."""
+    def _lines_of(self, shown: ShownTrial, decided: list[review.Decision]) -> Onsets:
+        """Return where the lines begin: as adjusted, else as the label has or suggests them."""
         if decided and decided[-1].verdict == "adjust" and decided[-1].label == shown.row.key:
             return decided[-1].new
         return shown.suggested
@@ -202,7 +215,7 @@ class Page:
             self._moved()
 
     def _zoom(self) -> None:
-        """Close to the cursor, or back."""
+        """Zoom to the cursor, or back."""
         if self.shown is None:
             return
         self._close_by = not self._close_by and self._frame is not None
@@ -211,7 +224,7 @@ class Page:
 
     def _moved(self) -> None:
         if self.shown is not None:
-            self.see.lines.text = words.lines(self.shown, self.plots.onsets())
+            self.see.lines.text = lines_html(self.shown, self.plots.onsets())
 
     # the frame under the cursor
 
@@ -224,7 +237,7 @@ class Page:
             self._draw()
 
     def _draw(self) -> None:
-        """Read the wanted frame in the background; the newest wish counts."""
+        """Read the wanted frame in the background; the newest request counts."""
         shown, index = self.shown, self._frame
         if shown is None or index is None:
             return
@@ -237,7 +250,7 @@ class Page:
             if (self.shown, self._frame) != (shown, index):
                 self._draw()
 
-        self.aside.do(lambda: shown.picture(index), done, otherwise=lambda: done(None))
+        self._background.run(lambda: shown.picture(index), done, otherwise=lambda: done(None))
 
     # decisions
 
@@ -246,7 +259,7 @@ class Page:
         if shown is None or self.see.buttons["accept"].disabled:
             return
         try:
-            made = keep(
+            made = record_verdict(
                 self.trials, shown, verdict, self.plots.onsets(), self.see.who.value,
                 self.see.reason.value,
             )  # fmt: skip
@@ -265,13 +278,13 @@ class Page:
         self._choose(after or shown.row)
 
     def _after(self) -> Row | None:
-        """The row below the one that is shown; None at the end."""
+        """Return the row below the one that is shown; None at the end."""
         here = self._place()
         following = [] if here is None else self._rows[here + 1 : here + 2]
         return following[0] if following else None
 
     def _key(self, _: str, __: str, new: str) -> None:
-        """A key that the browser handed on."""
+        """Act on a key that was pressed in the browser."""
         name = new.partition(" ")[0]
         if name in self.see.buttons:
             self._decide(name)
@@ -294,12 +307,50 @@ class Page:
         self.see.said.text = f"<p class='{'good' if good else 'bad'}'>{escape(text)}</p>"
 
     def close(self) -> None:
-        """The tab is gone."""
+        """Close what the tab has open; the tab is gone."""
         self._drop(self.shown)
-        self.aside.close()
+        self._background.close()
         self.shown = None
 
-    def _drop(self, shown: Shown | None) -> None:
+    def _drop(self, shown: ShownTrial | None) -> None:
         """Close a trial's video, in the thread that reads it."""
         if shown is not None:
-            self.aside.do(shown.close)
+            self._background.run(shown.close)
+
+
+class Background:
+    """Runs work of one tab in another thread, and brings its result back to the tab.
+
+    Args:
+        pool: does the work; on_error: called in the tab with an error's message.
+    """
+
+    def __init__(self, doc: Document, pool: Executor, on_error: Callable[[str], None]) -> None:
+        self._doc, self._pool, self._on_error = doc, pool, on_error
+        self._closed = False
+
+    def run(
+        self,
+        work: Callable[[], Any],
+        then: Callable[[Any], None] = lambda _: None,
+        otherwise: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Do `work` in the pool, and `then` with its result in the tab, or `otherwise`."""
+
+        def back(done: Future[Any]) -> None:
+            if not self._closed:
+                self._doc.add_next_tick_callback(partial(finish, done))
+
+        def finish(done: Future[Any]) -> None:
+            error = done.exception()
+            if error is None:
+                then(done.result())
+            else:
+                self._on_error(f"{type(error).__name__}: {error}")
+                otherwise()
+
+        self._pool.submit(work).add_done_callback(back)
+
+    def close(self) -> None:
+        """Drop all results from now on: the tab is gone."""
+        self._closed = True

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.flows.conftest import write
-from tests.flows.detecting.detecting import model_in, short_slide
+from tests.flows.detect.detecting import model_in, short_slide
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.detecting.detect import detect
-from sliplab.flows.detecting.detect_order import make_detect_order
+from sliplab.flows.detect import detect, make_detect_request
 from sliplab.rigs.build import loopback_rig
 from sliplab.rigs.core.rig import Rig
 from sliplab.rigs.rig_file import RigFile
 from tests.flows.conftest import write
-from tests.flows.detecting.detecting import model_in, short_slide, slip_when_busy
+from tests.flows.detect.detecting import model_in, short_slide, slip_when_busy
 from tests.flows.live import rig_yaml, stage_of
 
 pytestmark = pytest.mark.realtime
@@ -22,7 +21,7 @@ BEHIND_MS = 500.0
 
 
 def test_slip_through_real_drivers_stops_the_arm(tmp_path: Path) -> None:
-    order = make_detect_order(
+    order = make_detect_request(
         rig_yaml(tmp_path), model_in(tmp_path), protocol=write(tmp_path / "p.yaml", short_slide()),
         trial="", reflex="press:0.3", hold_s=0.3,
     )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.reviewing import view, view_streams
+from sliplab.flows.ui import view
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
@@ -62,8 +62,8 @@ class Read:
         for chunk in chunks.RrdReader(path).stream():
             table = chunk.to_record_batch()
             times = [None] * table.num_rows
-            if view_streams.TIMELINE in table.schema.names:
-                times = table.column(view_streams.TIMELINE).cast("int64").to_pylist()
+            if view.TIMELINE in table.schema.names:
+                times = table.column(view.TIMELINE).cast("int64").to_pylist()
             for name in table.schema.names:
                 if ":" in name:
                     cells = zip(times, table.column(name).to_pylist(), strict=True)
@@ -103,7 +103,7 @@ def test_events_are_all_there(saved: tuple[Read, Any]) -> None:
         starts = np.concatenate([[0], ends[:-1]])
         assert times == known_ns[starts].tolist()
         # a row holds what falls into one bin of 5 ms, and all of it
-        bins = known_ns // view_streams.BIN_NS
+        bins = known_ns // view.BIN_NS
         assert (bins[ends - 1] == bins[starts]).all()
         assert len(set(bins.tolist())) == len(cells)
 
@@ -164,7 +164,7 @@ def test_onsets_of_label_review_and_truth_are_told_apart(saved: tuple[Read, Any]
 def test_too_many_events_become_pictures_that_count_them(
     made: Reviewable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view_streams, "MOST_POINTS", EVENTS - 1)
+    monkeypatch.setattr(view, "MOST_POINTS", EVENTS - 1)
     counts = view.save(view.find(made.store, made.ids[1]), tmp_path / "b.rrd")
     read = Read(tmp_path / "b.rrd")
     times, cells = read["/events/counts", "Image:buffer"]
@@ -176,7 +176,7 @@ def test_too_many_events_become_pictures_that_count_them(
     np.add.at(spread, (known.y // 2, known.x // 2), 1)
     assert np.array_equal(found.sum(axis=0).reshape(240, 320), spread)
     assert times[0] == known.t_us[0] * 1000
-    assert set(np.diff(times)) == {view_streams.BIN_NS}  # type: ignore[arg-type]  # none is None
+    assert set(np.diff(times)) == {view.BIN_NS}  # type: ignore[arg-type]  # none is None
     assert ("/events/on", "Points2D:positions") not in read.columns
 
 

@@ -1,4 +1,8 @@
-"""What of a trial goes to Rerun, under which name; whole columns at a time.
+"""One trial in Rerun: everything that was recorded and derived, on one time line.
+
+Rerun's viewer and its own readers can read the file. Times are the trial's own (the sync box's
+clock), int64 nanoseconds, none of them rounded. Sizes are bounded: a trial of any length becomes a
+file that a laptop opens. Entities, sent as whole columns:
 
 events/on, events/off      points, a row a bin of 5 ms; events/counts in their place where there
                            are too many: pictures of how many events fell on 2 x 2 pixels
@@ -14,11 +18,18 @@ network/no_slip ...        spike counts of the evaluated network
 
 from __future__ import annotations
 
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
@@ -26,7 +37,10 @@ from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.labelling.label import label_key
 from sliplab.flows.labelling.reviewed import state_of
-from sliplab.flows.reviewing.review_trial import event_rate
+from sliplab.flows.running import stopping
+from sliplab.flows.ui.review import event_rate
+from sliplab.protocols.errors import InputError
+from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS, TrialLabel
 from sliplab.storage.streams import I64, EventChunk
 from sliplab.storage.trials import review
@@ -34,11 +48,163 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
+APPLICATION = "sliplab"
+
+
+def find(store: Store, trial: str, campaign: str | None = None) -> Subject:
+    """Find the committed trial of this id.
+
+    Raises:
+        InputError: there is none, or several campaigns have it.
+    """
+    found = [
+        Collected(item)
+        for item in store.campaigns()
+        if campaign in (None, item.name) and trial in item.committed()
+    ]
+    if not found:
+        where = str(store.folder) if campaign is None else f"campaign '{campaign}'"
+        raise InputError(
+            "TRIAL", "", trial,
+            f"is no committed trial of {where}; `sliplab trials {store.folder}` lists them",
+        )  # fmt: skip
+    if len(found) > 1:
+        names = ", ".join(item.name for item in found)
+        raise InputError("TRIAL", "", trial, f"is in {names}; name one with --campaign")
+    return Subject(store, found[0], found[0].campaign.recording(trial))
+
+
+def rerun() -> ModuleType:
+    """Import the Rerun library.
+
+    Raises:
+        ModuleNotFoundError: it is not installed.
+    """
+    import rerun as found
+
+    return found
+
+
+def save(subject: Subject, path: Path) -> dict[str, Any]:
+    """Write a trial as an .rrd file, complete or not at all.
+
+    Returns:
+        numbers of events, frames and so on, and the file's bytes.
+
+    Raises:
+        StoreError: the trial is damaged.
+        ModuleNotFoundError: Rerun is not installed.
+    """
+    library = rerun()
+    library.set_strict_mode(True)  # what cannot be written is an error, not a warning
+
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        stream = library.RecordingStream(
+            APPLICATION, recording_id=f"{subject.item.name}/{subject.trial}"
+        )
+        try:
+            stream.save(unfinished, default_blueprint=blueprint(library))
+            counts = send(library, stream, subject)
+            stream.flush()
+        finally:
+            stream.disconnect()
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return {**counts, "bytes": path.stat().st_size}
+
+
+def show(subject: Subject) -> None:
+    """Open a trial in Rerun's viewer, and wait until somebody closes it.
+
+    Raises:
+        StoreError: there is no display.
+        ModuleNotFoundError: Rerun is not installed.
+    """
+    rerun()
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise StoreError(
+            "there is no display here; --save FILE.rrd writes a file to open elsewhere"
+        )
+    with tempfile.TemporaryDirectory(prefix="sliplab-view-") as folder:
+        path = Path(folder) / f"{subject.item.name}.rrd"
+        save(subject, path)
+        with silent() as environment, viewer(str(path), environment=environment) as window:
+            while window.poll() is None:
+                stopping.wait(0.2)
+        if window.returncode:
+            raise StoreError(f"Rerun's viewer ended with {window.returncode}")
+
+
+ALONE = ("--bind", "127.0.0.1", "--port", "auto")
+"""Options of Rerun's viewer. Its server listens on every network of the computer unless told
+otherwise, and hands the file to whatever listens on its usual port, maybe another user's."""
+
+
+@contextmanager
+def viewer(*arguments: str, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Rerun's program while the block runs; nothing of it is left afterwards.
+
+    It has a session of its own, because it starts another program, which outlives it otherwise.
+    """
+    # what it prints is for people: standard output has nothing but the command's result
+    process = subprocess.Popen(
+        [program(), *ALONE, *arguments], env=environment, stdout=2, start_new_session=True
+    )
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(10)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait(10)
+
+
+def program() -> str:
+    """Find Rerun's own program.
+
+    Raises:
+        StoreError: it cannot be found.
+    """
+    import sys
+
+    sibling = Path(sys.executable).with_name("rerun")
+    found = str(sibling) if sibling.exists() else shutil.which("rerun")
+    if found is None:
+        raise StoreError("Rerun's program `rerun` cannot be found beside its library")
+    return found
+
+
+@contextmanager
+def silent() -> Iterator[dict[str, str]]:
+    """Yield an environment in which Rerun's viewer sends no usage data.
+
+    Its only switch is a file among the user's settings. It is set in a folder of our own, so that
+    the user's choice stays as it is.
+
+    Raises:
+        StoreError: the switch could not be set.
+    """
+    with tempfile.TemporaryDirectory(prefix="sliplab-rerun-") as folder:
+        environment = {**os.environ, "XDG_CONFIG_HOME": folder}
+        done = subprocess.run(
+            [program(), "analytics", "disable"], env=environment, capture_output=True, timeout=60,
+            check=False,
+        )  # fmt: skip
+        if done.returncode:
+            raise StoreError(f"Rerun's analytics cannot be switched off: {done.stderr.decode()}")
+        yield environment
+
+
 TIMELINE = "trial_time"
 BIN_NS = 5_000_000
 MOST_POINTS = 5_000_000
 """More events than this become pictures; as points they would take 40 MB and more."""
-MOST_PICTURES = 1000
+MOST_IMAGES = 1000
 POOL = 2
 MOST_FRAMES = 2000
 """Of more frames than this, every second, third, ... is taken."""
@@ -48,7 +214,7 @@ COUNTS = "counts"
 
 @dataclass(frozen=True)
 class Subject:
-    """A trial that is to be looked at."""
+    """The trial to view."""
 
     store: Store
     item: Collected
@@ -68,7 +234,7 @@ class _Columns:
         self.sent: dict[str, int] = {}
 
     def send(self, path: str, time_ns: I64, columns: Any, count: str = "") -> None:
-        """Rows at times; `count` is the name under which they are counted."""
+        """Send rows at times; `count` is the name under which they are counted."""
         if len(time_ns):
             index = self.rr.TimeColumn(TIMELINE, duration=time_ns.astype("timedelta64[ns]"))
             self._stream.send_columns(path, indexes=[index], columns=columns)
@@ -76,16 +242,16 @@ class _Columns:
             self.sent[count] = self.sent.get(count, 0) + len(time_ns)
 
     def scalars(self, path: str, time_ns: I64, values: Any, count: str = "") -> None:
-        """A curve."""
+        """Send a curve."""
         self.send(path, time_ns, self.rr.Scalars.columns(scalars=np.asarray(values, float)), count)
 
     def once(self, path: str, *what: Any) -> None:
-        """Something that does not change."""
+        """Send something that does not change."""
         self._stream.log(path, *what, static=True)
 
 
 def send(library: ModuleType, stream: Any, subject: Subject) -> dict[str, int]:
-    """Send all of a trial to a recording stream; how many there are of what."""
+    """Send all of a trial to a recording stream; return numbers by kind."""
     recording = subject.recording
     to = _Columns(library, stream)
     derived = Derived.of(subject.store, LABELS, subject.item.name)
@@ -121,14 +287,14 @@ def _events(to: _Columns, subject: Subject) -> None:
         for name, polarity in (("on", 1), ("off", 0)):
             _points(to, f"events/{name}", events, time_ns, events.p == polarity)
     else:
-        _pictures(to, recording.event_px, events, time_ns)
+        _count_images(to, recording.event_px, events, time_ns)
     start, end = recorded_span(recording)
     rate_s, rate = event_rate(recording, start, end)
     to.scalars("events/rate", np.round(rate_s * 1e9).astype(np.int64), rate)
 
 
 def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: Any) -> None:
-    """Events of one polarity, a row a bin, at the time of the bin's first event."""
+    """Send events of one polarity, a row a bin, at the time of the bin's first event."""
     times, x, y = time_ns[which], events.x[which], events.y[which]
     if not len(times):
         return
@@ -140,10 +306,10 @@ def _points(to: _Columns, path: str, events: EventChunk, time_ns: I64, which: An
     to.send(path, times[first], columns)
 
 
-def _pictures(to: _Columns, size: tuple[int, int], events: EventChunk, time_ns: I64) -> None:
-    """Counts of events on pooled pixels, uint16, in so many bins of equal length."""
+def _count_images(to: _Columns, size: tuple[int, int], events: EventChunk, time_ns: I64) -> None:
+    """Send counts of events on pooled pixels, uint16, in bins of equal length."""
     shape = (-(-size[1] // POOL), -(-size[0] // POOL))
-    length = max(BIN_NS, -(-int(time_ns[-1] - time_ns[0] + 1) // MOST_PICTURES))
+    length = max(BIN_NS, -(-int(time_ns[-1] - time_ns[0] + 1) // MOST_IMAGES))
     cell = (events.y // POOL).astype(np.int64) * shape[1] + events.x // POOL
     edges = np.arange(int(time_ns[0]), int(time_ns[-1]) + 1, length)
     cuts = [*np.searchsorted(time_ns, edges), len(time_ns)]
@@ -164,6 +330,8 @@ def _frames(to: _Columns, subject: Subject, arrays: dict[str, Any]) -> None:
     time_ns = recording.frame_times()
     every = -(-len(time_ns) // MOST_FRAMES) or 1
     if recording.has_video:
+        import cv2
+
         for index, image in enumerate(recording.frames(threads=2)):
             if index % every or index >= len(time_ns):
                 continue
@@ -184,7 +352,7 @@ def _frames(to: _Columns, subject: Subject, arrays: dict[str, Any]) -> None:
 
 
 def _markers(to: _Columns, path: str, time_ns: I64, places: Any) -> None:
-    """Places of those that were seen, a row a frame; markers keep their number as class."""
+    """Send positions of markers that were seen, a row a frame; the class is the marker's number."""
     seen = np.isfinite(places).all(axis=2)
     numbers = np.broadcast_to(np.arange(places.shape[1], dtype=np.uint16), seen.shape)[seen]
     columns = [
@@ -257,7 +425,7 @@ def _onsets(to: _Columns, subject: Subject, label: TrialLabel | None, key: str) 
 
 
 def _network(to: _Columns, subject: Subject) -> None:
-    """Spike counts, where the trial was evaluated."""
+    """Send spike counts, if the trial was evaluated."""
     counted = Derived.of(subject.store, COUNTS, subject.item.name)
     if counted.key(subject.trial) is None:
         return
@@ -268,7 +436,7 @@ def _network(to: _Columns, subject: Subject) -> None:
 
 
 def blueprint(library: ModuleType) -> Any:
-    """What stands where in the viewer."""
+    """Arrange the viewer."""
     views = library.blueprint
     curves = [
         views.TimeSeriesView(origin=f"/{path}", name=name)

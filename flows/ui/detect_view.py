@@ -1,4 +1,4 @@
-"""What a person sees of a running detection: a small picture that is drawn anew, or lines."""
+"""Live detection on the terminal: bars that are drawn again and again, or a line a change."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from sliplab.analysis.detectors.live import TimedDecision
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT
-from sliplab.flows.detecting.detect_sink import Timed
 from sliplab.flows.running import console
 
 EVERY_NS = 150_000_000
-"""The picture is drawn no more often: drawing takes milliseconds in which nothing is decided."""
+"""The shortest time between two drawings: drawing takes milliseconds that detection lacks."""
 WIDTH = 30
 LAST = 5
 _STYLES = ("green", "yellow", "red")
@@ -35,7 +35,7 @@ class DetectView:
         self._rate: deque[tuple[float, int]] = deque(maxlen=34)
         self._last: deque[str] = deque(maxlen=LAST)
         self._state = ""
-        self._now: Timed | None = None
+        self._now: TimedDecision | None = None
         self._drawn_ns = 0
         self._live: Live | None = None
         if console.messages.is_terminal:
@@ -58,8 +58,8 @@ class DetectView:
             self._draw()
             self._live.stop()
 
-    def on_decision(self, timed: Timed) -> None:
-        """A decision was made."""
+    def on_decision(self, timed: TimedDecision) -> None:
+        """Take up a decision."""
         made = timed.decision
         self._now = timed
         self._rate.append((made.end_us - made.start_us, made.events))
@@ -71,7 +71,7 @@ class DetectView:
                 console.say(line)
 
     def poll(self) -> None:
-        """Draw, if it is time to."""
+        """Draw again, if `EVERY_NS` have passed."""
         if self._live is None or time.monotonic_ns() - self._drawn_ns < EVERY_NS:
             return
         self._draw()
@@ -100,7 +100,7 @@ class DetectView:
         return Group(Text(self._title), table, state, *(Text(line) for line in self._last))
 
 
-def _line(timed: Timed) -> str:
+def _line(timed: TimedDecision) -> str:
     made = timed.decision
     counts = "/".join(str(count) for count in made.counts)
     late = "" if timed.latency_ms is None else f", {timed.latency_ms:.1f} ms after its last event"

@@ -16,8 +16,7 @@ from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.flows.collecting.session import Session
-from sliplab.flows.detecting.detect import detect
-from sliplab.flows.detecting.detect_order import make_detect_order
+from sliplab.flows.detect import detect, make_detect_request
 from sliplab.flows.planning.run_request import describe_campaign
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Detection
@@ -29,7 +28,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
 from tests.flows.conftest import tiny_gravity, write
-from tests.flows.detecting.detecting import (
+from tests.flows.detect.detecting import (
     RIG,
     keeping,
     model_in,
@@ -59,9 +58,9 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 @pytest.mark.parametrize(("outputs", "margin"), [(1, 2.0), (4, 8.0)])
 def test_the_margin_is_in_spikes_of_the_model(outputs: int, margin: float, tmp_path: Path) -> None:
     model, pilot = model_in(tmp_path, outputs), ROOT / "protocols" / "pilot.yaml"
-    listening = make_detect_order(RIG, model, seconds=1.0)
+    listening = make_detect_request(RIG, model, seconds=1.0)
     trial = "depth=2.4mm,speed=1.6mmps,direction=0deg"
-    moving = make_detect_order(RIG, model, protocol=pilot, trial=trial)
+    moving = make_detect_request(RIG, model, protocol=pilot, trial=trial)
     assert listening.detection.margin == moving.detection.margin == margin
 
 
@@ -216,7 +215,7 @@ def test_a_reflex_in_a_retraction_keeps_the_plate(
 ) -> None:
     data = tiny_gravity()
     data["collection"]["motion"][5] |= {"settle": "0.3 s", "duration": "0.3 s"}
-    order = make_detect_order(
+    order = make_detect_request(
         RIG, model, protocol=write(tmp_path / "g.yaml", data), trial="mass=0.165kg", reflex="stop",
         hold_s=0.2,
     )  # fmt: skip

@@ -1,1 +1,0 @@
-"""A trained network live on a rig's event stream."""
