@@ -133,7 +133,7 @@ _BETWEEN = 1.0 - 1e-9
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slides_on(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no-untyped-def]
+def keeps_sliding(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no-untyped-def]
     """Tell that the force f + s d of a sliding tip never enters its cone before it ends outside.
 
     A tip slides as long as its speed is above zero. Where friction rises with speed, its force then
@@ -148,7 +148,7 @@ def slides_on(fx, fy, dx, dy, start, end, strengthening):  # type: ignore[no-unt
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def raised(fx, fy, before, after):  # type: ignore[no-untyped-def]
+def raised_cone(fx, fy, before, after):  # type: ignore[no-untyped-def]
     """Radii of a cone at both ends of a step, made as large as the force is that lies on it.
 
     The speed of sliding raises friction, and goes on as it does.
@@ -158,7 +158,7 @@ def raised(fx, fy, before, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
+def leaves_cone_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
     """Share of a step at which the force f + s d last leaves a cone from `start` to `end`."""
     a = dx * dx + dy * dy - (end - start) ** 2
     half_b = fx * dx + fy * dy - start * (end - start)
@@ -174,8 +174,8 @@ def leaves_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def dragged(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
-    """How a sliding tip's force is dragged by the drive d, for `turned`.
+def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
+    """How a sliding tip's force is dragged by the drive d, for `tractrix_end`.
 
     `before`, `after`: the cone's radius at both ends.
 
@@ -204,7 +204,7 @@ def dragged(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def turned(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
+def tractrix_end(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
     """Direction of a sliding tip's force after the drive: the tractrix. A unit vector."""
     # straight against the drive it stays so
     high *= decayed(max(way, 0.0)) if low != 0.0 else 1.0
@@ -216,13 +216,13 @@ def turned(ux, uy, high, low, way):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def chord(fx, fy, to_x, to_y, ux, uy, after):  # type: ignore[no-untyped-def]
+def slip_direction(fx, fy, to_x, to_y, ux, uy, after):  # type: ignore[no-untyped-def]
     """Direction of a step's slip: a unit vector.
 
     Args:
         fx, fy: force when the slip begins, N.
         to_x, to_y: force at the end if the tip did not slip, N.
-        ux, uy: direction of the force at the end, from `turned`.
+        ux, uy: direction of the force at the end, from `tractrix_end`.
         after: its size there, the cone's radius, N.
     """
     size = np.sqrt(fx * fx + fy * fy)

@@ -16,29 +16,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sliplab.rigs.scene.contact import move_tips, record, respond
-from sliplab.rigs.scene.slip import relaxing
-from sliplab.rigs.scene.springs import (
-    ACROSS,
-    BASE_X,
-    BASE_Y,
-    END_FORCE_Y,
-    FORCE_Y,
-    GAP,
-    INDENTATION,
-    KICK,
+from sliplab.rigs.scene.contact import (
     LANES,
-    LAYOUT_X,
-    LAYOUT_Y,
-    MODE,
-    SHARE,
-    STUCK,
-    TABLE,
-    Law,
-    block_of,
-    gather,
-    spread,
+    Step,
+    make_blocks,
+    move_tips,
+    record,
+    respond,
+    store_state,
 )
+from sliplab.rigs.scene.slip import relaxing
+from sliplab.rigs.scene.springs import ACROSS, STUCK, Law
 
 _ITERATIONS = 200
 _NEVER = 1e9
@@ -46,28 +34,28 @@ _NEVER = 1e9
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pull(lanes, n, field, law, sensor, plate_y, swerve, h, decay, gain, new):  # type: ignore[no-untyped-def]
+def _pull(blocks, n, field, law, sensor, plate_y, step, new):  # type: ignore[no-untyped-def]
     """Upward force of all tips on the plate if it came to `plate_y` mm in this step, N.
 
     It is what must stand for the end of the step, so that its mean with the beginning (`new`) is
     that over the step: the force of a tip that lets go falls in no time.
     """
     total = 0.0
-    for k in range(lanes.shape[0]):
+    for k in range(blocks.shape[0]):
         first = k * LANES
         count = min(n - first, LANES)
-        respond(lanes[k], field, law, first, count, sensor, plate_y, swerve, h, decay, gain)
-        w = block_of(lanes[k])
+        respond(blocks[k], field, law, first, count, sensor, plate_y, step)
+        w = blocks[k]
         for j in range(count):
-            total += w[END_FORCE_Y, j]
-            if new < 1.0 and w[SHARE, j] >= 0.0:
-                total += w[KICK, j]
+            total += w.end_force_y[j]
+            if new < 1.0 and w.share[j] >= 0.0:
+                total += w.kick[j]
     return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(  # type: ignore[no-untyped-def]
-    lanes, n, field, law, sensor, motion, h, decay, gain, mass, weight, stiction, new, pulls
+    blocks, n, field, law, sensor, motion, step, mass, weight, stiction, new, pulls
 ):
     """The plate's speed at the end of the step, mm/s upwards; mass in kg, forces in N.
 
@@ -76,12 +64,12 @@ def _solve(  # type: ignore[no-untyped-def]
         new: share of the end's speed and force in their means.
         pulls: upward force of the tips when the step begins.
     """
+    h, decay, gain, _ = step
     inertia = mass * 1e-3 / h  # N per mm/s
     plate_y, speed = motion[0] + (1.0 - new) * motion[1] * h, motion[1]
     weight -= (1.0 - new) * pulls
-    rest = _pull(
-        lanes, n, field, law, sensor, plate_y, (1.0 - new) * speed, h, decay, gain, new
-    )  # fmt: skip
+    at_rest = Step(h, decay, gain, (1.0 - new) * speed)
+    rest = _pull(blocks, n, field, law, sensor, plate_y, at_rest, new)
     push = new * rest - weight + inertia * speed
     if abs(push) <= stiction:
         return 0.0
@@ -93,10 +81,8 @@ def _solve(  # type: ignore[no-untyped-def]
     v = speed if min(zero, far) < speed < max(zero, far) else far
     for _ in range(_ITERATIONS):
         f = inertia * (v - speed) + weight + drag
-        f -= new * _pull(
-            lanes, n, field, law, sensor, plate_y + new * v * h, (1.0 - new) * (speed - v), h,
-            decay, gain, new,
-        )  # fmt: skip
+        moving = Step(h, decay, gain, (1.0 - new) * (speed - v))
+        f -= new * _pull(blocks, n, field, law, sensor, plate_y + new * v * h, moving, new)
         if f == 0.0:
             return v
         if (f > 0.0) == (f_zero > 0.0):
@@ -136,7 +122,7 @@ def advance_free(  # type: ignore[no-untyped-def]
     Returns:
         steps taken, and whether the plate came to rest on its stop in the last of them.
     """
-    n, lanes = state.shape[0], spread(table, field, state)
+    n, blocks = state.shape[0], make_blocks(table, field, state)
     holding = Law(
         _NEVER, law.strengthening, law.weak_mm_s, law.maxwell, law.relaxation_s, law.damping_s,
         law.exact_turns,
@@ -155,24 +141,24 @@ def advance_free(  # type: ignore[no-untyped-def]
             mean_weight = new * weight[k + 1] + (1.0 - new) * begin_weight
             pulls = 0.0
             for i in range(n):
-                pulls += block_of(lanes[i // LANES])[FORCE_Y, i % LANES]
-            before = motion[1]
+                pulls += blocks[i // LANES].force_y[i % LANES]
+            before, step = motion[1], Step(h, decay, gain, 0.0)
             speed = _solve(
-                lanes, n, field, law, sensor[k], motion, h, decay, gain, mass, mean_weight,
-                stiction, new, pulls,
+                blocks, n, field, law, sensor[k], motion, step, mass, mean_weight, stiction,
+                new, pulls,
             )  # fmt: skip
-            if new == 1.0 or law.static_excess == 0.0 or _lets_go_first(lanes, n) > 1.0:
+            if new == 1.0 or law.static_excess == 0.0 or _lets_go_first(blocks, n) > 1.0:
                 break
             # a tip that lets go makes the plate faster, which may not have made it let go
             held = _solve(
-                lanes, n, field, holding, sensor[k], motion, h, decay, gain, mass, mean_weight,
-                stiction, new, pulls,
+                blocks, n, field, holding, sensor[k], motion, step, mass, mean_weight, stiction,
+                new, pulls,
             )  # fmt: skip
             _pull(
-                lanes, n, field, law, sensor[k], motion[0] + 0.5 * (before + held) * h,
-                0.5 * (before - held), h, decay, gain, new,
+                blocks, n, field, law, sensor[k], motion[0] + 0.5 * (before + held) * h,
+                Step(h, decay, gain, 0.5 * (before - held)), new,
             )  # fmt: skip
-            share = _lets_go_first(lanes, n)
+            share = _lets_go_first(blocks, n)
             if share > 1.0:
                 speed = held
                 break
@@ -182,12 +168,12 @@ def advance_free(  # type: ignore[no-untyped-def]
             if ns < 1 or ns == step_ns or height <= stop:
                 break
             # the step ends where the first tip lets go, and what is left of it is another
-            at = _between(lanes[0], motion[0], sensor[k], share)
+            at = _between(blocks[0], motion[0], sensor[k], share)
             part = ns * 1e-9
             decay, gain = relaxing(part, law.relaxation_s)
             move_tips(
-                lanes, n, field, holding, at, height, 0.5 * share * (before - held),
-                begin_ns * 1e-9, part, decay, gain,
+                blocks, n, field, holding, at, height, begin_ns * 1e-9,
+                Step(part, decay, gain, 0.5 * share * (before - held)),
             )  # fmt: skip
             motion[0], motion[1] = height, before + share * (held - before)
             begin_weight += share * (weight[k + 1] - begin_weight)
@@ -199,45 +185,46 @@ def advance_free(  # type: ignore[no-untyped-def]
             share = _lands_at(motion[0] - stop, mean * h, (mean - speed) * h)
             ns = min(max(np.int64(np.ceil(share * step_ns)), np.int64(1)), step_ns)
             share = ns / step_ns
-            at = _between(lanes[0], motion[0], sensor[k], share)
+            at = _between(blocks[0], motion[0], sensor[k], share)
             t_ns[k + 1] = begin_ns + ns
             h = ns * 1e-9
             decay, gain = relaxing(h, law.relaxation_s)
             height, swerve, motion[1] = stop, (mean - speed) * share, 0.0
         else:
             at, swerve, motion[1] = sensor[k], mean - speed, speed
-        move_tips(lanes, n, field, law, at, height, swerve, begin_ns * 1e-9, h, decay, gain)
+        step = Step(h, decay, gain, swerve)
+        move_tips(blocks, n, field, law, at, height, begin_ns * 1e-9, step)
         motion[0] = height
-        record(lanes, n, height, track[k], load[k])
+        record(blocks, n, height, track[k], load[k])
         if landed:
-            gather(lanes, state)
+            store_state(blocks, state)
             return k + 1, True
-    gather(lanes, state)
+    store_state(blocks, state)
     return sensor.shape[0], False
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lets_go_first(lanes, n):  # type: ignore[no-untyped-def]
+def _lets_go_first(blocks, n):  # type: ignore[no-untyped-def]
     """Share of a step at which the first of the tips that stuck lets go; above 1: none does."""
     first = 2.0
     for i in range(n):
-        w, j = block_of(lanes[i // LANES]), i % LANES
-        if w[MODE, j] == STUCK and w[SHARE, j] >= 0.0:
-            first = min(first, w[SHARE, j])
+        w, j = blocks[i // LANES], i % LANES
+        if w.mode[j] == STUCK and w.share[j] >= 0.0:
+            first = min(first, w.share[j])
     return first
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _between(flat, plate_y, sensor, share):  # type: ignore[no-untyped-def]
+def _between(w, plate_y, sensor, share):  # type: ignore[no-untyped-def]
     """The sensor's pose at a share of a step, from where the first tip's base was; (5,)."""
-    w, at = block_of(flat), sensor.copy()
-    x, y = w[TABLE + LAYOUT_X, 0], w[TABLE + LAYOUT_Y, 0]
+    at = sensor.copy()
+    x, y = w.layout_x[0], w.layout_y[0]
     left = 1.0 - share
-    at[0] -= left * (sensor[0] - (w[BASE_X, 0] - x))
-    at[1] -= left * (sensor[1] - (w[BASE_Y, 0] - y + plate_y))
-    deep = sensor[2] + sensor[3] * x + sensor[4] * y - w[TABLE + GAP, 0]
+    at[0] -= left * (sensor[0] - (w.base_x[0] - x))
+    at[1] -= left * (sensor[1] - (w.base_y[0] - y + plate_y))
+    deep = sensor[2] + sensor[3] * x + sensor[4] * y - w.gap[0]
     # a tip that was never moved does not know how deep it was
-    at[2] -= left * (deep - w[INDENTATION, 0]) if w[INDENTATION, 0] == w[INDENTATION, 0] else 0.0
+    at[2] -= left * (deep - w.indentation[0]) if w.indentation[0] == w.indentation[0] else 0.0
     return at
 
 

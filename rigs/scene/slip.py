@@ -5,7 +5,7 @@ the stretch that is left, and that the force lies on the friction cone at the en
 Newton step for both, shared by the tip that is computed alone (`rigs.scene.contact`) and by those
 computed side by side (`rigs.scene.contact`), so that both give the same bits. No branches,
 for the latter. Where it does not get there, because friction has a kink at rest or falls more
-steeply than the spring pulls, `slid_surely` does, slowly.
+steeply than the spring pulls, `march_to_slip` does, slowly.
 
 All vectors are split along the slip and across it; across it the tip does not move.
 """
@@ -49,7 +49,7 @@ def along_slip(  # type: ignore[no-untyped-def]
     new_x, new_y, old_x, old_y, branch_x, branch_y, soft, damp, per_s, swerve, unit_x, unit_y,
     quick, lag,
 ):  # fmt: skip
-    """Arguments of `pulled` for a tip whose slip has the direction `unit`.
+    """Arguments of `force_after` for a tip whose slip has the direction `unit`.
 
     Args:
         new_x, new_y, old_x, old_y: stretch at both ends of the step if the tip did not slip, mm.
@@ -59,7 +59,7 @@ def along_slip(  # type: ignore[no-untyped-def]
         swerve: the base's speed along y at the end of the step over its mean one, mm/s.
 
     Returns:
-        `ahead` to `soft_y` of `pulled`.
+        `ahead` to `soft_y` of `force_after`.
     """
     rate_x, rate_y = (new_x - old_x) * per_s, (new_y - old_y) * per_s + swerve
     x, y = branch_x - soft * old_x + damp * rate_x, branch_y - soft * old_y + damp * rate_y
@@ -72,7 +72,7 @@ def along_slip(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def begun(  # type: ignore[no-untyped-def]
+def first_slip(  # type: ignore[no-untyped-def]
     moved_x, moved_y, unit_x, unit_y, slides, bent, bending, shortening, compliance, pressed,
     pressing, rough,
 ):  # fmt: skip
@@ -103,7 +103,7 @@ def onto_cone(force_x, force_y, unit_x, unit_y, limit):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def pulled(  # type: ignore[no-untyped-def]
+def force_after(  # type: ignore[no-untyped-def]
     slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening
 ):
     """Force of a tip that slipped and is bent, and its normal force, N.
@@ -125,14 +125,14 @@ def pulled(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def slide_step(  # type: ignore[no-untyped-def]
+def slip_step(  # type: ignore[no-untyped-def]
     slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
     shortening, compliance, grip, grip_slope, quick, weak,
 ):  # fmt: skip
     """One Newton step towards the slip that leaves the force on the friction cone.
 
     Args:
-        slip to shortening: as in `pulled`.
+        slip to shortening: as in `force_after`.
         compliance: of what is in series with the bend, mm/N.
         grip, grip_slope: friction at the end of the slip, and its slope over it, 1/mm.
         quick, weak: slope of the speed over the slip, 1/s, and the speed at which friction begins
@@ -173,7 +173,7 @@ def slide_step(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def slid_surely(  # type: ignore[no-untyped-def]
+def march_to_slip(  # type: ignore[no-untyped-def]
     guess, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending, shortening,
     compliance, field, i, path, quick, lag, law,
 ):  # fmt: skip
@@ -194,7 +194,7 @@ def slid_surely(  # type: ignore[no-untyped-def]
         left = ahead - slip
         stretch = np.sqrt(left * left + aside * aside)
         bent = bend_for(stretch, bent, bending, shortening, compliance, pressed, pressing)
-        force_x, force_y, normal = pulled(
+        force_x, force_y, normal = force_after(
             slip, bent, ahead, aside, rest_x, rest_y, soft_x, soft_y, pressed, pressing, bending,
             shortening,
         )  # fmt: skip
@@ -253,7 +253,7 @@ def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # 
     Args:
         force, rise: size of the force, and by how much it rises if the tip does not slip, N.
         before, after: the cone's radii at both ends if it does not, N.
-        cone, steepness: the cone's radius and steepness (see `slide_step`) on the way.
+        cone, steepness: the cone's radius and steepness (see `slip_step`) on the way.
 
     Returns:
         the speed; negative: friction falls with the slip faster than the spring pulls.
@@ -270,7 +270,7 @@ def relaxed_speed(force, rise, before, after, cone, steepness, slid_s, law):  # 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def given_way(force, cone, damp, law):  # type: ignore[no-untyped-def]
+def force_kept(force, cone, damp, law):  # type: ignore[no-untyped-def]
     """Share of its force that a tip keeps in the moment in which it lets go.
 
     It slides at once at the speed w at which the damper and friction together hold the force:
@@ -295,7 +295,7 @@ def given_way(force, cone, damp, law):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def foreseen(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
+def predicted_speed(slid_s, per_s, earlier_s, speed, earlier):  # type: ignore[no-untyped-def]
     """Speed at the end of a step from the slip in it and the mean speeds of the steps before.
 
     A line through two of them, a parabola through three if all took as long. `per_s` is

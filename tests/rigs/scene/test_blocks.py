@@ -1,4 +1,7 @@
-"""Tips that are computed side by side against the same tips one at a time."""
+"""Tips that share a block against the same tips with a block each: lanes do not touch.
+
+The law itself is held by `reference`, which shares nothing with the solver.
+"""
 
 import itertools
 
@@ -8,29 +11,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from sliplab.rigs.scene.contact import respond, settle, tip_step
+from sliplab.rigs.scene.contact import (
+    BLOCK,
+    LANES,
+    Step,
+    make_blocks,
+    move_tips,
+    store_state,
+)
 from sliplab.rigs.scene.friction import friction_knots
 from sliplab.rigs.scene.skin import SkinGeometry, make_skin
 from sliplab.rigs.scene.slip import relaxing
 from sliplab.rigs.scene.springs import (
-    DEEP,
+    EARLIER,
     FREE,
-    GAP,
-    LANES,
-    LAYOUT_X,
-    LAYOUT_Y,
-    ROWS,
+    PLACE_X,
+    SHORTER,
     SLIDING,
     STUCK,
-    TABLE,
-    TO_X,
-    TO_Y,
     Springs,
-    block_of,
-    gather,
     make_springs,
     new_tips,
-    spread,
 )
 from tests.rigs.scene.steps import MU, ideal_skin, line, run, springs_of
 
@@ -43,59 +44,39 @@ SWITCHES = {
 
 
 @njit
-def steps_one_by_one(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
-    """The state after each row, (m, n, 18), if every tip takes every step alone."""
-    n, lanes = state.shape[0], spread(table, field, state)
+def states(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
+    """The state after each row, (m, n, 18)."""
+    n, blocks = state.shape[0], make_blocks(table, field, state)
     decay, gain = relaxing(h, law.relaxation_s)
-    states = np.empty((sensor.shape[0], *state.shape))
+    found = np.empty((sensor.shape[0], *state.shape))
     for k in range(sensor.shape[0]):
-        at = sensor[k]
-        for b in range(lanes.shape[0]):
-            # places and depths of all lanes, idle ones included
-            respond(
-                lanes[b], field, law, b * LANES, 0, at, plate_y[k], 0.0, h, decay, gain
-            )  # fmt: skip
-            w = block_of(lanes[b])
-            for j in range(min(n - b * LANES, LANES)):
-                lx, ly = w[TABLE + LAYOUT_X, j], w[TABLE + LAYOUT_Y, j]
-                w[TO_X, j], w[TO_Y, j] = at[0] + lx, at[1] + ly - plate_y[k]
-                w[DEEP, j] = at[2] + at[3] * lx + at[4] * ly - w[TABLE + GAP, j]
-                tip_step(w, field, law, b * LANES + j, j, h, 0.0, decay, gain)
-            settle(lanes[b], law, k * h, h, decay)
-        gather(lanes, state)
-        states[k] = state
-    return states
-
-
-@njit
-def steps_side_by_side(table, field, law, state, sensor, plate_y, h):  # type: ignore[no-untyped-def]
-    """The same in lanes."""
-    n, lanes = state.shape[0], spread(table, field, state)
-    decay, gain = relaxing(h, law.relaxation_s)
-    states = np.empty((sensor.shape[0], *state.shape))
-    for k in range(sensor.shape[0]):
-        for b in range(lanes.shape[0]):
-            respond(
-                lanes[b], field, law, b * LANES, min(n - b * LANES, LANES), sensor[k],
-                plate_y[k], 0.0, h, decay, gain,
-            )  # fmt: skip
-            settle(lanes[b], law, k * h, h, decay)
-        gather(lanes, state)
-        states[k] = state
-    return states
+        move_tips(
+            blocks, n, field, law, sensor[k], plate_y[k], k * h, Step(h, decay, gain, 0.0)
+        )  # fmt: skip
+        store_state(blocks, state)
+        found[k] = state
+    return found
 
 
 def both(
     springs: Springs, sensor: np.ndarray, plate_y: np.ndarray, h: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """States of tips that have a block each, and of tips that share blocks in another order."""
     full = np.zeros((len(sensor), 5))
     full[:, : sensor.shape[1]] = sensor
-    arguments = springs.table, springs.friction, springs.law
     n = len(springs.table)
-    return (
-        steps_one_by_one(*arguments, new_tips(n).state, full, plate_y, h),
-        steps_side_by_side(*arguments, new_tips(n).state, full, plate_y, h),
-    )
+
+    def solve(which: np.ndarray) -> np.ndarray:
+        table, field = springs.table[which].copy(), springs.friction[which].copy()
+        state = new_tips(len(which)).state
+        result: np.ndarray = states(table, field, springs.law, state, full, plate_y, h)
+        return result
+
+    alone = [solve(np.array([i])) for i in range(n)]
+    shuffled = np.random.default_rng(n).permutation(n)
+    together = np.empty((len(sensor), n, 18))
+    together[:, shuffled] = solve(shuffled)
+    return np.concatenate(alone, axis=1), together
 
 
 @settings(max_examples=120, deadline=None)
@@ -116,7 +97,7 @@ def both(
     steps=st.sampled_from([1, 7, 60, 400]),
     h=st.sampled_from([1e-4, 2e-3, 0.1]),
 )  # fmt: skip
-def test_side_by_side_gives_the_bits_of_one_by_one(
+def test_tips_that_share_a_block_are_as_alone(
     seed: int,
     level: int,
     off: str | None,
@@ -168,12 +149,17 @@ def test_any_number_of_tips_is_as_good(counts: tuple[int, ...]) -> None:
     assert np.array_equal(np.delete(tips.state, 13, 1), np.delete(together[-1], 13, 1))
 
 
-def test_the_block_is_what_the_kernels_take_it_for() -> None:
+def test_rows_of_a_block_are_the_columns_of_state_and_table() -> None:
     springs = springs_of(ideal_skin())
     tips = new_tips(19)
     tips.state[:, :] = np.arange(19 * 18).reshape(19, 18)
-    lanes = spread(springs.table, springs.friction, tips.state)
-    assert lanes.shape == (1, ROWS * LANES)
+    blocks = make_blocks(springs.table, springs.friction, tips.state)
+    assert blocks.shape == (1,)
+    assert blocks.itemsize == 8 * LANES * len(BLOCK.names)
+    assert np.array_equal(blocks["place_x"][0, :19], tips.state[:, PLACE_X])
+    assert np.array_equal(blocks["earlier"][0, :19], tips.state[:, EARLIER])
+    assert np.array_equal(blocks["layout_x"][0, :19], springs.layout[:, 0])
+    assert np.array_equal(blocks["shorter"][0, :19], springs.table[:, SHORTER])
     again = new_tips(19)
-    gather(lanes, again.state)
+    store_state(blocks, again.state)
     assert np.array_equal(again.state, tips.state)
