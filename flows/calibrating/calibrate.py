@@ -1,6 +1,7 @@
-"""`sliplab calibrate`: scale and lens of the outside camera, and where the event camera sees skin.
+"""`sliplab calibrate`: lens and scale of the outside camera, the event camera's crop, the board.
 
-Each step gives a `Finding`, or raises and nothing is written; see `flows.calibrating.teach`.
+Each measurement returns a `Finding`, or raises and nothing is written. The ChArUco board is printed
+as a PDF of lines at true size, or as a PNG that states its resolution.
 """
 
 from __future__ import annotations
@@ -8,17 +9,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, px
+from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, px
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.core.rig import StopRequested
 from sliplab.rigs.core.teaching import look, stir
+
+if TYPE_CHECKING:
+    from sliplab.analysis.calibration.charuco import Board
 
 MOST_LENS_PX = 0.5
 MOST_CROP_PX = 5.0
@@ -26,7 +30,7 @@ STIR_MM_S = 1.0
 
 
 def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.uint8]]:
-    """Pictures of a board that a person holds before the outside camera.
+    """Take pictures of a board that a person holds before the outside camera.
 
     Raises:
         StopRequested: the person said stop.
@@ -51,10 +55,10 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
 
 
 def read_pictures(folder: Path) -> list[npt.NDArray[np.uint8]]:
-    """Grey pictures of a folder in the order of their names.
+    """Read the grey pictures of a folder in the order of their names.
 
     Raises:
-        InputError: none there, or one that cannot be read.
+        InputError: the folder has none, or one cannot be read.
     """
     import cv2
 
@@ -71,10 +75,10 @@ def read_pictures(folder: Path) -> list[npt.NDArray[np.uint8]]:
 
 
 def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today: date) -> Finding:
-    """Lens, and scale on the plane of the first picture's board.
+    """Fit the lens, and the scale on the plane of the first picture's board.
 
     Raises:
-        RigError: pictures from which they cannot be found, or a residual above 0.5 px.
+        RigError: the fit is impossible, or its residual is above 0.5 px.
     """
     from sliplab.analysis.calibration.charuco import BoardError, find_corners, fit_lens
 
@@ -134,10 +138,10 @@ def calibrate_lens(pictures: Sequence[npt.NDArray[np.uint8]], board: Any, today:
 
 
 def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: float) -> Finding:
-    """Where the skin is in the event camera's picture.
+    """Find the skin in the event camera's image.
 
     Raises:
-        RigError: no skin found, or its two halves differ by more than 5 px.
+        RigError: no skin was found, or two rounds differ by more than 5 px.
     """
     from sliplab.analysis.calibration.crop import CropError, find_crop
 
@@ -171,3 +175,96 @@ def calibrate_crop(session: CalibrationSession, depth_mm: float, radius_mm: floa
         "residual_px": crop.residual_px,
     }
     return Finding({"calibration.event_crop": entry}, figures)
+
+
+PNG_PX_PER_MM = 50
+_MM_PER_INCH = 25.4
+_RULER_MM = 50.0
+_MARGIN_MM = 12.0
+
+
+def print_board(board: Board, path: Path) -> dict[str, float]:
+    """Write the board with a ruler beside it; return sizes in mm.
+
+    Raises:
+        InputError: the file's name ends in neither .pdf nor .png, or its folder is missing.
+    """
+    if path.suffix not in {".pdf", ".png"}:
+        raise InputError("--out", "", str(path), "must end in .pdf or .png")
+    if not path.parent.is_dir():
+        raise InputError("--out", "", str(path), "its folder does not exist")
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib.figure import Figure
+
+    width, height = board.size_mm
+    page = max(width, _RULER_MM + 40) + 2 * _MARGIN_MM, height + 4 * _MARGIN_MM
+    figure = Figure(figsize=(page[0] / _MM_PER_INCH, page[1] / _MM_PER_INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_xlim(0, page[0])
+    axes.set_ylim(0, page[1])
+    axes.axis("off")
+    _squares(board, axes, ((page[0] - width) / 2, 2.8 * _MARGIN_MM))
+    left = (page[0] - width) / 2
+    y = 2.0 * _MARGIN_MM
+    axes.plot([left, left + _RULER_MM], [y, y], color="black", linewidth=0.5)
+    for end in (left, left + _RULER_MM):
+        axes.plot([end, end], [y - 1.5, y + 1.5], color="black", linewidth=0.5)
+    text = (
+        f"between the ticks: {_RULER_MM:g} mm. Print at 100 %, measure it; squares that are not "
+        f"{board.square_mm:g} mm\nare given with --square. ChArUco {board.columns} x {board.rows}, "
+        f"squares {board.square_mm:g} mm, markers {board.marker_mm:g} mm\n(DICT_5X5_100), "
+        f"together {width:g} x {height:g} mm"
+    )
+    axes.text(left, y - 4, text, fontsize=6, va="top")
+    dpi = PNG_PX_PER_MM * _MM_PER_INCH
+    if path.suffix == ".pdf":
+        figure.savefig(path, format="pdf", metadata={"CreationDate": None})
+    else:
+        figure.savefig(path, format="png", dpi=dpi)
+    return {
+        "width_mm": width,
+        "height_mm": height,
+        "square_mm": board.square_mm,
+        "marker_mm": board.marker_mm,
+        "page_width_mm": page[0],
+        "page_height_mm": page[1],
+    }
+
+
+def _squares(board: Board, axes: object, corner: tuple[float, float]) -> None:
+    """Draw the board as black rectangles, row by row of the markers' modules."""
+    from matplotlib.collections import PolyCollection
+
+    module = board.marker_mm / 7  # five bits and a border of one on either side
+    dictionary = board.opencv().getDictionary()
+    quads, number = [], 0
+
+    def quad(x: float, y: float, side_x: float, side_y: float) -> None:
+        # y counts down the page from the board's top
+        top = corner[1] + board.size_mm[1] - y
+        quads.append(
+            [(corner[0] + x + a, top - b) for a, b in (
+                (0, 0), (side_x, 0), (side_x, side_y), (0, side_y)
+            )]
+        )  # fmt: skip
+
+    for row in range(board.rows):
+        for column in range(board.columns):
+            x, y = column * board.square_mm, row * board.square_mm
+            if (row + column) % 2 == 0:
+                quad(x, y, board.square_mm, board.square_mm)
+                continue
+            inset = (board.square_mm - board.marker_mm) / 2
+            bits = dictionary.generateImageMarker(number, 7, borderBits=1)
+            number += 1
+            for line, black in enumerate(np.asarray(bits) < 128):
+                edges = np.flatnonzero(np.diff(np.concatenate([[0], black, [0]]).astype(int)))
+                for begin, end in edges.reshape(-1, 2).tolist():
+                    quad(
+                        x + inset + begin * module, y + inset + line * module,
+                        (end - begin) * module, module,
+                    )  # fmt: skip
+    shapes = PolyCollection(quads, facecolors="black", edgecolors="none", antialiased=False)
+    axes.add_collection(shapes)  # type: ignore[attr-defined]

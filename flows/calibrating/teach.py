@@ -1,7 +1,7 @@
-"""`sliplab teach`: where the plate, the depth zero and the tip are.
+"""`sliplab teach`: contact plane, depth zero and tool centre point.
 
-Each step gives a `Finding`, or raises and nothing is written. A finding that is too poor to be
-relied on is a failure like any other.
+Each measurement returns a `Finding`, or raises and nothing is written. A residual that is too large
+is a failure like any other.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Planned, mm
+from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, PlannedMove, mm
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.program import Position
@@ -28,30 +28,30 @@ MOST_PLANE_MM = 0.1
 MOST_DIFFERENCE_MM = 0.15
 MOST_TOOL_MM = 0.3
 REGION_MM = 36.0
-"""Side of what the outside camera looks at while touching."""
+"""Side of the outside camera's region while touching, mm."""
 
 
 def plane_places(span_mm: float) -> dict[str, tuple[float, float]]:
-    """Where the plane is touched: three points, and one that checks them; plate coordinates."""
-    aside = -span_mm / 2**0.5
+    """Return where the plane is touched, in plate coordinates: three points, and one to check."""
+    diagonal = -span_mm / 2**0.5
     return {
         "centre": (0.0, 0.0), "right": (span_mm, 0.0), "above": (0.0, span_mm),
-        "check": (aside, aside),
+        "check": (diagonal, diagonal),
     }  # fmt: skip
 
 
 def planned_touches(
     places: Sequence[tuple[str, tuple[float, float]]], creep: Creep
-) -> list[Planned]:
-    """The touches that a command will make."""
+) -> list[PlannedMove]:
+    """Return the touches that a command will make."""
     return [
-        Planned(f"touch {name}", *xy, -creep.clearance_mm, creep.search_mm, creep.speed_mm_s)
+        PlannedMove(f"touch {name}", *xy, -creep.clearance_mm, creep.search_mm, creep.speed_mm_s)
         for name, xy in places
     ]
 
 
-def planned_zero(creep: Creep, with_markers: bool) -> list[Planned]:
-    """The touches that find depth zero; their deepest points."""
+def planned_zero(creep: Creep, with_markers: bool) -> list[PlannedMove]:
+    """Return the touches that find depth zero."""
     places = [("centre, straight in", (0.0, 0.0))]
     if with_markers:
         places.append(("centre, aslant", (ASLANT * creep.search_mm, 0.0)))
@@ -59,7 +59,7 @@ def planned_zero(creep: Creep, with_markers: bool) -> list[Planned]:
 
 
 def check_touches(file: RigFile, name: str, span_mm: float, creep: Creep) -> None:
-    """Hold touches against the rig's limits.
+    """Check touches against the rig's limits.
 
     Raises:
         InputError: the search goes deeper than the rig may, or the points lie too far out.
@@ -76,7 +76,7 @@ def check_touches(file: RigFile, name: str, span_mm: float, creep: Creep) -> Non
 
 
 def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repeats: int) -> Finding:
-    """The contact plane from three touches, and a fourth that checks them.
+    """Find the contact plane from three touches, and check it by a fourth.
 
     Raises:
         RigError: a touch never came, or the fourth is off the plane by more than 0.1 mm.
@@ -102,7 +102,7 @@ def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repea
 
 
 def teach_plane_by_hand(session: CalibrationSession) -> Finding:
-    """The contact plane from four points to which a person jogs the arm.
+    """Find the contact plane from four points to which a person jogs the arm.
 
     Raises:
         StopRequested: the person said stop.
@@ -168,7 +168,7 @@ def _plane_found(
 
 
 def marker_finder(session: CalibrationSession) -> MarkerFinder:
-    """Finds the markers in what the rig's outside camera hands over, from the first frame on."""
+    """Return a function that finds the markers in the outside camera's frames, in their order."""
     from sliplab.analysis.labels.markers import MarkerTracker
 
     layout = np.array(session.file.skin.layout_mm()) * session.file.frame_camera.scale_px_per_mm
@@ -185,7 +185,7 @@ def marker_finder(session: CalibrationSession) -> MarkerFinder:
 def teach_zero(
     session: CalibrationSession, creep: Creep, repeats: int, with_markers: bool
 ) -> Finding:
-    """Depth zero at the plate's centre, by event rate and by the markers' motion.
+    """Find depth zero at the plate's centre, by event rate and by the markers' motion.
 
     Raises:
         RigError: a touch never came, or the two differ by more than 0.15 mm.
@@ -195,14 +195,14 @@ def teach_zero(
     if with_markers:
         side = max(16, round(REGION_MM * camera.scale_px_per_mm / 16) * 16)
         rig.frames.set_region(min(side, camera.width_px), min(side, camera.height_px))
-    ways = ("events", "markers") if with_markers else ("events",)
-    depths: dict[str, list[float]] = {way: [] for way in ways}
-    with console.bar(f"{session.simulated}touches", repeats * len(ways)) as bar:
+    methods = ("events", "markers") if with_markers else ("events",)
+    depths: dict[str, list[float]] = {method: [] for method in methods}
+    with console.bar(f"{session.simulated}touches", repeats * len(methods)) as bar:
         for number in range(repeats):
-            for way in ways:
-                find = marker_finder(session) if way == "markers" else None
-                depths[way].append(touch(rig, 0.0, 0.0, creep, 2000 + number, find).depth_mm)
-                bar.advance(1, f"by {way} {depths[way][-1]:+.3f} mm")
+            for method in methods:
+                find = marker_finder(session) if method == "markers" else None
+                depths[method].append(touch(rig, 0.0, 0.0, creep, 2000 + number, find).depth_mm)
+                bar.advance(1, f"by {method} {depths[method][-1]:+.3f} mm")
     events = np.array(depths["events"])
     zero, residual = float(events.mean()), float(np.ptp(events)) / 2
     entry: dict[str, Any] = {"zero": mm(zero), "by_events": mm(zero)}
@@ -233,7 +233,7 @@ def teach_zero(
 
 
 def teach_tool(session: CalibrationSession, poses: int, tool: Pose) -> Finding:
-    """The tool centre point: a person brings the tip onto one fixed point in many ways.
+    """Find the tool centre point: a person brings the tip onto one point, leaning differently.
 
     Args:
         tool: from the flange to the point that the controller reports now.

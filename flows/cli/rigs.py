@@ -13,7 +13,7 @@ from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
 if TYPE_CHECKING:
-    from sliplab.flows.calibrating.measuring import CalibrationSession, Finding
+    from sliplab.flows.calibrating.measurement import CalibrationSession, Finding
     from sliplab.rigs.core.teaching import Creep
     from sliplab.rigs.rig_file import RigFile
 
@@ -173,7 +173,7 @@ def teach_plane(
 ) -> None:
     """The contact plane: touches at the centre, to the right, above, and one that checks them."""
     from sliplab.flows.calibrating import teach as steps
-    from sliplab.flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating.measurement import Measurement
 
     command = Measurement(rig, out, "plane", as_json)
     if by is By.HAND:
@@ -205,7 +205,7 @@ def teach_zero(
 ) -> None:
     """Depth zero: touches at the centre, seen by both cameras."""
     from sliplab.flows.calibrating import teach as steps
-    from sliplab.flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating.measurement import Measurement
 
     command = Measurement(rig, out, "zero", as_json)
     creep = _creep(speed, search, clearance)
@@ -235,7 +235,7 @@ def teach_tool(
 ) -> None:  # fmt: skip
     """The tool centre point: a person brings the tip onto one point, leaning in many ways."""
     from sliplab.flows.calibrating import teach as steps
-    from sliplab.flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating.measurement import Measurement
     from sliplab.rigs.build import tool_of
 
     command = Measurement(rig, out, "tool", as_json)
@@ -264,7 +264,7 @@ def calibrate_lens(
 ) -> None:
     """Lens and scale of the outside camera, from a printed ChArUco board. Nothing moves."""
     from sliplab.flows.calibrating import calibrate as steps
-    from sliplab.flows.calibrating.measuring import Measurement
+    from sliplab.flows.calibrating.measurement import Measurement
 
     board = _board(columns, rows, square)
     command = Measurement(rig, out, "lens", as_json)
@@ -293,7 +293,7 @@ def calibrate_crop(
 ) -> None:
     """Where the skin is in the event camera's picture: press, and move in a circle."""
     from sliplab.flows.calibrating import calibrate as steps
-    from sliplab.flows.calibrating.measuring import Measurement, Planned
+    from sliplab.flows.calibrating.measurement import Measurement, PlannedMove
 
     command = Measurement(rig, out, "crop", as_json)
     limit = float(command.file.limits.depth)
@@ -301,8 +301,8 @@ def calibrate_crop(
         text = f"is deeper than the rig may go: limits.depth = {limit:g} mm"
         raise InputError("--depth", "", f"{depth:g} mm", text)
     moves = [
-        Planned("press", 0.0, 0.0, -5.0, depth, 2.0),
-        Planned(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
+        PlannedMove("press", 0.0, 0.0, -5.0, depth, 2.0),
+        PlannedMove(f"circle of {radius:g} mm", 0.0, 0.0, depth, depth, steps.STIR_MM_S),
     ]
     command.run(moves, yes, dry_run, lambda session: steps.calibrate_crop(session, depth, radius))
 
@@ -318,7 +318,7 @@ def calibrate_board(
     as_json: JsonOption = False,
 ) -> None:
     """Make the board to print, with its true size on it."""
-    from sliplab.flows.calibrating.board_print import print_board
+    from sliplab.flows.calibrating.calibrate import print_board
 
     board = _board(columns, rows, square)
     sizes = print_board(board, out)

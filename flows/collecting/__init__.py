@@ -1,1 +1,1 @@
-"""Taking trials: sessions at a rig, what happens between two trials, how a campaign is led."""
+"""Taking trials: sessions at a rig, requests from other terminals, checks between two trials."""

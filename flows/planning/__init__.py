@@ -1,1 +1,1 @@
-"""What can be known before anything moves: orders, plans, checks of devices, file schemas."""
+"""Checks before anything moves: requests, plans, estimates, devices, file schemas."""

@@ -16,8 +16,8 @@ import pytest
 
 from sliplab.analysis.calibration.charuco import Board, find_corners
 from sliplab.flows import __main__ as entry
-from sliplab.flows.calibrating import calibrate, measuring, teach
-from sliplab.flows.calibrating.board_print import PNG_PX_PER_MM, print_board
+from sliplab.flows.calibrating import calibrate, measurement, teach
+from sliplab.flows.calibrating.calibrate import PNG_PX_PER_MM, print_board
 from sliplab.flows.running import console, stopping
 from sliplab.protocols import InputError
 from sliplab.protocols.program import Position
@@ -46,16 +46,16 @@ def lab(folder: Path, *, moved_mm: float = 0.0, leant_mm: float = 0.0, mock: str
     return path
 
 
-def session(path: Path, **attributes: Any) -> measuring.CalibrationSession:
+def session(path: Path, **attributes: Any) -> measurement.CalibrationSession:
     file, _ = load_rig_file(path)
     rig = build_rig(file)
     rig.connect()
     for name, value in attributes.items():
         setattr(rig, name, value)
-    return measuring.CalibrationSession(file, rig, date(2026, 12, 1))
+    return measurement.CalibrationSession(file, rig, date(2026, 12, 1))
 
 
-def taught(finding: measuring.Finding) -> PlateFrame:
+def taught(finding: measurement.Finding) -> PlateFrame:
     plane = finding.changes["calibration.contact_plane"]
     points = [
         [float(v.removesuffix(" mm")) for v in plane[k]] for k in ("centre", "right", "above")
@@ -400,10 +400,10 @@ def test_the_arm_is_asked_for_before_it_moves(
 
     def answer(text: str, **_: object) -> bool:
         asked.append(text)
-        raise measuring.typer.Abort
+        raise measurement.typer.Abort
 
     monkeypatch.setattr("sys.stdin", Terminal())
-    monkeypatch.setattr(measuring.typer, "confirm", answer)
+    monkeypatch.setattr(measurement.typer, "confirm", answer)
     assert run("teach", "zero", "--rig", lab(tmp_path)) == console.INTERRUPTED
     assert "Move the arm?" in asked[0]
 

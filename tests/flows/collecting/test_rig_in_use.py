@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.calibrating.measuring import CalibrationSession, Finding, Measurement
+from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, Measurement
 from sliplab.flows.cli.rigs import _about
 from sliplab.flows.collecting.session import run_session
 from sliplab.flows.planning.preflight import check_devices

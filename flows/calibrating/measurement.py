@@ -1,4 +1,4 @@
-"""One measurement of one rig: say what will move, ask, measure, write, and say what was found."""
+"""One measurement of a rig: announce the motion, ask, measure, write the rig file, report."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sliplab.rigs.rig_file import RigFile, load_rig_file
 from sliplab.rigs.rig_inheritance import rig_path
 from sliplab.rigs.rig_lock import held
 
-WAY = (
+ANNOUNCEMENT = (
     f"the arm goes out along the plate's normal and across at {RETRACT_SPEED_MM_S:g} mm/s, in at "
     f"{APPROACH_MM_S:g} mm/s, and then as listed"
 )
@@ -31,7 +31,7 @@ WAY = (
 
 @dataclass(frozen=True)
 class Finding:
-    """What was measured: keys of the rig file to set and to remove, and figures for people."""
+    """The result of a measurement: keys of the rig file to set and to remove, and figures."""
 
     changes: dict[str, Any]
     figures: dict[str, Any]
@@ -39,8 +39,8 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Planned:
-    """One motion that a command will make: plate coordinates of the rig's present plane."""
+class PlannedMove:
+    """A motion that a command will make, in plate coordinates of the rig's present plane."""
 
     what: str
     x_mm: float
@@ -52,10 +52,10 @@ class Planned:
 
 @dataclass
 class CalibrationSession:
-    """The rig at hand.
+    """The connected rig of a measurement.
 
     Attributes:
-        today: the day that entries get.
+        today: the date of new entries.
     """
 
     file: RigFile
@@ -69,17 +69,21 @@ class CalibrationSession:
 
 
 def mm(value: float) -> str:
-    """A length as a rig file has it."""
+    """Format a length as rig files have it."""
     return f"{value:.4f} mm"
 
 
 def px(value: float) -> str:
-    """A length in a picture as a rig file has it."""
+    """Format a length in an image as rig files have it."""
     return f"{value:.3f} px"
 
 
 class Measurement:
-    """One calibration of one rig file, from the question to the written entry.
+    """One measurement for one rig file, from the announcement to the written entry.
+
+    Args:
+        out: the file to write; None for the rig file itself.
+        what: name of the measurement: ``plane``, ``zero``, ``tool``, ``lens`` or ``crop``.
 
     Raises:
         InputError: the rig file cannot be read, or not be written to.
@@ -92,7 +96,7 @@ class Measurement:
 
     def run(
         self,
-        moves: Sequence[Planned],
+        moves: Sequence[PlannedMove],
         yes: bool,
         dry_run: bool,
         measure: Callable[[CalibrationSession], Finding],
@@ -100,12 +104,24 @@ class Measurement:
         *,
         with_arm: bool = True,
     ) -> None:
-        """Say what will move, ask, measure, write, and say what was found."""
+        """Run the measurement; a dry run only announces the motion.
+
+        Args:
+            moves: motions to announce; without any, nothing is asked.
+            yes: do not ask before the arm moves.
+            who: text in place of the general announcement.
+            with_arm: connect the arm.
+
+        Raises:
+            InputError: there is no terminal to ask on.
+            KeyboardInterrupt: the person said stop.
+            RigError: the measurement failed; nothing was written.
+        """
         if dry_run:
-            self._dry(moves, who)
+            self._print_moves(moves, who)
             return
         target = self._target()
-        self._say(moves, who)
+        self._announce(moves, who)
         if moves and not yes:
             _confirm()
         today = date.today()
@@ -125,9 +141,9 @@ class Measurement:
             self.path, target, finding.changes, today=today, remove=finding.remove,
             expected=self.text,
         )  # fmt: skip
-        self._show(finding, written.path, written.kept)
+        self._report(finding, written.path, written.kept)
 
-    def _rows(self, moves: Sequence[Planned]) -> list[dict[str, Any]]:
+    def _rows(self, moves: Sequence[PlannedMove]) -> list[dict[str, Any]]:
         plane = self.file.calibration.contact_plane
         frame = PlateFrame.taught((plane.centre, plane.right, plane.above))
         if self.what == "crop":
@@ -138,9 +154,9 @@ class Measurement:
             rows.append({**vars(move), "base_mm": [round(v, 3) for v in base]})
         return rows
 
-    def _say(self, moves: Sequence[Planned], who: str) -> None:
+    def _announce(self, moves: Sequence[PlannedMove], who: str) -> None:
         simulated = " (simulated)" if self.file.simulated else ""
-        console.say(f"{self.what} of rig {self.file.name}{simulated}: {who or WAY}")
+        console.say(f"{self.what} of rig {self.file.name}{simulated}: {who or ANNOUNCEMENT}")
         for row in self._rows(moves):
             console.say(
                 f"  {row['what']}: at ({row['x_mm']:.1f}, {row['y_mm']:.1f}) mm of the plate, "
@@ -149,22 +165,22 @@ class Measurement:
                 "arm's base frame"
             )
 
-    def _dry(self, moves: Sequence[Planned], who: str) -> None:
+    def _print_moves(self, moves: Sequence[PlannedMove], who: str) -> None:
         rows = self._rows(moves)
         if self.as_json:
             console.print_json(
                 {"what": self.what, "rig": self.file.name, "simulated": self.file.simulated,
-                 "dry_run": True, "how": who or WAY, "moves": rows}
+                 "dry_run": True, "how": who or ANNOUNCEMENT, "moves": rows}
             )  # fmt: skip
             return
         columns = ["what", "x, mm", "y, mm", "from depth, mm", "to at most, mm", "speed, mm/s",
                    "deepest in base, mm"]  # fmt: skip
-        table = [[*list(row.values())[:-1], _shown(row["base_mm"])] for row in rows]
+        table = [[*list(row.values())[:-1], _cell(row["base_mm"])] for row in rows]
         title = f"{self.what} of rig {self.file.name}: nothing moved (dry run)"
         console.print_table(title, columns, table)
-        console.say(who or WAY)
+        console.say(who or ANNOUNCEMENT)
 
-    def _show(self, finding: Finding, path: Path, kept: Path | None) -> None:
+    def _report(self, finding: Finding, path: Path, kept: Path | None) -> None:
         removed = [key for key in finding.remove if self._had(key)]
         if self.as_json:
             console.print_json(
@@ -174,7 +190,7 @@ class Measurement:
             )  # fmt: skip
             return
         simulated = " (simulated)" if self.file.simulated else ""
-        shown = {name: _shown(value) for name, value in finding.figures.items()}
+        shown = {name: _cell(value) for name, value in finding.figures.items()}
         console.print_pairs(f"{self.what} of rig {self.file.name}{simulated}", shown)
         console.say(f"written to {path}: {', '.join(finding.changes)}")
         for key in removed:
@@ -193,15 +209,15 @@ def _confirm() -> None:
                   err=True)  # fmt: skip
 
 
-def _shown(value: object) -> object:
+def _cell(value: object) -> object:
     if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
+        return ", ".join(_number_text(item) for item in value)
     if isinstance(value, dict):
-        return "; ".join(f"{key} {_shown(item)}" for key, item in value.items())
-    return _text(value) if isinstance(value, float) else value
+        return "; ".join(f"{key} {_cell(item)}" for key, item in value.items())
+    return _number_text(value) if isinstance(value, float) else value
 
 
-def _text(value: object) -> str:
+def _number_text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) and abs(value) < 100 else (
         f"{value:.2f}" if isinstance(value, float) else str(value)
     )  # fmt: skip
