@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import ControllerClock, Ramp, StraightMotion
+from sliplab.rigs.core.fake_motion import Ramp, StraightMotion, running_clock
 
 A, B = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pose((15.0, 0.0, 0.0), (0.0, 0.0, 90.0))
 
@@ -68,6 +68,6 @@ def test_a_line_may_be_extended_on_its_way_and_only_straight_on() -> None:
 
 def test_a_fast_clock_runs_at_its_rate() -> None:
     host = iter([10.0, 10.0, 12.0])
-    clock = ControllerClock(lambda: next(host), rate=5.0, offset_s=100.0)
+    clock = running_clock(5.0, 100.0, lambda: next(host))
     assert clock.now_s() == 100.0
     assert clock.now_s() == 110.0

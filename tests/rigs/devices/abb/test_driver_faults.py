@@ -130,7 +130,7 @@ KILLED = """
 import sys, threading
 from sliplab.rigs.devices.abb.driver import AbbArm
 from sliplab.rigs.devices.abb.settings import AbbSettings
-from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.core.capabilities import Pose, Segment
 arm = AbbArm(AbbSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 90.0, 300.0), (180.0, 0.0, 0.0)), 40.0)])

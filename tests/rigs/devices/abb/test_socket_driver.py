@@ -193,7 +193,7 @@ KILLED = """
 import sys, threading
 from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
-from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.core.capabilities import Pose, Segment
 arm = AbbSocketArm(AbbSocketSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 90.0, 300.0), (180.0, 0.0, 0.0)), 40.0)])

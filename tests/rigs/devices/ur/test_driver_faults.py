@@ -402,7 +402,7 @@ DRIVES = """
 import sys
 from sliplab.rigs.devices.ur.settings import UrSettings
 from sliplab.rigs.devices.ur.driver import UrArm
-from sliplab.rigs.capabilities import Pose, Segment
+from sliplab.rigs.core.capabilities import Pose, Segment
 arm = UrArm(UrSettings.model_validate_json(sys.argv[1]))
 arm.connect()
 arm.start([Segment(Pose((400.0, 95.0, 300.0), (180.0, 0.0, 0.0)), 20.0)])
