@@ -1,4 +1,8 @@
-"""A path that an arm follows: how far it has come, and when each segment began and ended."""
+"""What the drivers of real arms share: a path that a thread follows, and how far it has come.
+
+A driver brings its own connection, its own way to send a path and its own ways to stop. What it
+says of a path while it runs, and what becomes of one that fails, is the same for all.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,20 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Progress, Segment
+from sliplab.rigs.core.arm_settings import Limits
+from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Progress, RigError, Segment
+from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.pose import angle_deg, distance_mm
+from sliplab.rigs.core.pose_stream import PoseStream
+from sliplab.storage.streams import PoseChunk, PulseChunk
+
+LEFT_MM = 0.001
+"""A segment has begun once the tool centre point is this far from where it stood."""
+NEAR_MM = 0.05
+"""How close to its target a segment may end."""
+REST_SHARE = 0.02
+"""Below this share of its speed, near its target, a segment has ended."""
+_LEFT_DEG, _NEAR_DEG = 0.001, 0.1
 
 
 @dataclass
@@ -25,7 +41,7 @@ class Run:
     thread: threading.Thread | None = None
 
     def progress(self, state: ArmState) -> Progress:
-        """How far it has come.
+        """Return how far it has come.
 
         Raises:
             ArmFault: it was given up for a reason that `state` does not say: the arm is healthy, or
@@ -35,18 +51,90 @@ class Run:
             raise self.error
         return Progress(state, tuple(self.finished), self.done)
 
+    def join(self, within_s: float) -> None:
+        """Wait for its thread to end, unless that thread itself asks."""
+        if self.thread is not None and self.thread is not threading.current_thread():
+            self.thread.join(within_s)
 
-LEFT_MM = 0.001
-"""A segment has begun once the tool centre point is this far from where it stood."""
-NEAR_MM = 0.05
-"""How close to its target a segment may end."""
-REST_SHARE = 0.02
-"""Below this share of its speed, near its target, a segment has ended."""
-_LEFT_DEG, _NEAR_DEG = 0.001, 0.1
+
+class ArmDriver:
+    """A base for drivers of arms that follow a path in a thread of their own.
+
+    A subclass has `state`, and follows a path in `_follow_path`.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._guard = Guard(limits)
+        self._stream = PoseStream()
+        self._lost: str | None = "not connected"
+        """Why the arm cannot be reached; None while it can."""
+        self._run = Run((), done=True)
+
+    def state(self) -> ArmState:
+        """Return the arm's state; never waits."""
+        raise NotImplementedError
+
+    def progress(self) -> Progress:
+        """Return how far the path has come.
+
+        Raises:
+            ArmFault: the path was given up for a reason that `state` does not tell.
+        """
+        return self._run.progress(self.state())
+
+    def read_poses(self) -> PoseChunk:
+        """Return the measured poses since the last call."""
+        return self._stream.read()
+
+    def read_pulses(self) -> PulseChunk:
+        """Return the rising edges of the sync input since the last call."""
+        return self._stream.read_pulses()
+
+    def _begin(self, run: Run) -> None:
+        """Follow a path from now on, in a thread of its own."""
+        run.thread = threading.Thread(target=self._follow, args=(run,), daemon=True)
+        run.thread.start()
+
+    def _follow(self, run: Run) -> None:
+        """A path's thread; one that dies must not look like a stop from outside."""
+        try:
+            self._follow_path(run)
+        except Exception as error:
+            given_up = ArmFault("arm", f"its path was given up: {error!r}")
+            run.error = error if isinstance(error, ArmFault) else given_up
+            self._give_up()
+        finally:
+            run.done = True
+            self._path_is_over()
+            self._stream.wake()
+
+    def _follow_path(self, run: Run) -> None:
+        """Wait for each segment to end, and note it in `run.finished`. May raise anything."""
+        raise NotImplementedError
+
+    def _give_up(self) -> None:
+        """Stop what nobody follows any more."""
+
+    def _path_is_over(self) -> None:
+        """Take note that a path's thread has come to its end."""
+
+    def _refuse(self, path: Sequence[Segment], moving: bool) -> None:
+        """Raise RigError for an empty path, or for one that comes too early."""
+        if not path:
+            raise RigError("arm", "was given an empty path")
+        if moving:
+            raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+
+    def _fault(self, state: ArmState, what: str) -> ArmFault:
+        reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
+        return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")
 
 
 class SegmentWatch:
-    """Follows one path sample by sample.
+    """Tells when each segment of a path began and ended, from the pose stream alone.
+
+    For controllers that do not say so themselves: commanded poses are exact, so leaving a place and
+    coming to rest at another one can be seen to a sample.
 
     Args:
         begin: where the arm stands.

@@ -1,17 +1,17 @@
 """Where a fake's tool centre point is: straight lines at constant speed, with real ramps.
 
-A fake asks a `Motion` and nothing else, so a simulated scene can take the place of this one
-and see the same moves.
+A fake asks a `StraightMotion` and nothing else; a simulated scene listens to its lines (`on_line`)
+and sees the same moves.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from threading import Lock
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,22 +21,6 @@ from sliplab.rigs.core.pose import angle_deg, between, distance_mm, way
 
 F64 = npt.NDArray[np.float64]
 _OFF_LINE_MM = 0.01
-
-
-class Motion(Protocol):
-    """A tool centre point that can be sent along straight lines, on a clock in seconds."""
-
-    def pose(self, t_s: float) -> Pose:
-        """Where it is at a time that is not before the last call's."""
-
-    def moving(self, t_s: float) -> bool:
-        """Whether it is on its way."""
-
-    def move(self, to: Pose, speed_mm_s: float, acceleration_mm_s2: float, t_s: float) -> None:
-        """Leave for `to` in a straight line, from rest."""
-
-    def stop(self, deceleration_mm_s2: float, t_s: float) -> None:
-        """Come to rest on the line."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +97,9 @@ class Line:
 
 
 class StraightMotion:
-    """The `Motion` of a fake by itself. May be asked from any thread.
+    """A tool centre point that can be sent along straight lines, on a clock in seconds.
+
+    May be asked from any thread, for times that do not run back.
 
     Args:
         on_line: told of every new way and since when it holds, s; in the thread that moves.
@@ -191,30 +177,27 @@ def _backwards(line: Line, gone: float, way: float) -> Pose:
     return between(line.begin, line.end, (gone - way) / line.ramp.length)
 
 
-class CycleClock(Protocol):
-    """What a fake's controller counts its cycles by."""
-
-    @property
-    def rate(self) -> float:
-        """Controller seconds a host second."""
-
-    def now_s(self) -> float:
-        """The controller's time, s."""
-
-
+@dataclass(frozen=True)
 class ControllerClock:
-    """A controller's own seconds since it was switched on.
+    """A controller's clock, by which a fake counts its cycles."""
+
+    now_s: Callable[[], float]
+    """The controller's time, s."""
+    rate: float = 1.0
+    """Controller seconds a host second. More than 1 makes slow slides quick to test."""
+
+
+def running_clock(
+    rate: float = 1.0,
+    offset_s: float = 1000.0,
+    host_s: Callable[[], float] = time.monotonic,
+) -> ControllerClock:
+    """Return the clock of a controller that is switched on now.
 
     Args:
+        rate: controller seconds a host second.
+        offset_s: what it shows now.
         host_s: the host's monotonic clock, s.
-        rate: controller seconds a host second. More than 1 makes slow slides quick to test.
-        offset_s: what it shows at the beginning.
     """
-
-    def __init__(self, host_s: Callable[[], float], rate: float, offset_s: float = 1000.0) -> None:
-        self._host_s, self.rate = host_s, rate
-        self._began, self._offset = host_s(), offset_s
-
-    def now_s(self) -> float:
-        """The controller's time, s."""
-        return self._offset + (self._host_s() - self._began) * self.rate
+    began = host_s()
+    return ControllerClock(lambda: offset_s + (host_s() - began) * rate, rate)

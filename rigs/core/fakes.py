@@ -7,17 +7,23 @@ them copies what a device costs in time; what they copy is what it says, and how
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
+
+from sliplab.rigs.core.capabilities import Pose
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion, running_clock
 
 T = TypeVar("T")
 Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 START_S = 5.0
 """How long a fake may take to open its ports, or to close them, s."""
+HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
+"""Where a fake's tool centre point is at first."""
 
 
 class LoopThread:
@@ -178,3 +184,84 @@ class Fault:
     kind: Kind
     stage: Stage
     after_mm: float = 0.0
+
+
+class FaultPlan:
+    """The faults of one fake that are yet to come, each at its stage.
+
+    Args:
+        happen: makes a kind of fault happen now.
+    """
+
+    def __init__(self, faults: Sequence[Fault], happen: Callable[[Kind], None]) -> None:
+        self._waiting, self._happen = list(faults), happen
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def add(self, fault: Fault) -> None:
+        """Wait for one more."""
+        self._waiting.append(fault)
+
+    def reach(self, stage: Stage, gone_mm: float = math.inf) -> None:
+        """Let happen what waits for a stage that was reached.
+
+        Args:
+            gone_mm: how far the tool centre point has travelled in this move.
+        """
+        for fault in [f for f in self._waiting if f.stage is stage and gone_mm >= f.after_mm]:
+            self._waiting.remove(fault)
+            self._happen(fault.kind)
+
+
+class FakeController:
+    """A base for fakes of arm controllers: `start` opens the ports, `close` gives them back.
+
+    Args:
+        host: loopback address of its own.
+        motion: where the tool centre point is; a straight-line motion from `HOME` if left out.
+        clock: the controller's; one of its own, at `rate`, if left out.
+        rate: controller seconds a host second.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        motion: StraightMotion | None = None,
+        clock: ControllerClock | None = None,
+        rate: float = 1.0,
+    ) -> None:
+        self.host = host
+        self.motion = motion or StraightMotion(HOME)
+        self.clock = clock or running_clock(rate)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def start(self) -> None:
+        """Open the ports and run. Raises OSError if one of them is taken."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Cut every connection and give the ports back."""
+        raise NotImplementedError
+
+    def happen(self, kind: Kind) -> None:
+        """Make something go wrong now."""
+        raise NotImplementedError
+
+    def restore(self) -> None:
+        """Put everything right, as a person would."""
+        raise NotImplementedError
+
+    def pose(self) -> Pose:
+        """Return where the tool centre point is now."""
+        return self.motion.pose(self.clock.now_s())
+
+    def moving(self) -> bool:
+        """Return whether it is on its way now."""
+        return self.motion.moving(self.clock.now_s())

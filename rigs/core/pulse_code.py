@@ -35,6 +35,8 @@ REGULAR_TICKS = 2
 U8 = npt.NDArray[np.uint8]
 _WORD = (1 << 32) - 1
 _SPREAD = 2_654_435_761
+_FIRST_BITS = 1 << 12
+"""Bits that are made at first; more when they are needed."""
 
 
 def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
@@ -67,6 +69,20 @@ def code_bits(seed: int, n: int, code: Code = "lfsr") -> U8:
     if n < 0:
         raise ValueError(f"n = {n}: must not be negative")
     return {"lfsr": _lfsr, "irregular": _irregular, "regular": _regular}[code](seed, n)
+
+
+class CodeBits:
+    """A code without an end, made as far as somebody asked."""
+
+    def __init__(self, seed: int, code: Code = "lfsr") -> None:
+        self._seed, self._code = seed, code
+        self._made = code_bits(seed, _FIRST_BITS, code)
+
+    def upto(self, ticks: int) -> U8:
+        """Return the bits of the first `ticks` ticks, uint8, and perhaps of more."""
+        if ticks > len(self._made):
+            self._made = code_bits(self._seed, 2 * ticks, self._code)
+        return self._made
 
 
 def _lfsr(seed: int, n: int) -> U8:

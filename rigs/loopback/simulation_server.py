@@ -11,9 +11,8 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +20,9 @@ import numpy.typing as npt
 from sliplab.protocols.program import PlateAction
 from sliplab.protocols.timing import Timing
 from sliplab.rigs.core.capabilities import ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fake_motion import StraightMotion
-from sliplab.rigs.core.fakes import Kind
-from sliplab.rigs.core.pulse_code import code_bits
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fakes import FakeController, Kind
+from sliplab.rigs.core.pulse_code import CodeBits
 from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.devices.settings import ArmSettings
 from sliplab.rigs.devices.sync_box.fake import FakeSyncBox, Train
@@ -44,132 +43,8 @@ from sliplab.storage.streams import FrameChunk
 
 REACH_MM = 2_000.0
 """Limits of the fake itself; those of the rig file are the driver's to hold."""
-
-
-class FakeArm(Protocol):
-    """A fake of an arm's controller."""
-
-    def start(self) -> None:
-        """Open its ports. Raises OSError."""
-
-    def happen(self, kind: Kind) -> None:
-        """Make something go wrong now."""
-
-    def restore(self) -> None:
-        """A person has put everything right."""
-
-    def pose(self) -> Pose:
-        """Where its tool centre point is now."""
-
-    def moving(self) -> bool:
-        """Whether it is on its way now."""
-
-    def close(self) -> None:
-        """Give its ports back."""
-
-
-@dataclass(frozen=True)
-class DrivenClock:
-    """A controller's clock that somebody else drives."""
-
-    seconds: Callable[[], float]
-    rate: float = 1.0
-
-    def now_s(self) -> float:
-        """The controller's time, s."""
-        return self.seconds()
-
-
-def fake_arm(
-    settings: ArmSettings,
-    motion: StraightMotion,
-    now_s: Callable[[], float],
-    sync: Callable[[float], bool],
-) -> FakeArm:
-    """A fake for the arm that `settings` describe, started.
-
-    Args:
-        motion: where its tool centre point is.
-        now_s: its controller's clock, s.
-        sync: level of the sync line at a time of that clock.
-
-    Raises:
-        OSError: a port is taken.
-    """
-    arm: FakeArm
-    clock = DrivenClock(now_s)
-    if isinstance(settings, UrSettings):
-        from sliplab.rigs.devices.ur.fake import FakeUr
-
-        bit = 1 << settings.sync_input
-        arm = FakeUr(
-            settings.host,
-            motion,
-            cycle_hz=settings.frequency_hz,
-            digital_inputs=lambda t_s: bit if sync(t_s) else 0,
-            reach_mm=REACH_MM,
-            clock=clock,
-        )
-    elif settings.driver == "abb":
-        from sliplab.rigs.devices.abb.fake import FakeAbb
-
-        arm = FakeAbb(
-            settings.host,
-            settings.rws_port,
-            ("127.0.0.1", settings.egm_port),
-            motion,
-            egm_point=settings.egm_point,
-            clock=clock,
-        )
-    else:
-        from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
-
-        arm = FakeRapidServer(settings.host, settings.port, motion=motion, clock=clock)
-    arm.start()
-    return arm
-
-
 PULSE_NS = 5_000_000
 """Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
-_BITS = 1 << 12
-
-
-class SyncLevel:
-    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
-
-    Args:
-        box: true time of all trials to the box's clock, ns.
-    """
-
-    def __init__(self, box: ClockMap) -> None:
-        self._box = box
-        self._train: Train | None = None
-        self._bits = np.zeros(0, np.uint8)
-        self._ticks: int | None = None
-
-    def follow(self, train: Train | None, sent: int) -> None:
-        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
-        if train is None:
-            self._ticks = sent
-        else:
-            self._bits = np.zeros(0, np.uint8)
-            self._ticks, self._train = None, train
-
-    def high(self, total_ns: int) -> bool:
-        """Whether the line is high at a true time of all trials."""
-        train, ticks = self._train, self._ticks
-        if train is None:
-            return False
-        passed = self._box.to_reference(total_ns) - train.first_ns
-        period = 1e9 / train.rate_hz
-        tick = int(passed // period)
-        if tick < 0 or (ticks is not None and tick >= ticks):
-            return False
-        if tick >= len(self._bits):
-            self._bits = code_bits(train.seed, max(2 * tick, _BITS), train.code)
-        return bool(self._bits[tick]) and passed - tick * period < min(PULSE_NS, period / 2)
-
-
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
 """How far the world is behind the host's clock: longer than a controller's cycle."""
@@ -223,7 +98,9 @@ class SimulationServer:
         self._size = settings.event_camera.width, settings.event_camera.height
         self.sync_box = FakeSyncBox(self._box_now_ns, on_train=self._on_train)
         self.camera = LiveDvxplorer(self._size)
-        self.arm: FakeArm = fake_arm(arm, self._path.motion, self._arm_now_s, self._arm_input)
+        self.arm: FakeController = fake_arm(
+            arm, self._path.motion, self._arm_now_s, self._arm_input
+        )
         self._events.start()
 
     def close(self) -> None:
@@ -434,6 +311,90 @@ class SimulationServer:
         else:
             raise RigError(device, "is no device of a stand-in")
         return self.sync_box.port, self.camera.ports
+
+
+class SyncLevel:
+    """The sync line's level at any time, from the train that runs; asked in the arm's thread.
+
+    Args:
+        box: true time of all trials to the box's clock, ns.
+    """
+
+    def __init__(self, box: ClockMap) -> None:
+        self._box = box
+        self._train: Train | None = None
+        self._bits = CodeBits(1)
+        self._ticks: int | None = None
+
+    def follow(self, train: Train | None, sent: int) -> None:
+        """A train begins, or (None) the one that ran has ended after `sent` ticks."""
+        if train is None:
+            self._ticks = sent
+        else:
+            self._bits = CodeBits(train.seed, train.code)
+            self._ticks, self._train = None, train
+
+    def high(self, total_ns: int) -> bool:
+        """Whether the line is high at a true time of all trials."""
+        train, ticks = self._train, self._ticks
+        if train is None:
+            return False
+        passed = self._box.to_reference(total_ns) - train.first_ns
+        period = 1e9 / train.rate_hz
+        tick = int(passed // period)
+        if tick < 0 or (ticks is not None and tick >= ticks):
+            return False
+        bit = bool(self._bits.upto(tick + 1)[tick])
+        return bit and passed - tick * period < min(PULSE_NS, period / 2)
+
+
+def fake_arm(
+    settings: ArmSettings,
+    motion: StraightMotion,
+    now_s: Callable[[], float],
+    sync: Callable[[float], bool],
+) -> FakeController:
+    """A fake for the arm that `settings` describe, started.
+
+    Args:
+        motion: where its tool centre point is.
+        now_s: its controller's clock, s.
+        sync: level of the sync line at a time of that clock.
+
+    Raises:
+        OSError: a port is taken.
+    """
+    arm: FakeController
+    clock = ControllerClock(now_s)
+    if isinstance(settings, UrSettings):
+        from sliplab.rigs.devices.ur.fake import FakeUr
+
+        bit = 1 << settings.sync_input
+        arm = FakeUr(
+            settings.host,
+            motion,
+            cycle_hz=settings.frequency_hz,
+            digital_inputs=lambda t_s: bit if sync(t_s) else 0,
+            reach_mm=REACH_MM,
+            clock=clock,
+        )
+    elif settings.driver == "abb":
+        from sliplab.rigs.devices.abb.fake import FakeAbb
+
+        arm = FakeAbb(
+            settings.host,
+            settings.rws_port,
+            ("127.0.0.1", settings.egm_port),
+            motion,
+            egm_point=settings.egm_point,
+            clock=clock,
+        )
+    else:
+        from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
+
+        arm = FakeRapidServer(settings.host, settings.port, motion=motion, clock=clock)
+    arm.start()
+    return arm
 
 
 def _rehearse(settings: MockSettings, timing: Timing) -> None:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from sliplab.rigs.mock.clocks import HighestStamp
 from sliplab.rigs.mock.fault_settings import EventBurst
+from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.history import History
 from sliplab.rigs.mock.sync import REPORT_NS, MockSyncBox, SyncInput
 from sliplab.rigs.mock.world import World
@@ -84,9 +85,6 @@ def _none() -> Events:
     return np.empty(0, np.int64), empty, empty, np.empty(0, np.uint8)
 
 
-_NEVER = 1 << 62
-
-
 class MockEventCamera:
     """The event camera inside the sensor.
 
@@ -119,7 +117,7 @@ class MockEventCamera:
         loads = self._loads = world.keep_loads()
         self._next_ns = loads.end_ns
         self._sensor.reset(loads.between(self._next_ns, self._next_ns)[1][0], world.seed)
-        self._begun_ns, self._until_ns, self._running = world.now_ns, _NEVER, True
+        self._begun_ns, self._until_ns, self._running = world.now_ns, NEVER, True
         self._input.skip()
 
     def read(self) -> EventChunk:

@@ -18,8 +18,9 @@ from sliplab.protocols.timing import FrameGrade
 from sliplab.rigs.core.capabilities import RigError
 from sliplab.rigs.mock.clocks import Jitter, Lateness
 from sliplab.rigs.mock.fault_settings import DeviceGone, FrameLate, FramesLost, MarkerOccluded
+from sliplab.rigs.mock.faults import NEVER
 from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.sync import ClockReader, FreeRun, Trigger
+from sliplab.rigs.mock.sync import ClockReader, FreeRun, Ticks
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.frames import (
     Exposures,
@@ -37,7 +38,6 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
-_NEVER = 1 << 62
 _NOISE_FRAMES = 256
 """Frames whose centroid noise is drawn together."""
 
@@ -51,7 +51,7 @@ class MockFrameCamera:
     """
 
     def __init__(
-        self, world: World, trigger: Trigger, grade: FrameGrade = "hardware trigger"
+        self, world: World, trigger: Ticks, grade: FrameGrade = "hardware trigger"
     ) -> None:
         self._world, self._trigger = world, trigger
         self._faults = FrameFaults(world, trigger)
@@ -102,7 +102,7 @@ class MockFrameCamera:
             self._trigger.start()
         self._run, self._number = self._trigger.run, 0
         self._next_tick = self._trigger.tick_at(self._world.now_ns)
-        self._running, self._until_ns = True, _NEVER
+        self._running, self._until_ns = True, NEVER
 
     def read(self) -> FrameChunk:
         """Frames since the last call whose read-out is over."""
@@ -250,7 +250,7 @@ OUT_OF_SIGHT_MM = 500.0
 class FrameFaults:
     """The frame camera's share in the faults of whatever trial runs."""
 
-    def __init__(self, world: World, trigger: Trigger) -> None:
+    def __init__(self, world: World, trigger: Ticks) -> None:
         self._world, self._trigger = world, trigger
 
     def lost(self, ticks: I64) -> Mask:

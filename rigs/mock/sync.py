@@ -1,15 +1,17 @@
-"""The simulated sync box, and the edges that other devices see of its line."""
+"""Ticks of the simulated sync box and of a camera that runs by itself, and who sees their edges.
+
+Where the box does not trigger the frame camera, exposures follow the camera's own clock. To the
+camera either is a source of ticks: tick k is the start of exposure k.
+"""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import RigError
-from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
+from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
 from sliplab.rigs.mock.clocks import FaultyClock, Jitter, faulty, undisturbed
 from sliplab.rigs.mock.fault_settings import (
     DeviceGone,
@@ -23,6 +25,145 @@ from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.randomness import generator
 from sliplab.storage.clockmap import ClockMap
 from sliplab.storage.streams import ClockReads, PulseChunk
+
+I64 = npt.NDArray[np.int64]
+U8 = npt.NDArray[np.uint8]
+REPORT_NS = 100_000
+"""From an edge to its report; longer than any jitter, so that no edge is reported early."""
+
+
+class Ticks:
+    """Numbered ticks at even distances of a clock, from a moment on.
+
+    Attributes:
+        run: counts the trains, so that whoever follows the ticks notices a new one.
+        clock: true time to the clock that the ticks are counted by.
+        stopped_ns: true time after which none comes; None while they go on.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.run = 0
+        self._clear()
+        world.on_begin.append(self._clear)
+
+    def _clear(self) -> None:
+        """Forget the train: a trial begins."""
+        self.clock = ClockMap.line(0, 0)
+        self._period_ns, self._origin_ns = 0.0, 0
+        self.stopped_ns: int | None = 0
+
+    def _tick_on(self, clock: ClockMap, period_ns: float, origin_ns: int = 0) -> None:
+        """Begin a train whose tick 0 comes when the clock, without its jumps, shows `origin_ns`."""
+        self.run += 1
+        self.clock, self._period_ns, self._origin_ns = clock, period_ns, origin_ns
+        self.stopped_ns = None
+
+    @property
+    def ticking(self) -> bool:
+        """Whether a train was begun since the trial did."""
+        return self._period_ns > 0.0
+
+    def _last_ns(self, until_ns: int) -> int:
+        """The true time up to which ticks come that are asked for up to `until_ns`."""
+        return until_ns if self.stopped_ns is None else min(until_ns, self.stopped_ns)
+
+    def ticks(self, first: int, until_ns: int) -> I64:
+        """Return the numbers of the ticks from `first` on that came up to a true time."""
+        end = max(self.tick_at(self._last_ns(until_ns) + 1), first)
+        return np.arange(first, end, dtype=np.int64)
+
+    def tick_at(self, true_ns: int) -> int:
+        """Return the number of the first tick at or after a true time, 0 at the least."""
+        if not self.ticking:
+            return 0
+        passed = undisturbed(self.clock).to_reference(true_ns) - self._origin_ns
+        guess = max(int(passed / self._period_ns) + 1, 0)
+        while guess and self._true_of(guess - 1) >= true_ns:
+            guess -= 1
+        while self._true_of(guess) < true_ns:
+            guess += 1
+        return guess
+
+    def _true_of(self, tick: int) -> int:
+        """`true_ns` of one tick, without arrays: it is asked often."""
+        if isinstance(self.clock, FaultyClock):
+            return int(self.true_ns(np.array([tick], np.int64))[0])
+        return self.clock.to_device(self._origin_ns + round(tick * self._period_ns))
+
+    def shown_ns(self, ticks: I64) -> I64:
+        """Return the ticks on their own clock, without its jumps, ns."""
+        return self._origin_ns + np.rint(ticks * self._period_ns).astype(np.int64)
+
+    def true_ns(self, ticks: I64) -> I64:
+        """Return the true times of ticks, ns."""
+        true_ns = undisturbed(self.clock).to_device(self.shown_ns(ticks))
+        return self.clock.cycle_ns(true_ns) if isinstance(self.clock, FaultyClock) else true_ns
+
+    def bits(self, ticks: I64) -> U8:
+        """Return the level of the sync line that is seen at ticks: low where none is wired."""
+        return np.zeros(len(ticks), np.uint8)
+
+
+class FreeRun(Ticks):
+    """Exposures of a camera that runs by itself; the first one comes within a period."""
+
+    def _clear(self) -> None:
+        super()._clear()
+        self._starts = 0
+
+    def start(self) -> None:
+        """Begin; cycles that run are given up."""
+        world = self._world
+        period_ns = 1e9 / world.settings.frame_camera.rate_hz
+        clock, now_ns = world.clocks.frame_camera, world.now_ns
+        if isinstance(clock, FaultyClock):  # cycles follow a clock's drifts, and not its jumps
+            now_ns = int(clock.pace_ns(np.array([now_ns], np.int64))[0])
+        share = generator(world.seed, "first exposure", self._starts).uniform()
+        origin_ns = undisturbed(clock).to_reference(now_ns) + round(share * period_ns)
+        self._tick_on(clock, period_ns, origin_ns)
+        self._starts += 1
+
+    def stop(self) -> None:
+        """No exposure begins from now on."""
+        if self.stopped_ns is None:
+            self.stopped_ns = self._world.now_ns
+
+
+class ExposureLine:
+    """The camera's output that is high during exposures, with its edges as the box captures them.
+
+    A frame that is lost on its way to the host was exposed all the same.
+    """
+
+    def __init__(self, world: World, camera: FreeRun) -> None:
+        self._world, self._camera = world, camera
+        self._begin()
+        world.on_begin.append(self._begin)
+
+    def _begin(self) -> None:
+        self._run, self._read = self._camera.run, 0
+        jitter_us = self._world.settings.clocks.exposure_jitter_us
+        self._jitter = Jitter(self._world.seed, "exposure edges", jitter_us)
+
+    def edges_ns(self, until_ns: int) -> I64:
+        """Return the true times, with jitter, of the starts of exposures since the last call, ns.
+
+        Args:
+            until_ns: exposures that begin after this true time are left for a later call.
+        """
+        camera = self._camera
+        if camera.run != self._run:
+            self._run, self._read = camera.run, 0
+        ticks = camera.ticks(self._read, until_ns)
+        self._read += len(ticks)
+        true_ns = camera.true_ns(ticks)
+        exposed = np.ones(len(ticks), np.bool_)
+        for fault, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
+            if fault.device == "frame_camera":
+                exposed &= (true_ns < begin_ns) | (true_ns >= end_ns)
+        edges: I64 = (true_ns + self._jitter.ns(ticks))[exposed]
+        return edges
 
 
 class ClockReader:
@@ -61,165 +202,22 @@ class ClockReader:
         return ClockReads(*(np.array([value], np.int64) for value in row))
 
 
-I64 = npt.NDArray[np.int64]
-U8 = npt.NDArray[np.uint8]
-
-
-class Trigger(Protocol):
-    """What starts the exposures of a simulated frame camera.
-
-    Attributes:
-        run: counts the starts, so that the camera notices a new train.
-    """
-
-    run: int
-
-    def ticks(self, first: int, until_ns: int) -> I64:
-        """Numbers of the ticks from `first` on that came up to the true time `until_ns`."""
-
-    def tick_at(self, true_ns: int) -> int:
-        """Number of the first tick at or after a true time, 0 at the least."""
-
-    def true_ns(self, ticks: I64) -> I64:
-        """True times of ticks, ns."""
-
-    def bits(self, ticks: I64) -> U8:
-        """Level of the sync line that the camera sees at ticks."""
-
-
-class FreeRun:
-    """Cycles of a camera's clock from `start` on; the first one comes within a period."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._period_ns = 1e9 / world.settings.frame_camera.rate_hz
-        self.run = 0
-        self._begin()
-        world.on_begin.append(self._begin)
-
-    def _begin(self) -> None:
-        self._clock: ClockMap | None = None
-        self._origin_ns = self._starts = 0
-        self._stopped_ns: int | None = None
-
-    def start(self) -> None:
-        """Begin; cycles that run are given up."""
-        world = self._world
-        self.run += 1
-        self._clock, self._stopped_ns = world.clocks.frame_camera, None
-        share = generator(world.seed, "first exposure", self._starts).uniform()
-        self._origin_ns = self._shown(self._clock, world.now_ns) + round(share * self._period_ns)
-        self._starts += 1
-
-    def stop(self) -> None:
-        """No exposure begins from now on."""
-        if self._stopped_ns is None:
-            self._stopped_ns = self._world.now_ns
-
-    def ticks(self, first: int, until_ns: int) -> I64:
-        """Numbers of the exposures from `first` on that began up to the true time `until_ns`."""
-        if self._stopped_ns is not None:
-            until_ns = min(until_ns, self._stopped_ns)
-        return np.arange(first, max(self.tick_at(until_ns + 1), first), dtype=np.int64)
-
-    def tick_at(self, true_ns: int) -> int:
-        """Number of the first exposure that begins at or after a true time, 0 at the least."""
-        if self._clock is None:
-            return 0
-        passed = self._shown(self._clock, true_ns) - self._origin_ns
-        guess = max(int(passed / self._period_ns) - 1, 0)
-        while int(self.true_ns(np.array([guess], np.int64))[0]) < true_ns:
-            guess += 1
-        return guess
-
-    def true_ns(self, ticks: I64) -> I64:
-        """True times at which exposures begin, ns."""
-        if self._clock is None:
-            return np.zeros(len(ticks), np.int64)
-        shown = self._origin_ns + np.rint(ticks * self._period_ns).astype(np.int64)
-        true_ns = undisturbed(self._clock).to_device(shown)
-        return self._clock.cycle_ns(true_ns) if isinstance(self._clock, FaultyClock) else true_ns
-
-    def bits(self, ticks: I64) -> U8:
-        """No sync line reaches this camera."""
-        return np.zeros(len(ticks), np.uint8)
-
-    @staticmethod
-    def _shown(clock: ClockMap, true_ns: int) -> int:
-        """What the camera's cycles are counted by: its clock with its drifts, without its jumps."""
-        if isinstance(clock, FaultyClock):
-            true_ns = int(clock.pace_ns(np.array([true_ns], np.int64))[0])
-        return undisturbed(clock).to_reference(true_ns)
-
-
-class ExposureLine:
-    """The camera's output that is high during exposures, with its edges as the box captures them.
-
-    A frame that is lost on its way to the host was exposed all the same.
-    """
-
-    def __init__(self, world: World, camera: FreeRun) -> None:
-        self._world, self._camera = world, camera
-        self._begin()
-        world.on_begin.append(self._begin)
-
-    def _begin(self) -> None:
-        self._run, self._read = self._camera.run, 0
-        jitter_us = self._world.settings.clocks.exposure_jitter_us
-        self._jitter = Jitter(self._world.seed, "exposure edges", jitter_us)
-
-    def edges_ns(self, until_ns: int) -> I64:
-        """True times, with jitter, of the starts of exposures since the last call, ns.
-
-        Args:
-            until_ns: exposures that begin after this true time are left for a later call.
-        """
-        camera = self._camera
-        if camera.run != self._run:
-            self._run, self._read = camera.run, 0
-        ticks = camera.ticks(self._read, until_ns)
-        self._read += len(ticks)
-        true_ns = camera.true_ns(ticks)
-        exposed = np.ones(len(ticks), np.bool_)
-        for fault, begin_ns, end_ns in self._world.faults.spans(DeviceGone):
-            if fault.device == "frame_camera":
-                exposed &= (true_ns < begin_ns) | (true_ns >= end_ns)
-        edges: I64 = (true_ns + self._jitter.ns(ticks))[exposed]
-        return edges
-
-
-REPORT_NS = 100_000
-"""From an edge to its report; longer than any jitter, so that no edge is reported early."""
-_BITS = 1 << 12
-"""Bits of the code that are made at first; more when they are needed."""
-
-
-class MockSyncBox:
+class MockSyncBox(Ticks):
     """Ticks at a fixed rate with a code on the line, and an input for the camera's exposures.
 
     Args:
         exposures: the frame camera's output, where it is wired.
-
-    Attributes:
-        run: counts the starts, so that devices notice a new train.
     """
 
     def __init__(self, world: World, exposures: ExposureLine | None = None) -> None:
-        self._world, self._exposures = world, exposures
+        self._exposures = exposures
         self._clock_reader = ClockReader(world, "sync_box")
-        self._reset()
-        self.run = 0
-        world.on_begin.append(self._reset)
+        super().__init__(world)
 
-    def _reset(self) -> None:
-        self.rate_hz = 0.0
-        self.started_ns = 0
-        self.stopped_ns: int | None = 0
-        self._dark_ns = NEVER
-        self.clock = ClockMap.line(0, 0)
-        self._read = 0
-        self._code: tuple[int, Code] = 1, "lfsr"
-        self._bits: U8 = np.zeros(0, np.uint8)
+    def _clear(self) -> None:
+        super()._clear()
+        self.started_ns, self._dark_ns, self._read = 0, NEVER, 0
+        self._code = CodeBits(1)
         self._reports = _PulseFaults(self._world, self, "sync_box")
 
     def connect(self) -> None:
@@ -234,43 +232,46 @@ class MockSyncBox:
         if not 1 <= seed <= SEEDS:
             raise RigError("sync box", f"seed {seed}: must lie between 1 and {SEEDS}")
         world = self._world
-        self.run += 1
-        self.started_ns = world.now_ns if at_ns is None else at_ns
-        self.rate_hz, self.stopped_ns, self._read = rate_hz, None, 0
+        self.started_ns, self._read = world.now_ns if at_ns is None else at_ns, 0
         clock = ClockMap.line(self.started_ns, 0, world.clocks.sync_box_ppb)
-        self.clock = faulty(clock, "sync_box", world.faults)
-        self._code, self._bits = (seed, code), code_bits(seed, _BITS, code)
+        self._tick_on(faulty(clock, "sync_box", world.faults), 1e9 / rate_hz)
+        self._code = CodeBits(seed, code)
         self._reports = _PulseFaults(world, self, "sync_box")
         if world.faults.recording_ns is None:
             world.faults.recording_ns = self.started_ns
         # a box without power does not tick, and does not go on by itself when it has some again
         self._dark_ns = world.faults.lost_power_ns("sync_box", self.started_ns)
 
+    def _last_ns(self, until_ns: int) -> int:
+        return super()._last_ns(min(until_ns, self._dark_ns - 1))
+
+    def bits(self, ticks: I64) -> U8:
+        """Return the code at ticks."""
+        return self._code.upto(int(ticks.max(initial=-1)) + 1)[ticks]
+
     def read_pulses(self) -> PulseChunk:
-        """Pulses sent since the last call, box clock, whole microseconds."""
+        """Return the pulses sent since the last call, box clock, whole microseconds."""
         now_ns = self._world.now_ns
-        if self.rate_hz == 0.0:
-            return PulseChunk(np.empty(0, np.int64))
         ticks = self.ticks(self._read, now_ns - REPORT_NS)
         self._read += len(ticks)
         ticks = ticks[self.bits(ticks) == 1]
         true_ns, sent = self._reports.of(
-            ticks, self.true_ns(ticks), self.box_ns(ticks), now_ns - 2 * REPORT_NS
+            ticks, self.true_ns(ticks), self.shown_ns(ticks), now_ns - 2 * REPORT_NS
         )
         if isinstance(self.clock, FaultyClock):
             sent = sent + self.clock.jumped_ns(true_ns)
         return PulseChunk(sent // 1000 * 1000)
 
     def read_exposures(self) -> PulseChunk:
-        """Starts of exposures since the last call, box clock, whole microseconds."""
-        if self._exposures is None or self.rate_hz == 0.0:
+        """Return the starts of exposures since the last call, box clock, whole microseconds."""
+        if self._exposures is None or not self.ticking:
             return PulseChunk(np.empty(0, np.int64))
         edges = self._exposures.edges_ns(self._world.now_ns - REPORT_NS)
         edges = edges[(edges >= self.started_ns) & (edges < self._dark_ns)]
         return PulseChunk(self.clock.to_reference(edges) // 1000 * 1000)
 
     def read_clock(self) -> ClockReads:
-        """The box's clock now, whole microseconds: one row."""
+        """Return the box's clock now, whole microseconds: one row."""
         return self._clock_reader.read(self.clock, 1000)
 
     def stop(self, at_ns: int | None = None) -> None:
@@ -281,53 +282,6 @@ class MockSyncBox:
     def close(self) -> None:
         """Give the device back."""
         self.stop()
-
-    # -- what the other simulated devices see ----------------------------------------------
-
-    def ticks(self, first: int, until_ns: int) -> I64:
-        """Numbers of the ticks from `first` on that came up to the true time `until_ns`."""
-        if self.rate_hz == 0.0:
-            return np.empty(0, np.int64)
-        until_ns = min(until_ns, self._dark_ns - 1)
-        if self.stopped_ns is not None:
-            until_ns = min(until_ns, self.stopped_ns)
-        end = max(self.tick_at(until_ns + 1), first)
-        return np.arange(first, end, dtype=np.int64)
-
-    def tick_at(self, true_ns: int) -> int:
-        """Number of the first tick at or after a true time, 0 at the least."""
-        if self.rate_hz == 0.0:
-            return 0
-        box = undisturbed(self.clock).to_reference(true_ns)
-        guess = max(int(box * self.rate_hz / 1e9) + 1, 0)
-        while guess and self._true_of(guess - 1) >= true_ns:
-            guess -= 1
-        while self._true_of(guess) < true_ns:
-            guess += 1
-        return guess
-
-    def _true_of(self, tick: int) -> int:
-        """`true_ns` of one tick, without arrays: it is asked often."""
-        if isinstance(self.clock, FaultyClock):
-            return int(self.true_ns(np.array([tick], np.int64))[0])
-        return self.clock.to_device(round(tick * (1e9 / self.rate_hz)))
-
-    def box_ns(self, ticks: I64) -> I64:
-        """Ticks on the box's clock, ns."""
-        return np.rint(ticks * (1e9 / self.rate_hz)).astype(np.int64)
-
-    def true_ns(self, ticks: I64) -> I64:
-        """True times of ticks, ns."""
-        true_ns = undisturbed(self.clock).to_device(self.box_ns(ticks))
-        return self.clock.cycle_ns(true_ns) if isinstance(self.clock, FaultyClock) else true_ns
-
-    def bits(self, ticks: I64) -> U8:
-        """The code at ticks."""
-        most = int(ticks.max(initial=-1)) + 1
-        if most > len(self._bits):
-            seed, code = self._code
-            self._bits = code_bits(seed, max(most, 2 * len(self._bits)), code)
-        return self._bits[ticks]
 
 
 class SyncInput:
@@ -410,7 +364,7 @@ class _PulseFaults:
         """Ticks whose pulses suffer from a kind of fault, and by how much, ns."""
         ticks: list[int] = []
         shift: list[int] = []
-        for fault in self._book.of(kind) if self._box.rate_hz else ():
+        for fault in self._book.of(kind) if self._box.ticking else ():
             due = self._book.due_ns(fault)
             if fault.device == self._device and due is not None:
                 first = self._box.tick_at(due)

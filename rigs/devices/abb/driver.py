@@ -14,19 +14,17 @@ import threading
 import time
 from collections.abc import Sequence
 
-from sliplab.rigs.core.arm_driver import Run, SegmentWatch, has_left, is_at
+from sliplab.rigs.core.arm_driver import ArmDriver, Run, SegmentWatch, has_left, is_at
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
     DeviceHealth,
     Pose,
     Progress,
-    RigError,
     Segment,
 )
-from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.pose import compose, distance_mm
-from sliplab.rigs.core.pose_stream import PoseStream, Sample
+from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.devices.abb.egm import EgmCounts, EgmFault, EgmPose, EgmReceiver
 from sliplab.rigs.devices.abb.program import PAUSE_S, motion_program
 from sliplab.rigs.devices.abb.rws import (
@@ -41,7 +39,7 @@ from sliplab.rigs.devices.abb.rws import (
 )
 from sliplab.rigs.devices.abb.settings import AbbSettings
 from sliplab.rigs.devices.abb.watchdog import Watchdog
-from sliplab.storage.streams import Json, PoseChunk, PulseChunk
+from sliplab.storage.streams import Json
 
 ENTRY, MODULES = "motion_program_main", "motion_program"
 """Where the task begins that runs motion programs, and what the names of its modules begin with."""
@@ -67,13 +65,12 @@ AGREE_MM = 0.5
 """How far EGM and the web services may differ in where the arm stands, mm."""
 
 
-class AbbArm:
+class AbbArm(ArmDriver):
     """An ABB arm by motion programs; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSettings) -> None:
+        super().__init__(settings.limits)
         self._settings = settings
-        self._guard = Guard(settings.limits)
-        self._stream = PoseStream()
         self._tool = Pose(settings.tool.tcp_mm, settings.tool.tcp_rotvec_deg)
         self._web: WebServices | None = None
         self._egm: EgmReceiver | None = None
@@ -82,10 +79,8 @@ class AbbArm:
         self._closing = threading.Event()
         self._status: WebStatus | None = None
         self._asked_s = 0.0
-        self._lost: str | None = "not connected"
         self._planned: Pose | None = None
         self._watch: SegmentWatch | None = None
-        self._run = Run((), done=True)
         self._starting = threading.Lock()
         self._stopping = threading.Lock()
         self._may_move = False
@@ -189,10 +184,7 @@ class AbbArm:
             RigError: it is still moving, or the path is empty.
         """
         with self._starting:
-            if not path:
-                raise RigError("arm", "was given an empty path")
-            if not self._run.done:
-                raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+            self._refuse(path, moving=not self._run.done)
             if self._lost is not None or self._web is None:
                 raise self._fault(ArmState.DISCONNECTED, "cannot move")
             begin = self.pose()
@@ -216,11 +208,10 @@ class AbbArm:
                 self._give_up()
                 raise ArmFault("arm", f"did not take a path: {error}") from None
             self._began_s = time.monotonic()
-            run.thread = threading.Thread(target=self._follow, args=(run,), daemon=True)
-            run.thread.start()
+            self._begin(run)
 
     def progress(self) -> Progress:
-        """How far the path has come.
+        """Return how far the path has come.
 
         Raises:
             ArmFault: the path was given up for a reason that `state` does not tell.
@@ -229,14 +220,6 @@ class AbbArm:
         if run.error is not None and run.done and state is ArmState.DISCONNECTED:
             raise run.error  # it says more than that the arm cannot be reached
         return run.progress(state)
-
-    def read_poses(self) -> PoseChunk:
-        """Measured poses since the last call; the controller may send none between two paths."""
-        return self._stream.read()
-
-    def read_pulses(self) -> PulseChunk:
-        """Always empty: EGM carries no digital input, and the web services are far too slow."""
-        return self._stream.read_pulses()
 
     def stop(self) -> None:
         """Stop the program and the arm; safe at any time; never unlocks anything.
@@ -257,8 +240,7 @@ class AbbArm:
                 raise self._not_stopped[1]  # another thread has tried meanwhile
             if self._may_move:
                 self._halt(run)
-        if run.thread is not None and run.thread is not threading.current_thread():
-            run.thread.join(SILENCE_S + 1.0)
+        run.join(SILENCE_S + 1.0)
 
     def close(self) -> None:
         """Stop if it moves, and give every connection back.
@@ -565,8 +547,8 @@ class AbbArm:
             self._may_move = False
         self._stream.wake()
 
-    def _follow(self, run: Run) -> None:
-        """A path's thread: until all segments have ended, or something else has."""
+    def _follow_path(self, run: Run) -> None:
+        """Wait until all segments have ended, or something else has."""
         watch = self._watch
         assert watch is not None
 
@@ -577,26 +559,20 @@ class AbbArm:
             return ended() or not self.state().healthy or self._why_given_up() is not None
 
         seconds = sum(self._seconds(run))
-        try:
-            if not self._stream.wait_for(over, 1.5 * seconds + OVERTIME_S):
-                raise ArmFault("arm", f"did not end a path of {seconds:.1f} s in time")
-            why = self._why_given_up()
-            if why is not None and not ended():
-                raise ArmFault("arm", why)
-            if self._has_stopped(self._began_s):  # the last poses may still be on their way
-                self._stream.wait_for(lambda: watch.done, SILENCE_S)
-                self._finish(run)
-            elif self._lost is not None and not run.cancelled:
-                self._give_up()
-        except Exception as error:  # a thread that dies must not look like a stop from outside
-            given_up = ArmFault("arm", f"its path was given up: {error!r}")
-            run.error = error if isinstance(error, ArmFault) else given_up
+        if not self._stream.wait_for(over, 1.5 * seconds + OVERTIME_S):
+            raise ArmFault("arm", f"did not end a path of {seconds:.1f} s in time")
+        why = self._why_given_up()
+        if why is not None and not ended():
+            raise ArmFault("arm", why)
+        if self._has_stopped(self._began_s):  # the last poses may still be on their way
+            self._stream.wait_for(lambda: watch.done, SILENCE_S)
+            self._finish(run)
+        elif self._lost is not None and not run.cancelled:
             self._give_up()
-        finally:
-            run.done = True
-            if self._has_stopped(self._began_s):
-                self._may_move = False
-            self._stream.wake()
+
+    def _path_is_over(self) -> None:
+        if self._has_stopped(self._began_s):
+            self._may_move = False
 
     def _why_given_up(self) -> str | None:
         """Why the path is not to be followed to its end, if so: no poses, or another speed."""
@@ -660,7 +636,3 @@ class AbbArm:
             distance_mm(one, segment.to) / segment.speed_mm_s + PAUSE_S
             for one, segment in zip(places, run.path, strict=False)
         ]
-
-    def _fault(self, state: ArmState, what: str) -> ArmFault:
-        reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
-        return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")

@@ -23,9 +23,18 @@ from urllib.parse import parse_qsl
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
-from sliplab.rigs.core.fakes import CLOCK_BACK_S, PACKETS_LOST, START_S, Fault, Kind, Stage
-from sliplab.rigs.core.pose import compose, from_quaternion, inverse, quaternion
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fakes import (
+    CLOCK_BACK_S,
+    PACKETS_LOST,
+    START_S,
+    FakeController,
+    Fault,
+    FaultPlan,
+    Kind,
+    Stage,
+)
+from sliplab.rigs.core.pose import compose, distance_mm, from_quaternion, inverse, quaternion
 from sliplab.rigs.devices.abb.fake_http import HttpServer, Reply
 from sliplab.rigs.devices.abb.watchdog import BEAT, ECHO, LIMIT
 
@@ -122,7 +131,6 @@ def read_program(data: bytes) -> Program:
     return Program(tool, mass_kg, tuple(commands))
 
 
-HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
 ACCELERATION_MM_S2 = 500.0
 STOP_MM_S2 = 2000.0
@@ -138,19 +146,16 @@ _NO_AXIS = "9E+09"
 """What RAPID says of an external axis that is not there."""
 
 
-class FakeAbb:
-    """One fake controller; `start` opens its port, `close` gives it back.
+class FakeAbb(FakeController):
+    """One fake controller.
 
     Args:
-        host: loopback address of its own.
+        host, motion, rate, clock: as of any `FakeController`.
         port: of its web services.
         egm: address and UDP port that it sends its poses to.
-        motion: where the tool centre point is.
-        rate: controller seconds a host second.
         cycle_hz: EGM packets a controller second; 250 from the real one.
         egm_point: what EGM tells: the tool centre point, or the flange.
         faults: what will go wrong.
-        clock: the controller's; one of its own, at `rate`, if left out.
         watchdog: whether the watchdog module is loaded. It counts the host's seconds, whatever
             the rate: it watches the host.
         answer_s: how long each answer takes.
@@ -171,21 +176,20 @@ class FakeAbb:
         host: str,
         port: int,
         egm: tuple[str, int],
-        motion: Motion | None = None,
+        motion: StraightMotion | None = None,
         rate: float = 1.0,
         cycle_hz: int = 250,
         egm_point: str = "tool",
         faults: Sequence[Fault] = (),
         joints_deg: Sequence[float] = JOINTS_DEG,
-        clock: CycleClock | None = None,
+        clock: ControllerClock | None = None,
         watchdog: bool = True,
         answer_s: float = 0.0,
         egm_time: bool = True,
     ) -> None:
-        self.host, self.port, self._egm = host, port, egm
-        self.motion = motion or StraightMotion(HOME)
-        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
-        self.faults = list(faults)
+        super().__init__(host, motion, clock, rate)
+        self.port, self._egm = port, egm
+        self._faults = FaultPlan(faults, self._happen)
         self.controller, self.mode = "motoron", "AUTO"
         self.running = False
         self.speed_percent = 100.0
@@ -214,13 +218,6 @@ class FakeAbb:
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._unplugging: threading.Thread | None = None
-
-    def __enter__(self) -> FakeAbb:
-        self.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def start(self) -> None:
         """Open the port and run. Raises OSError if it is taken."""
@@ -263,14 +260,6 @@ class FakeAbb:
         """How many clients are logged in."""
         return 0 if self._http is None else self._http.sessions
 
-    def pose(self) -> Pose:
-        """Where the tool centre point is now."""
-        return self.motion.pose(self.clock.now_s())
-
-    def moving(self) -> bool:
-        """Whether it is on its way now."""
-        return self.motion.moving(self.clock.now_s())
-
     def _unplug(self) -> None:
         """Cut the connections from a thread of its own: a handler cannot wait for itself to end."""
         http, self._http = self._http, None
@@ -304,11 +293,6 @@ class FakeAbb:
         self._halt()
         self.controller, self.mode = states[kind]
 
-    def _reach(self, stage: Stage) -> None:
-        for fault in [fault for fault in self.faults if fault.stage is stage]:
-            self.faults.remove(fault)
-            self._happen(fault.kind)
-
     def _halt(self) -> None:
         self.running = False
         self._todo.clear()
@@ -340,12 +324,10 @@ class FakeAbb:
     def _step(self, t_s: float) -> None:
         moving = self.motion.moving(t_s)
         if moving and self._left_from is not None:
-            gone = abs(_gone(self._left_from, self.motion.pose(t_s)))
-            for fault in [f for f in self.faults if f.stage is Stage.MOVING and gone >= f.after_mm]:
-                self.faults.remove(fault)
-                self._happen(fault.kind)
+            gone_mm = distance_mm(self._left_from, self.motion.pose(t_s))
+            self._faults.reach(Stage.MOVING, gone_mm)
         elif not moving and not self.running:
-            self._reach(Stage.IDLE)
+            self._faults.reach(Stage.IDLE)
         if self.running and not moving and t_s >= self._wait_until_s:
             self._next(t_s)
         late = self.clock.now_s() - t_s > LATE_S * self.clock.rate
@@ -394,9 +376,9 @@ class FakeAbb:
         if self._answer_s:
             self._closing.wait(self._answer_s)
         with self._lock:
-            self._reach(Stage.CONNECTING)
+            self._faults.reach(Stage.CONNECTING)
             if method == "PUT":
-                self._reach(Stage.UPLOADING)
+                self._faults.reach(Stage.UPLOADING)
             if self._silent or not self.web_on:
                 return None
             if path.startswith("fileservice/"):
@@ -512,10 +494,6 @@ class FakeAbb:
             "actions": "",
             "argc": "0",
         }
-
-
-def _gone(one: Pose, other: Pose) -> float:
-    return sum((a - b) ** 2 for a, b in zip(one.xyz_mm, other.xyz_mm, strict=True)) ** 0.5
 
 
 def main() -> None:

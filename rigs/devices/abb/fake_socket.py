@@ -11,16 +11,22 @@ from __future__ import annotations
 
 import asyncio
 import struct
-import time
 from collections.abc import Sequence
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, StraightMotion
-from sliplab.rigs.core.fakes import Connections, Fault, Kind, LoopThread, Stage
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fakes import (
+    Connections,
+    FakeController,
+    Fault,
+    FaultPlan,
+    Kind,
+    LoopThread,
+    Stage,
+)
 from sliplab.rigs.core.pose import distance_mm, from_quaternion, quaternion
 from sliplab.rigs.devices.abb.rapid_socket import ARGUMENTS, Command
 
-HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, 10.0, 20.0, 0.0, 60.0, 0.0)
 ACCELERATION_MM_S2 = 500.0
 INFO = b"SlipLab stand-in of a RAPID socket server"
@@ -28,16 +34,13 @@ _POLL_S = 0.001
 _DONE, _REFUSED = b"\x00\x01", b"\x00\x00"
 
 
-class FakeRapidServer:
-    """One fake; `start` opens its port, `close` gives it back.
+class FakeRapidServer(FakeController):
+    """One fake server.
 
     Args:
-        host: loopback address of its own.
+        host, motion, rate, clock: as of any `FakeController`.
         port: of the server.
-        rate: controller seconds a host second.
         faults: what will go wrong.
-        motion: where the tool centre point is.
-        clock: the controller's; one of its own, at `rate`, if left out.
 
     Attributes:
         speed_percent: the pendant's speed ratio, for moves that begin from now on; the server
@@ -51,12 +54,11 @@ class FakeRapidServer:
         rate: float = 1.0,
         faults: Sequence[Fault] = (),
         motion: StraightMotion | None = None,
-        clock: CycleClock | None = None,
+        clock: ControllerClock | None = None,
     ) -> None:
-        self.host, self.port = host, port
-        self.motion = motion or StraightMotion(HOME)
-        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
-        self.faults = list(faults)
+        super().__init__(host, motion, clock, rate)
+        self.port = port
+        self._faults = FaultPlan(faults, self._happen)
         self.tool = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self.speed_percent = 100.0
         self._speed_mm_s = 10.0
@@ -65,13 +67,6 @@ class FakeRapidServer:
         self._connections = Connections()
         self._thread: LoopThread | None = None
         self._turn: asyncio.Lock | None = None
-
-    def __enter__(self) -> FakeRapidServer:
-        self.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def start(self) -> None:
         """Open the port and run. Raises OSError if it is taken."""
@@ -103,14 +98,6 @@ class FakeRapidServer:
         self._stopped = self._silent = False
         self._thread.call(self._listen)
 
-    def pose(self) -> Pose:
-        """Where the tool centre point is now."""
-        return self.motion.pose(self.clock.now_s())
-
-    def moving(self) -> bool:
-        """Whether it is on its way now."""
-        return self.motion.moving(self.clock.now_s())
-
     def _listen(self) -> None:
         self._turn = asyncio.Lock()
         self._connections.listen(self.host, self.port, self._talk)
@@ -125,12 +112,6 @@ class FakeRapidServer:
         else:
             self._stopped = True
             self.motion.stop(ACCELERATION_MM_S2, self.clock.now_s())
-
-    def _reach(self, stage: Stage, gone_mm: float = 0.0) -> None:
-        due = [f for f in self.faults if f.stage is stage and gone_mm >= f.after_mm]
-        for fault in due:
-            self.faults.remove(fault)
-            self._happen(fault.kind)
 
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         assert self._turn is not None
@@ -147,7 +128,7 @@ class FakeRapidServer:
                 command = Command(number)
                 layout = struct.Struct(">" + ARGUMENTS[command])
                 values = layout.unpack(await reader.readexactly(layout.size))
-                self._reach(Stage.CONNECTING)
+                self._faults.reach(Stage.CONNECTING)
                 reply = await self._do(command, values)
                 if self._silent:
                     await asyncio.get_running_loop().create_future()
@@ -184,7 +165,7 @@ class FakeRapidServer:
         zone_mm = min(self._zone_mm, distance_mm(begin, to) / 2)  # RAPID's own rule
         while self.moving() or self._stopped:
             here = self.pose()
-            self._reach(Stage.MOVING, distance_mm(begin, here))
+            self._faults.reach(Stage.MOVING, distance_mm(begin, here))
             if not self._stopped and 0 < distance_mm(here, to) < zone_mm:
                 return
             await self._tick()

@@ -17,22 +17,19 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
-from sliplab.rigs.core.arm_driver import Run
+from sliplab.rigs.core.arm_driver import ArmDriver, Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
     DeviceHealth,
     Pose,
-    Progress,
-    RigError,
     Segment,
 )
-from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.pose import angle_deg, between, distance_mm, from_quaternion, quaternion
-from sliplab.rigs.core.pose_stream import PoseStream, Sample
+from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket, socket_health
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
-from sliplab.storage.streams import PoseChunk, PulseChunk
+from sliplab.storage.streams import PoseChunk
 
 T = TypeVar("T")
 ANSWER_S = 2.0
@@ -51,17 +48,15 @@ ARRIVED_MM = 0.1
 """A segment that ends further than this from its target was stopped by somebody."""
 
 
-class AbbSocketArm:
+class AbbSocketArm(ArmDriver):
     """An ABB arm by the RAPID socket server; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: AbbSocketSettings) -> None:
+        super().__init__(settings.limits)
         self._settings = settings
-        self._guard = Guard(settings.limits)
-        self._stream = PoseStream()
         self._link: RapidSocket | None = None
-        self._lost: str | None = "not connected"
         self._info = ""
-        self._run = Run((), done=True)
+        self._leaves_from = Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self._one = threading.Lock()
         self._may_move = False
         """A path was begun, and nobody has seen the arm at rest since."""
@@ -109,7 +104,7 @@ class AbbSocketArm:
                 self._watched(self._look)
         last = self._stream.last
         if last is None:
-            raise self._fault("has no pose")
+            raise self._fault(self.state(), "has no pose")
         return last.pose
 
     def now_ns(self) -> int:
@@ -130,24 +125,16 @@ class AbbSocketArm:
             ArmFault: no connection, or no answer.
             RigError: it is still moving, or the path is empty.
         """
-        if not path:
-            raise RigError("arm", "was given an empty path")
-        if not self._run.done:
-            raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+        self._refuse(path, moving=not self._run.done)
         if self._lost is not None:
-            raise self._fault("cannot move")
+            raise self._fault(self.state(), "cannot move")
         begin = self.pose()
         self._guard.check(begin, path)
         with self._one:
             self._guard.check_joints(self._watched(lambda: self._ask(Command.JOINTS)))
-        run = Run(path)
-        run.thread = threading.Thread(target=self._follow, args=(run, begin), daemon=True)
-        self._run, self._may_move = run, True
-        run.thread.start()
-
-    def progress(self) -> Progress:
-        """How far the path has come. Raises ArmFault if it was given up."""
-        return self._run.progress(self.state())
+        self._leaves_from = begin
+        self._run, self._may_move = Run(path), True
+        self._begin(self._run)
 
     def read_poses(self) -> PoseChunk:
         """Poses since the last call, on the host's clock: one a piece, and one now if it stands.
@@ -158,10 +145,6 @@ class AbbSocketArm:
             with self._one:
                 self._watched(self._look)
         return self._stream.read()
-
-    def read_pulses(self) -> PulseChunk:
-        """Always empty: the server tells no inputs."""
-        return self._stream.read_pulses()
 
     def stop(self) -> None:
         """Send no further piece and wait for the one that runs: there is no stop on this wire.
@@ -175,7 +158,7 @@ class AbbSocketArm:
         run = self._run
         run.cancelled = True
         if run.thread is not None and run.thread is not threading.current_thread():
-            run.thread.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
+            run.join(self._bound_s(self._settings.segment_s) + ANSWER_S)
             if not run.done:
                 raise ArmFault("arm", "does not end its move: press its emergency stop")
         if self._may_move:
@@ -230,27 +213,19 @@ class AbbSocketArm:
         if link is not None:
             link.close()
 
-    def _follow(self, run: Run, begin: Pose) -> None:
-        """A path's thread: piece after piece."""
-        at = begin
-        try:
-            for segment in run.path:
-                start_ns = time.monotonic_ns()
-                make = partial(self._segment, run, at, segment)
-                with self._one:
-                    arrived = self._watched(make)
-                if not arrived:
-                    break
-                run.finished.append((start_ns, time.monotonic_ns()))
-                at = segment.to
-            else:
-                self._may_move = False
-        except Exception as error:  # a thread that dies must not look like a stop from outside
-            given_up = ArmFault("arm", f"its path was given up: {error!r}")
-            run.error = error if isinstance(error, ArmFault) else given_up
-        finally:
-            run.done = True
-            self._stream.wake()
+    def _follow_path(self, run: Run) -> None:
+        """Send piece after piece."""
+        at = self._leaves_from
+        for segment in run.path:
+            start_ns = time.monotonic_ns()
+            make = partial(self._segment, run, at, segment)
+            with self._one:
+                arrived = self._watched(make)
+            if not arrived:
+                return
+            run.finished.append((start_ns, time.monotonic_ns()))
+            at = segment.to
+        self._may_move = False
 
     def _segment(self, run: Run, begin: Pose, segment: Segment) -> bool:
         """Make one segment; whether its end was reached. Raises RapidError."""
@@ -322,6 +297,3 @@ class AbbSocketArm:
 
     def _bound_s(self, seconds: float) -> float:
         return 2 * seconds + OVERTIME_S
-
-    def _fault(self, what: str) -> ArmFault:
-        return ArmFault("arm", f"{what}: disconnected ({self._lost}); {self.state().advice}")

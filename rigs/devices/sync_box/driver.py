@@ -12,18 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from sliplab.protocols.timing import Code
 from sliplab.rigs.core.capabilities import DeviceHealth, RigError
-from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, code_bits
+from sliplab.rigs.core.pulse_code import LONGEST_GAP_TICKS, SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import LEAST_HZ, MOST_HZ, NAME, whole
 from sliplab.rigs.devices.sync_box.port import DEVICE, SyncBoxFault, SyncPort, began_anew
 from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 from sliplab.storage.streams import ClockReads, PulseChunk
 
-_BITS = 1 << 12
-"""Bits of the code that are made at first; more when they are needed."""
 _FARTHEST_TICKS = 1 << 24
 """A tick further on than this is no tick of a trial: 4 hours at 1,000 Hz."""
 _MOST_MISSED = 10_000
@@ -49,20 +46,6 @@ class Losses:
         return any((self.pulses, self.exposures, self.told_by_box, self.lines, self.unread))
 
 
-class Bits:
-    """A code without an end, made as far as somebody asked."""
-
-    def __init__(self, seed: int, code: Code) -> None:
-        self._seed, self._code = seed, code
-        self._made = code_bits(seed, _BITS, code)
-
-    def upto(self, ticks: int) -> npt.NDArray[np.uint8]:
-        """The bits of the first `ticks` ticks, uint8, and perhaps of more."""
-        if ticks > len(self._made):
-            self._made = code_bits(self._seed, 2 * ticks, self._code)
-        return self._made
-
-
 class Train:
     """Checks reports, and counts what is missing.
 
@@ -73,7 +56,7 @@ class Train:
     """
 
     def __init__(self, millihertz: int, seed: int, code: Code) -> None:
-        self._millihertz, self._bits = millihertz, Bits(seed, code)
+        self._millihertz, self._bits = millihertz, CodeBits(seed, code)
         self._next_tick = self._next_exposure = 0
         self._last_exposure_us = 0
         self.first_us: int | None = None

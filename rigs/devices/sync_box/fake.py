@@ -17,8 +17,7 @@ from functools import cached_property
 from typing import get_args
 
 from sliplab.protocols.timing import Code
-from sliplab.rigs.core.pulse_code import SEEDS
-from sliplab.rigs.devices.sync_box.driver import Bits
+from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 
 TURN_S = 0.001
@@ -39,9 +38,9 @@ class _Plan:
     code: Code
 
     @cached_property
-    def bits(self) -> Bits:
+    def bits(self) -> CodeBits:
         """The code, tick by tick."""
-        return Bits(self.seed, self.code)
+        return CodeBits(self.seed, self.code)
 
 
 @dataclass(frozen=True)

@@ -19,25 +19,23 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from sliplab.rigs.core.arm_driver import Run
+from sliplab.rigs.core.arm_driver import ArmDriver, Run
 from sliplab.rigs.core.capabilities import (
     ArmFault,
     ArmState,
     DeviceHealth,
     Pose,
-    Progress,
     RigError,
     Segment,
 )
-from sliplab.rigs.core.guard import Guard
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
-from sliplab.rigs.core.pose_stream import PoseStream, Sample
+from sliplab.rigs.core.pose_stream import Sample
 from sliplab.rigs.devices.ur import ports as ur_ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
 from sliplab.rigs.devices.ur.ports import ur_health
 from sliplab.rigs.devices.ur.rtde import OUTPUTS, Packet, RtdeError, RtdeReader, UrStatus, status_of
 from sliplab.rigs.devices.ur.settings import UrSettings
-from sliplab.storage.streams import Json, PoseChunk, PulseChunk
+from sliplab.storage.streams import Json
 
 ANSWER_S = 3.0
 """Connecting the pose stream, with every answer of its set-up, s."""
@@ -69,21 +67,18 @@ _FULL_SPEED = 0.999
 """The speed slider is up when it stands at least here."""
 
 
-class UrArm:
+class UrArm(ArmDriver):
     """A Universal Robots arm; an `Arm` of `rigs.core.capabilities`."""
 
     def __init__(self, settings: UrSettings) -> None:
+        super().__init__(settings.limits)
         self._settings = settings
-        self._guard = Guard(settings.limits)
-        self._stream = PoseStream()
         self._reader: RtdeReader | None = None
         self._control: ControlProcess | None = None
         self._listener: threading.Thread | None = None
         self._status: UrStatus | None = None
-        self._lost: str | None = "not connected"
         self._remote = True
         self._closing = False
-        self._run = Run((), done=True)
         self._moved_ns: int | None = None
         """Host's time when the last move was handed over; None once the arm was seen at rest."""
         self._missing = 0
@@ -180,12 +175,10 @@ class UrArm:
             RigError: it is still moving, or the path is empty.
         """
         with self._starting:
-            if not path:
-                raise RigError("arm", "was given an empty path")
+            self._refuse(path, moving=False)
             self._check_remote()
             state = self.state()
-            if state is ArmState.MOVING:
-                raise RigError("arm", "is still moving; wait for its path to end, or stop it")
+            self._refuse(path, moving=state is ArmState.MOVING)
             if state is not ArmState.READY:
                 raise self._fault(state, "cannot move")
             self._check(path)
@@ -196,24 +189,7 @@ class UrArm:
             except ArmFault:
                 run.done = True
                 raise
-            run.thread = threading.Thread(target=self._follow, args=(run,), daemon=True)
-            run.thread.start()
-
-    def progress(self) -> Progress:
-        """How far the path has come.
-
-        Raises:
-            ArmFault: the path was given up for a reason that `state` does not tell.
-        """
-        return self._run.progress(self.state())
-
-    def read_poses(self) -> PoseChunk:
-        """Poses since the last call, one a packet."""
-        return self._stream.read()
-
-    def read_pulses(self) -> PulseChunk:
-        """Rising edges of the sync input since the last call, known to one packet."""
-        return self._stream.read_pulses()
+            self._begin(run)
 
     def stop(self) -> None:
         """Stop the arm by every way that is left; never unlocks anything.
@@ -248,8 +224,7 @@ class UrArm:
                     f"move after {1 / WATCHDOG_HZ:g} s: look at the arm before you go near it",
                 )
         self._moved_ns = None
-        if run.thread is not None and run.thread is not threading.current_thread():
-            run.thread.join(STILL_S)
+        run.join(STILL_S)
         run.done = True
 
     def close(self) -> None:
@@ -442,24 +417,19 @@ class UrArm:
             raise self._fault(self.state(), "did not take a move")
         return True
 
-    def _follow(self, run: Run) -> None:
-        """A path's thread: wait for each segment to end, hand over the next one."""
-        try:
-            for index, segment in enumerate(run.path):
-                if index and not self._send(run, segment):
-                    break
-                times = self._await_segment(run, segment)
-                if times is None:
-                    break
-                run.finished.append(times)
-        except Exception as error:  # a thread that dies must not look like a stop from outside
-            given_up = ArmFault("arm", f"its path was given up: {error!r}")
-            run.error = error if isinstance(error, ArmFault) else given_up
-            if not (self._ask_control_to_stop() and self._wait_still()):
-                self._end_program()
-        finally:
-            run.done = True
-            self._stream.wake()
+    def _follow_path(self, run: Run) -> None:
+        """Wait for each segment to end, and hand over the next one."""
+        for index, segment in enumerate(run.path):
+            if index and not self._send(run, segment):
+                return
+            times = self._await_segment(run, segment)
+            if times is None:
+                return
+            run.finished.append(times)
+
+    def _give_up(self) -> None:
+        if not (self._ask_control_to_stop() and self._wait_still()):
+            self._end_program()
 
     def _await_segment(self, run: Run, segment: Segment) -> tuple[int, int] | None:
         """Start and end of the move that was just sent; None if it was stopped."""
@@ -566,10 +536,6 @@ class UrArm:
         if last is None:
             raise self._fault(ArmState.DISCONNECTED, "has no pose")
         return last
-
-    def _fault(self, state: ArmState, what: str) -> ArmFault:
-        reason = f" ({self._lost})" if state is ArmState.DISCONNECTED and self._lost else ""
-        return ArmFault("arm", f"{what}: {state.value}{reason}; {state.advice}")
 
 
 def _rests(status: UrStatus) -> bool:

@@ -13,13 +13,19 @@ import argparse
 import asyncio
 import struct
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import ControllerClock, CycleClock, Motion, StraightMotion
-from sliplab.rigs.core.fakes import PACKETS_LOST, Connections, Fault, Kind, LoopThread, Stage
+from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion
+from sliplab.rigs.core.fakes import (
+    PACKETS_LOST,
+    Connections,
+    FakeController,
+    Fault,
+    Kind,
+    LoopThread,
+    Stage,
+)
 from sliplab.rigs.devices.ur.fake_program import Safety, UrProgram
 from sliplab.rigs.devices.ur.rtde import (
     DATA,
@@ -153,60 +159,47 @@ def _kind(name: str) -> str:
 DASHBOARD_PORT, SCRIPT_PORT = 29999, 30003
 VERSION = (5, 11, 1, 108318)
 """PolyScope version that it says it is."""
-HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
 JOINTS_DEG = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
 _TICK_S = 0.001
 _STALL_S = 0.02
 """A fake that was kept from running this long must not blame its client for it."""
 
 
-class FakeUr:
-    """One fake robot; `start` opens its ports, `close` gives them back.
+class FakeUr(FakeController):
+    """One fake robot.
 
     Args:
-        host: loopback address of its own.
-        motion: where the tool centre point is; a straight-line motion from `HOME` if left out.
-        rate: controller seconds a host second.
+        host, motion, rate, clock: as of any `FakeController`.
         cycle_hz: controller cycles a controller second; 500 on the real one.
         digital_inputs: levels of the digital inputs by controller time in seconds.
         faults: what will go wrong.
         reach_mm: poses further from the base are outside its safety limits.
         joints_deg: what `actual_q` says.
-        clock: the controller's; one of its own, at `rate`, if left out.
     """
 
     def __init__(
         self,
         host: str,
-        motion: Motion | None = None,
+        motion: StraightMotion | None = None,
         rate: float = 1.0,
         cycle_hz: int = 500,
         digital_inputs: Callable[[float], int] = lambda t_s: 0,
         faults: Sequence[Fault] = (),
         reach_mm: float = 850.0,
         joints_deg: Sequence[float] = JOINTS_DEG,
-        clock: CycleClock | None = None,
+        clock: ControllerClock | None = None,
     ) -> None:
-        self.host, self._cycle_hz = host, cycle_hz
-        self.motion = motion or StraightMotion(HOME)
-        self.clock: CycleClock = clock or ControllerClock(time.monotonic, rate)
+        super().__init__(host, motion, clock, rate)
+        self._cycle_hz = cycle_hz
         self.program = UrProgram(
-            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, self.clock.rate
+            self.motion, reach_mm, joints_deg, digital_inputs, self._cut, faults, self.clock.rate
         )
-        self.program.faults = list(faults)
         self._cycle = int(self.clock.now_s() * cycle_hz)
         self._clients: list[Client] = []
         self._connections = Connections()
         self._silent = self._cut_off = False
         self._unsent = 0
         self._thread: LoopThread | None = None
-
-    def __enter__(self) -> FakeUr:
-        self.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def start(self) -> None:
         """Open the ports and run. Raises OSError if one of them is taken."""
@@ -231,7 +224,7 @@ class FakeUr:
 
     def will(self, fault: Fault) -> None:
         """Make something go wrong when its stage comes."""
-        self._inside(lambda: self.program.faults.append(fault))
+        self._inside(lambda: self.program.faults.add(fault))
 
     def restore_link(self) -> None:
         """Take connections again after the link was cut or went silent."""
@@ -263,14 +256,6 @@ class FakeUr:
     def unlock(self) -> None:
         """A person unlocks a protective stop, or releases an emergency or safeguard stop."""
         self._inside(lambda: setattr(self.program, "safety", Safety.NORMAL))
-
-    def pose(self) -> Pose:
-        """Where the tool centre point is now."""
-        return self.motion.pose(self.clock.now_s())
-
-    def moving(self) -> bool:
-        """Whether it is on its way now."""
-        return self.motion.moving(self.clock.now_s())
 
     def _inside(self, function: Callable[[], None]) -> None:
         assert self._thread is not None
@@ -306,7 +291,7 @@ class FakeUr:
         due = int(self.clock.now_s() * self._cycle_hz)
         late_s = (due - self._cycle) / self._cycle_hz
         if late_s > _STALL_S * self.clock.rate:
-            self.program.forgive(late_s)
+            self.program.postpone_watchdog(late_s)
         while self._cycle < due:
             self._cycle += 1
             t_s = self._cycle / self._cycle_hz
@@ -325,9 +310,9 @@ class FakeUr:
             while True:
                 size, command = HEADER.unpack(await reader.readexactly(HEADER.size))
                 body = await reader.readexactly(size - HEADER.size)
-                self.program.reach(Stage.CONNECTING)
+                self.program.faults.reach(Stage.CONNECTING)
                 if command == SETUP_INPUTS:
-                    self.program.reach(Stage.CONTROL)
+                    self.program.faults.reach(Stage.CONTROL)
                 await self._may_answer()
                 if command == DATA:
                     client.take(self.program, body)
@@ -386,7 +371,7 @@ class FakeUr:
         text = ""
         while data := await reader.read(65536):
             if "def rtde_control" in text + data.decode():
-                self.program.reach(Stage.UPLOADING)
+                self.program.faults.reach(Stage.UPLOADING)
             await self._may_answer()
             text += data.decode()
             while (whole := _whole_script(text)) is not None:

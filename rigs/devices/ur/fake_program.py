@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fake_motion import Motion
-from sliplab.rigs.core.fakes import CLOCK_BACK_S, Fault, Kind, Stage
+from sliplab.rigs.core.fake_motion import StraightMotion
+from sliplab.rigs.core.fakes import CLOCK_BACK_S, Fault, FaultPlan, Kind, Stage
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, from_ur, to_ur
 
 READY, DONE = 1, 2
@@ -51,16 +51,18 @@ class UrProgram:
         joints_deg: what the joints are said to be; a fake has no joints.
         digital_inputs: levels of the digital inputs by controller time.
         cut: what to do for the faults that concern the link.
+        faults: what will go wrong.
         rate: controller seconds a host second; the watchdog watches the host, in its seconds.
     """
 
     def __init__(
         self,
-        motion: Motion,
+        motion: StraightMotion,
         reach_mm: float,
         joints_deg: Sequence[float],
         digital_inputs: Callable[[float], int],
         cut: Callable[[Kind], None],
+        faults: Sequence[Fault] = (),
         rate: float = 1.0,
     ) -> None:
         self.motion, self._reach_mm, self._cut, self._rate = motion, reach_mm, cut, rate
@@ -74,7 +76,7 @@ class UrProgram:
         self.tcp = [0.0] * 6
         self.payload_kg = 0.0
         self.uploads = 0
-        self.faults: list[Fault] = []
+        self.faults = FaultPlan(faults, self.happen)
         self._watchdog_s: float | None = None
         self._written_s = 0.0
         self._executing = False
@@ -139,7 +141,7 @@ class UrProgram:
         else:
             self.doubles_in[index] = float(value)
 
-    def forgive(self, seconds: float) -> None:
+    def postpone_watchdog(self, seconds: float) -> None:
         """The fake itself stood still for `seconds` of controller time and heard nobody."""
         self._written_s += seconds
 
@@ -202,12 +204,6 @@ class UrProgram:
         if self.program_running:
             self.runtime = Runtime.PAUSED
 
-    def reach(self, stage: Stage) -> None:
-        """A client came to a stage; what waits for it happens."""
-        for fault in [fault for fault in self.faults if fault.stage is stage]:
-            self.faults.remove(fault)
-            self.happen(fault.kind)
-
     def unlock(self) -> bool:
         """Unlock a protective stop, if there is one; a paused program stays paused."""
         was = self.safety is Safety.PROTECTIVE_STOP
@@ -230,12 +226,7 @@ class UrProgram:
             "timestamp": lambda t_s: t_s + self.clock_shift_s,
             "actual_TCP_pose": self._tcp,
             "target_TCP_pose": self._tcp,
-            "target_TCP_speed": lambda _: [
-                *(v / MM_PER_M for v in self._speed_mm_s),
-                0.0,
-                0.0,
-                0.0,
-            ],
+            "target_TCP_speed": lambda _: self._velocity(),
             "target_speed_fraction": lambda _: self.speed_fraction,
             "actual_q": lambda _: [angle * 0.017453292519943295 for angle in self.joints_deg],
             "actual_digital_input_bits": self.digital_inputs,
@@ -247,7 +238,7 @@ class UrProgram:
         }
         return known.get(name, lambda _: 0)
 
-    def _velocity(self, t_s: float) -> list[float]:
+    def _velocity(self) -> list[float]:
         """Of the tool centre point in the last cycle, m/s; turning is left out."""
         return [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0]
 
@@ -322,11 +313,8 @@ class UrProgram:
         if self._left_from is None or not self.motion.moving(self._t) or not self.faults:
             return
         gone = distance_mm(self._left_from, self.motion.pose(self._t))
-        due = [f for f in self.faults if f.stage is Stage.MOVING and gone >= f.after_mm]
-        for fault in due:
-            self.faults.remove(fault)
-            self.happen(fault.kind)
+        self.faults.reach(Stage.MOVING, gone)
 
     def _idle_faults(self) -> None:
         if self.faults and self.runtime is Runtime.PLAYING and not self.motion.moving(self._t):
-            self.reach(Stage.IDLE)
+            self.faults.reach(Stage.IDLE)
