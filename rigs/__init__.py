@@ -1,1 +1,1 @@
-"""What does it: rig files, device capabilities, drivers, and the simulated rig."""
+"""Rig files, device capabilities, drivers, and the simulated rig."""

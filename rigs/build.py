@@ -47,7 +47,7 @@ class _MockSimulation:
         self._devices.begin_trial(seed)
 
     def sink(self, sink: Sink) -> Sink:
-        """Where the recording goes in this world."""
+        """Return the sink of the recording in this world."""
         return self._devices.sink(sink)
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:

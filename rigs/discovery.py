@@ -1,4 +1,4 @@
-"""Whether a rig's devices can be reached, without taking control of any of them."""
+"""Discovery: can a rig's devices be reached? None of them is taken control of."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which level of physics a plan needs in a simulated rig, and what slip to expect from it.
+"""The level of physics that a plan needs in a simulated rig, and the slip to expect from it.
 
 A scene takes the lowest level whose onsets differ from the next level's by less than two seeds of
 the same scene differ. That is reckoned from onsets in closed form (`rigs.scene.onsets`), in
@@ -29,7 +29,7 @@ HIGHEST = 3
 
 @dataclass(frozen=True)
 class Slide:
-    """What decides on the onsets of one slide."""
+    """Parameters that decide on the onsets of one slide."""
 
     depth_mm: float
     speed_mm_s: float

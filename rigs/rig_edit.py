@@ -27,7 +27,7 @@ _WIDEST = 1 << 20
 
 @dataclass(frozen=True)
 class Written:
-    """What was written, and where the file that stood there before is kept."""
+    """The file that was written, and the kept copy of the one before."""
 
     path: Path
     kept: Path | None
@@ -165,7 +165,7 @@ def _plain(value: Any) -> Any:
 
 
 def _check(rig: Path, target: Path, text: str) -> None:
-    """Whether `text` at `target` would be a rig file."""
+    """Check that `text` at `target` would be a rig file."""
     aside = target.with_name(f".{target.name}.new")
     write_text(aside, text)
     try:

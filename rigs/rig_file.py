@@ -36,7 +36,7 @@ SCALE_ERROR = 0.005
 
 
 class RigLimits(StrictModel):
-    """What this arm may do here, whatever a protocol says."""
+    """Limits of this arm at this rig, whatever a protocol says."""
 
     depth: PositiveMillimetres
     speed: PositiveSpeed
@@ -68,7 +68,7 @@ class Skin(StrictModel):
 
 
 class Estimates(StrictModel):
-    """What this rig's streams take, measured, for the plan's estimate of disk space."""
+    """Measured sizes of this rig's streams, for the plan's estimate of disk space."""
 
     noise_events_per_s: float = Field(ge=0, le=1e9)
     signal_events_per_mm: float = Field(ge=0, le=1e9)
@@ -215,7 +215,7 @@ class RigFile(StrictModel):
         return self.mock.frame_camera.level if self.mock is not None else "video"
 
     def frame_bytes(self, with_plate: bool) -> float:
-        """What one frame is expected to take on disk, with or without the plate's marker."""
+        """Return the expected size of one frame on disk, with or without the plate's marker."""
         known = self.estimates
         if self.frame_source == "tracks":
             return known.bytes_per_tracked_frame
@@ -268,7 +268,7 @@ def rig_hash(text: str) -> str:
 
 
 def same_rig(one: str, other: str) -> bool:
-    """Whether two contents of rig files describe one rig.
+    """Return whether two contents of rig files describe one rig.
 
     The faults of a simulated rig happen to it and are no part of it: a campaign that one of them
     ended goes on without it. So does one whose plate was taught anew, or whose password is another.
@@ -283,7 +283,7 @@ def same_rig(one: str, other: str) -> bool:
 
 
 def _check_exposure(rig: RigFile, plan: Plan, file: str) -> None:
-    """Where every tick triggers a frame, its exposure must end before the next tick."""
+    """Check that an exposure ends before the next tick, where every tick triggers a frame."""
     rate = plan.protocol.collection.recording.sync_rate
     if rig.timing.frames != "hardware trigger":
         return

@@ -120,7 +120,7 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 
 
 def _depth(data: Any, path: list[str]) -> int:
-    """How many leading parts of a key stand in `data`."""
+    """Return the number of leading parts of a key that stand in `data`."""
     for depth, part in enumerate(path):
         if isinstance(data, dict) and part in data:
             data = data[part]

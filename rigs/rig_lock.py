@@ -26,7 +26,7 @@ _FOLDER = Path("/tmp/sliplab-rigs")
 
 
 def lock_names(file: RigFile) -> dict[str, str]:
-    """What is locked, by the name of its lock file; nothing on simulated rigs.
+    """Return what is locked, by the name of its lock file; nothing on simulated rigs.
 
     Each simulated rig has devices, or fakes, of its own.
     """

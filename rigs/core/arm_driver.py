@@ -1,4 +1,4 @@
-"""What the drivers of real arms share: a path that a thread follows, and how far it has come.
+"""The common part of the drivers of real arms: a thread follows a path and notes its progress.
 
 A driver brings its own connection, its own way to send a path and its own ways to stop. What it
 says of a path while it runs, and what becomes of one that fails, is the same for all.
@@ -177,10 +177,10 @@ class SegmentWatch:
 
 
 def is_at(pose: Pose, target: Pose) -> bool:
-    """Whether a pose is as close to a target as a segment that has ended."""
+    """Return whether a pose is as close to a target as a segment that has ended."""
     return distance_mm(pose, target) <= NEAR_MM and angle_deg(pose, target) <= _NEAR_DEG
 
 
 def has_left(begin: Pose, pose: Pose) -> bool:
-    """Whether a pose is another one than where the arm stood."""
+    """Return whether a pose is another one than where the arm stood."""
     return distance_mm(begin, pose) > LEFT_MM or angle_deg(begin, pose) > _LEFT_DEG

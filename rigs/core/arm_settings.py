@@ -29,7 +29,7 @@ class PlaneSettings(StrictModel):
 
 
 class Limits(StrictModel):
-    """What the arm may do, checked before every move, whatever a protocol says."""
+    """Limits of the arm, checked before every move, whatever a protocol says."""
 
     low_mm: Triple
     high_mm: Triple
@@ -57,7 +57,7 @@ class Limits(StrictModel):
 
 
 class ToolSettings(StrictModel):
-    """What is mounted on the flange."""
+    """The tool that is mounted on the flange."""
 
     tcp_mm: Triple = (0.0, 0.0, 0.0)
     tcp_rotvec_deg: Triple = (0.0, 0.0, 0.0)
@@ -67,7 +67,7 @@ class ToolSettings(StrictModel):
 
 
 class BaseArmSettings(StrictModel):
-    """What every arm has, whatever its make."""
+    """Settings that every arm has, whatever its make."""
 
     host: Host
     tool: ToolSettings = ToolSettings()

@@ -1,4 +1,4 @@
-"""What was measured on a rig: the `calibration:` section of a rig file, and how long it holds.
+"""The `calibration:` section of a rig file: measurements on the rig, and how long each holds.
 
 `sliplab teach` and `sliplab calibrate` write its entries, each with the day, the residual and the
 method; `sliplab check` refuses what is missing or too old (docs/calibration.md).
@@ -84,7 +84,7 @@ class ContactPlane(StrictModel):
 
 
 class DepthZero(StrictModel):
-    """Where the skin first touches, measured from the contact plane into the plate."""
+    """Depth at which the skin first touches, measured from the contact plane into the plate."""
 
     zero: Millimetre
     """What the rig begins with; a protocol's `rezero` finds it again."""
@@ -99,7 +99,7 @@ class DepthZero(StrictModel):
 
 
 class ToolCentrePoint(StrictModel):
-    """Where the centre papilla's tip is on the tool, by pivoting about a fixed point."""
+    """Place of the centre papilla's tip on the tool, by pivoting about a fixed point."""
 
     offset: Point
     """From the flange, in the flange's axes: what the controller's tool has to be."""
@@ -134,7 +134,7 @@ class Lens(StrictModel):
 
 
 class EventCrop(StrictModel):
-    """Where the skin is in the event camera's picture."""
+    """Place of the skin in the event camera's picture."""
 
     centre: tuple[Pixel, Pixel]
     """Column, row."""
@@ -147,7 +147,7 @@ class EventCrop(StrictModel):
 
 
 class MaxAge(StrictModel):
-    """How old each entry may be; null: it may be any age, and may be missing."""
+    """The age that each entry may have; null: it may be any age, and may be missing."""
 
     contact_plane: Days | None = 30
     depth_zero: Days | None = 1
@@ -157,7 +157,7 @@ class MaxAge(StrictModel):
 
 
 class Calibration(StrictModel):
-    """What was measured on this rig."""
+    """Measurements on this rig."""
 
     contact_plane: ContactPlane
     touch_depth: Millimetre = 0.0
@@ -175,7 +175,7 @@ class Calibration(StrictModel):
 
     @property
     def centre_px(self) -> tuple[float, float] | None:
-        """Where the event camera sees the skin's centre; None: nobody has looked."""
+        """Return where the event camera sees the skin's centre; None: nobody has looked."""
         return None if self.event_crop is None else self.event_crop.centre
 
 

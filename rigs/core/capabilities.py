@@ -1,4 +1,4 @@
-"""What a device must be able to do to be part of a rig: capabilities, not base classes.
+"""Capabilities: everything that a device must be able to do to be part of a rig; no base classes.
 
 A driver, a fake on the wire and a simulated device are all the same to the rig if they can
 do what is written here. Every call returns within a bounded time or raises a `RigError`; nothing
@@ -22,7 +22,7 @@ UNKNOWN = "unknown"
 
 
 class RigError(RuntimeError):
-    """Something the rig could not do. `device` names the part; the text says what to do."""
+    """An action of the rig that failed. `device` names the part; the text says what to do."""
 
     def __init__(self, device: str, message: str) -> None:
         super().__init__(f"{device}: {message}")
@@ -34,7 +34,7 @@ class ArmFault(RigError):
 
 
 class ArmState(Enum):
-    """What an arm says of itself."""
+    """The state that an arm reports."""
 
     READY = "ready"
     MOVING = "moving"
@@ -52,7 +52,7 @@ class ArmState(Enum):
 
     @property
     def advice(self) -> str:
-        """What a person must do about it; no rig unlocks or restarts anything by itself."""
+        """The action that a person must take; no rig unlocks or restarts anything by itself."""
         return {
             ArmState.PROTECTIVE_STOP: "clear the cause and unlock the stop at the pendant",
             ArmState.EMERGENCY_STOP: (
@@ -82,7 +82,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a started path has come: (start, end) controller times of finished segments, ns."""
+    """Progress of a started path: (start, end) controller times of finished segments, ns."""
 
     state: ArmState
     finished: tuple[tuple[int, int], ...]
@@ -91,7 +91,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class DeviceHealth:
-    """What a device says of itself, read without starting it; `unknown` where it does not say."""
+    """A device's own report, read without starting it; `unknown` where it does not say."""
 
     device: str
     """Its part in the rig, as `RigError` names it."""
@@ -128,7 +128,7 @@ class Arm(Protocol):
         """The arm's state now."""
 
     def pose(self) -> Pose:
-        """Where the tool centre point is now."""
+        """Return where the tool centre point is now."""
 
     def now_ns(self) -> int:
         """The controller's clock now."""
@@ -137,7 +137,7 @@ class Arm(Protocol):
         """Begin to follow `path` and return at once. Raises ArmFault, or RigError if moving."""
 
     def progress(self) -> Progress:
-        """How far the path begun last has come."""
+        """Return how far the path begun last has come."""
 
     def read_poses(self) -> PoseChunk:
         """Poses since the last call."""
@@ -265,7 +265,7 @@ class Simulation(Protocol):
         """`sink` as this world lets it be written: its disk may be full."""
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """What really happened in the trial that just ran (JSON), times in ns of the sync box.
+        """Return the truth of the trial that just ran (JSON), times in ns of the sync box.
 
         Args:
             reference_arm_ns: arm controller time from which displacements are counted.

@@ -1,4 +1,4 @@
-"""Where a fake's tool centre point is: straight lines at constant speed, with real ramps.
+"""Motion of a fake's tool centre point: straight lines at constant speed, with real ramps.
 
 A fake asks a `StraightMotion` and nothing else; a simulated scene listens to its lines (`on_line`)
 and sees the same moves.
@@ -38,7 +38,7 @@ class Ramp:
 
     @property
     def seconds(self) -> float:
-        """How long the whole way takes."""
+        """Return how long the whole way takes."""
         if self.length == 0:
             return 0.0
         return self.length / self.peak + self.peak / self.acceleration
@@ -85,7 +85,7 @@ class Line:
     start_s: float
 
     def pose(self, t_s: float) -> Pose:
-        """Where the tool centre point is."""
+        """Return where the tool centre point is."""
         gone, _ = self.ramp.at(t_s - self.start_s)
         if self.ramp.length == 0 or gone >= self.ramp.length:
             return self.end
@@ -113,12 +113,12 @@ class StraightMotion:
         self._rest_s = 0.0
 
     def pose(self, t_s: float) -> Pose:
-        """Where the tool centre point is."""
+        """Return where the tool centre point is."""
         with self._lock:
             return self._line.pose(t_s)
 
     def moving(self, t_s: float) -> bool:
-        """Whether it is on its way."""
+        """Return whether it is on its way."""
         with self._lock:
             return t_s < self._rest_s
 

@@ -1,4 +1,4 @@
-"""What fakes of controllers share: an asyncio server in a thread of its own, and faults by name.
+"""The common part of fake controllers: an asyncio server in its own thread, and faults by name.
 
 A fake speaks the own protocol of a device, so that the real driver can be tried without it. None of
 them copies what a device costs in time; what they copy is what it says, and how it fails.
@@ -139,7 +139,7 @@ PACKETS_LOST = 25
 
 
 class Kind(Enum):
-    """What happens."""
+    """A kind of fault."""
 
     PROTECTIVE_STOP = "protective stop"
     EMERGENCY_STOP = "emergency stop"
@@ -163,7 +163,7 @@ class Kind(Enum):
 
 
 class Stage(Enum):
-    """When it happens."""
+    """The stage at which a fault happens."""
 
     CONNECTING = "connecting"
     """With the first request of any client."""

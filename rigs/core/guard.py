@@ -1,4 +1,4 @@
-"""What a move is held against before an arm is asked to make it.
+"""Limits that a move is checked against before an arm is asked to make it.
 
 The controller has limits of its own; these are the rig's, and they speak of the sensor and the
 plate. A straight move stays inside a box when both its ends do, so ends are all that is looked at.

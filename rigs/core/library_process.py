@@ -144,7 +144,7 @@ class LibraryProcess:
         return result
 
     def _comes(self, within_s: float) -> bool:
-        """Whether there is an answer, after waiting for it."""
+        """Return whether there is an answer, after waiting for it."""
         if not self._patient:
             return self._pipe.poll(within_s)
         stall = StallTimer()

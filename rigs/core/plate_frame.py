@@ -67,7 +67,7 @@ class PlateFrame:
 
     @cached_property
     def _rotvec_deg(self) -> tuple[float, float, float]:
-        """How the tool stands: the same for every place."""
+        """Return the tool's rotation vector, the same for every place."""
         rotation = Rotation.from_matrix(np.column_stack(tuple(self.axes)))
         a, b, c = np.degrees(rotation.as_rotvec()).tolist()
         return a, b, c

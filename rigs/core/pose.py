@@ -35,7 +35,7 @@ def from_ur(values: Sequence[float]) -> Pose:
 
 
 def quaternion(pose: Pose) -> tuple[float, float, float, float]:
-    """How the tool stands, as a unit quaternion w x y z with w >= 0."""
+    """Return the tool's rotation as a unit quaternion w x y z with w >= 0."""
     w, x, y, z = _rotation(pose).as_quat(canonical=True, scalar_first=True).tolist()
     return w, x, y, z
 

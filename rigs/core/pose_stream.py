@@ -1,4 +1,4 @@
-"""What an arm's controller streams, kept until somebody reads it, within a bound.
+"""The stream of an arm's controller, kept until somebody reads it, within a bound.
 
 One thread writes (`add`), others read. Nothing is resampled: a sample is what one packet said.
 """
@@ -75,7 +75,7 @@ class PoseStream:
             self._changed.notify_all()
 
     def wait_for(self, condition: Callable[[], bool], within_s: float) -> bool:
-        """Whether `condition` became true within `within_s`; looked at with every sample."""
+        """Return whether `condition` became true within `within_s`; looked at with every sample."""
         with self._changed:
             return self._changed.wait_for(condition, within_s)
 

@@ -37,7 +37,7 @@ class Watcher(Sink, Protocol):
 
 @dataclass(frozen=True)
 class Reflex:
-    """What the arm does when slip is seen.
+    """The arm's reaction when slip is seen.
 
     Attributes:
         kind: ``stop``, or ``press``: stop, and then press on by `press_mm` at `speed_mm_s`.
@@ -54,7 +54,7 @@ class Reflex:
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a reflex did; times on the rig's clock.
+    """The outcome of a reflex; times on the rig's clock.
 
     Attributes:
         phase: the motion that it cut short.

@@ -48,7 +48,7 @@ class StopRequested(Exception):
 
 @dataclass(frozen=True)
 class TrialRun:
-    """What the rig can say of a trial besides its streams."""
+    """The record of a trial besides its streams."""
 
     steps: tuple[tuple[StepTimes, bool], ...]
     """Each step with its times, and whether it was recorded."""
@@ -130,7 +130,7 @@ class Rig:
             raise ArmFault("arm", f"{_text(fault)}{text}")
 
     def health(self) -> list[DeviceHealth]:
-        """What the connected devices say of themselves; simulated ones have nothing to say.
+        """Return the reports of the connected devices; simulated ones have none.
 
         Raises:
             RigError: one does not answer.
@@ -139,7 +139,7 @@ class Rig:
         return [device.health() for device in devices if hasattr(device, "health")]
 
     def describe(self) -> dict[str, Json]:
-        """What drivers tell of the trial that just ran, by device: settings, counts, losses."""
+        """Return settings, counts and losses of the trial that just ran, by device."""
         told = {}
         cameras = ("event_camera", self.events), ("frame_camera", self.frames)
         for name, device in (("arm", self.arm), *cameras):
@@ -379,7 +379,7 @@ class Rig:
         return PathSegment(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
-        """Where the tool centre point is now, in plate coordinates."""
+        """Return where the tool centre point is now, in plate coordinates."""
         return self.frame.position(self.arm.pose().xyz_mm)
 
     @contextmanager
@@ -465,7 +465,7 @@ class Rig:
 
 
 def arm_fault(state: ArmState, phase: str) -> ArmFault:
-    """What happened, and what a person must do about it; nothing is unlocked from here."""
+    """Return the error for an arm's state, with the action that a person must take."""
     lost = state is ArmState.DISCONNECTED
     where = "the arm may still move" if lost else "the arm stays where it is"
     return ArmFault(
@@ -476,5 +476,5 @@ def arm_fault(state: ArmState, phase: str) -> ArmFault:
 
 
 def _text(error: RigError) -> str:
-    """What it says, without the device's name."""
+    """Return an error's text without the device's name."""
     return str(error).removeprefix(f"{error.device}: ")

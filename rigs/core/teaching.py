@@ -40,7 +40,7 @@ _OVER_MM = 0.05
 
 @dataclass(frozen=True)
 class Creep:
-    """How a touch is sought.
+    """Parameters of the search for a touch.
 
     Attributes:
         speed_mm_s: creeping speed, at most `MOST_CREEP_MM_S`.
@@ -201,7 +201,7 @@ class _Watch:
         return self.touched_mm is not None or depth > self._limit_mm
 
     def nothing(self) -> RigError:
-        """Why nothing was found."""
+        """Return the error that says why nothing was found."""
         if self._by_events_mm is not None:
             return RigError(
                 "frame camera",

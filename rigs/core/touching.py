@@ -1,4 +1,4 @@
-"""When the skin touches the plate: by the rate of events, or by the centre marker's motion.
+"""The moment of touching the plate: by the rate of events, or by the centre marker's motion.
 
 Both look while the arm creeps in. The event camera sees the centre papilla's image change; the
 outside camera sees that its white top no longer goes where all the others go.
@@ -55,7 +55,7 @@ class RateTouch:
         self._recent: deque[int] = deque(maxlen=5)
 
     def touched(self, count: int) -> bool:
-        """Whether the last 50 ms, with `count` events in the last `LOOK_S`, are a touch."""
+        """Return whether the last 50 ms, with `count` events in the last `LOOK_S`, are a touch."""
         self._recent.append(count)
         return sum(self._recent) > self.limit
 
@@ -128,7 +128,7 @@ class MarkerTouch:
         return None
 
     def _off_line(self, apart: F64, when: int) -> tuple[float, float]:
-        """How far a frame is from the line through those before, and how far it may be, px."""
+        """Return how far a frame is from the line through those before, and its limit, px."""
         host = np.array(self._host, np.float64)[: -self.SKIP] - self._host[0]
         way = np.array(self._apart)[: -self.SKIP]
         centre = host.mean()

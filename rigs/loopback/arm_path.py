@@ -76,7 +76,7 @@ class FakeArmPath(ArmPath):
         raise RigError("arm", "is moved by its controller")
 
     def cut(self, now_ns: int) -> None:
-        """Something in the world stops the arm: see `cut_ns`."""
+        """Stop the arm by something in the world: see `cut_ns`."""
         if self.cut_ns is None:
             self.cut_ns = now_ns
 
@@ -98,7 +98,7 @@ class FakeArmPath(ArmPath):
         return result
 
     def stirred(self, t_ns: I64) -> F64:
-        """How much the arm trembles at rising times, 0 to 1."""
+        """Return how much the arm trembles at rising times, 0 to 1."""
         with self._lock:
             ways, past_ns = self._ways, self._past_ns
         ends = [*(way.since_ns for way in ways[1:]), 1 << 62]
@@ -110,7 +110,7 @@ class FakeArmPath(ArmPath):
         return stirred(moves, t_ns)
 
     def moving(self, now_ns: int) -> bool:
-        """Whether the tool centre point is on its way at a true time of the trial."""
+        """Return whether the tool centre point is on its way at a true time of the trial."""
         with self._lock:
             total = now_ns + self._past_ns
             way = [way for way in self._ways if way.since_ns <= total][-1]

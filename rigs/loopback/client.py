@@ -120,7 +120,7 @@ class Loopback:
         return mass
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """What a simulated person does at once."""
+        """Ask the simulated person, who does it at once."""
         done: bool = self._ask("ask", task, prompt, expected)
         return done
 
@@ -145,22 +145,22 @@ class Loopback:
         self.sync_port, self.event_ports = self._ask("restore", device)
 
     def arm_place(self) -> tuple[float, float, float]:
-        """Where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        """Return where the sensor truly is: right and up on the plate, and depth into it, mm."""
         place: tuple[float, float, float] = self._ask("arm_place")
         return place
 
     def at_rest(self) -> bool:
-        """Whether the arm truly stands still."""
+        """Return whether the arm truly stands still."""
         rest: bool = self._ask("at_rest")
         return rest
 
     def sent(self) -> Counter[str]:
-        """What was sent since the trial began, by stream."""
+        """Return the counts of what was sent since the trial began, by stream."""
         found: Counter[str] = self._ask("sent")
         return found
 
     def events_between(self, first_us: int, last_us: int) -> int:
-        """How many events with stamps from the first to the last of these were sent, us."""
+        """Return how many events with stamps from the first to the last of these were sent, us."""
         found: int = self._ask("events_between", first_us, last_us)
         return found
 

@@ -206,18 +206,18 @@ class SimulationServer:
         )
 
     def sent(self) -> Counter[str]:
-        """What was sent since the trial began, by stream; pulses of the box since its last ARM."""
+        """Return the counts sent since the trial began; the box's pulses since its last ARM."""
         return self._sent + Counter({"box_pulses": self.sync_box.pulses})
 
     def events_between(self, first_us: int, last_us: int) -> int:
-        """How many events with stamps from the first to the last of these were sent, us."""
+        """Return how many events with stamps from the first to the last of these were sent, us."""
         return sum(
             int(np.count_nonzero((stamps >= first_us) & (stamps <= last_us)))
             for stamps in self._stamps_us
         )
 
     def act(self, action: PlateAction, seconds: float) -> None:
-        """What the plate does."""
+        """Move the plate."""
         self.turn()
         self._plate.act(action, seconds)
 
@@ -226,7 +226,7 @@ class SimulationServer:
         return self._plate.mass_kg()
 
     def ask(self, task: str, prompt: str, expected: str) -> bool:
-        """What a person does."""
+        """Let the simulated person do a task."""
         if task == "protective_stop":
             self.arm.restore()
         return self._operator.ask(task, prompt, expected)
@@ -250,12 +250,12 @@ class SimulationServer:
     # -- what a person at the rig would see and do -----------------------------------------
 
     def arm_place(self) -> tuple[float, float, float]:
-        """Where the sensor truly is: right and up on the plate, and depth into it, mm."""
+        """Return where the sensor truly is: right and up on the plate, and depth into it, mm."""
         x, y, depth = self.world.plane.sensor(self.arm.pose())[:3]
         return float(x), float(y), float(depth)
 
     def at_rest(self) -> bool:
-        """Whether the arm truly stands still."""
+        """Return whether the arm truly stands still."""
         return not self.arm.moving()
 
     def happen(self, device: str, kind: str) -> None:
@@ -335,7 +335,7 @@ class SyncLevel:
             self._ticks, self._train = None, train
 
     def high(self, total_ns: int) -> bool:
-        """Whether the line is high at a true time of all trials."""
+        """Return whether the line is high at a true time of all trials."""
         train, ticks = self._train, self._ticks
         if train is None:
             return False

@@ -59,7 +59,7 @@ class MockArm:
         return ArmState.MOVING if moving else ArmState.READY
 
     def pose(self) -> Pose:
-        """Where the tool centre point is now."""
+        """Return where the tool centre point is now."""
         state = self._world.path.states(np.array([self._world.now_ns], np.int64))[0].tolist()
         return Pose((state[0], state[1], state[2]), (state[3], state[4], state[5]))
 
@@ -75,7 +75,7 @@ class MockArm:
         self._legs = self._world.start_arm(path)
 
     def progress(self) -> Progress:
-        """How far the path begun last has come; `done` once it ended or was stopped."""
+        """Return how far the path begun last has come; `done` once it ended or was stopped."""
         world, clock = self._world, self._world.clocks.arm
         finished = tuple(
             (clock.to_reference(leg.start_ns), clock.to_reference(leg.end_ns))

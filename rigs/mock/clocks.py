@@ -84,7 +84,7 @@ class FaultyClock(ClockMap):
     @overload
     def to_reference(self, times: npt.NDArray[np.integer[Any]]) -> I64: ...
     def to_reference(self, times: int | npt.NDArray[np.integer[Any]]) -> int | I64:
-        """What the clock shows at true times, ns: an int or an int64 array of any shape.
+        """Return the clock's readings at true times, ns: an int or an int64 array of any shape.
 
         Raises:
             TypeError, OverflowError: as the undisturbed map.
@@ -117,7 +117,7 @@ class FaultyClock(ClockMap):
         return gained
 
     def _drifted_ns(self, true_ns: I64) -> I64:
-        """What the clock has gained by drifting more at true times, ns."""
+        """Return the gain of the clock by drifting more, at true times, ns."""
         gained = np.zeros(true_ns.shape, np.int64)
         for fault, due in self._drifts():
             since = np.maximum(true_ns - due, 0)
@@ -220,7 +220,7 @@ def faulty(clock: ClockMap, device: Device, faults: FaultBook) -> ClockMap:
 
 
 def undisturbed(clock: ClockMap) -> ClockMap:
-    """What the device's cycles run by: `clock` without its faults."""
+    """Return `clock` without its faults, by which the device's cycles run."""
     if type(clock) is ClockMap:
         return clock
     return ClockMap(clock.device_ns, clock.reference_ns, clock.drift)
@@ -291,7 +291,7 @@ class Jitter:
 
 
 class Lateness:
-    """How much later than they might messages come: half-normal, cut at four sigma."""
+    """Delays of messages beyond the shortest one: half-normal, cut at four sigma."""
 
     def __init__(self, seed: int, purpose: str, longest_us: float) -> None:
         self._jitter = Jitter(seed, purpose, longest_us / 4)

@@ -91,13 +91,13 @@ class MockDevices:
         self.world.begin_trial(seed)
 
     def sink(self, sink: Sink) -> Sink:
-        """Where streams go in this world, whose disk may be full."""
+        """Return the sink of the streams in this world, whose disk may be full."""
         return on_disk(sink, self.world)
 
     def truth(
         self, reference_true_ns: int, hold_true_ns: int | None = None, threshold_px: float = 2.0
     ) -> dict[str, Any]:
-        """What really happened since `reference_true_ns`, and what the clocks truly showed.
+        """Return what really happened since `reference_true_ns`, and what the clocks truly showed.
 
         See `truth_of` and `clocks_of` in `rigs.mock.truth`.
         """

@@ -1,4 +1,4 @@
-"""What can go wrong on purpose, as a rig file or a test writes it down: `mock: faults: [...]`.
+"""Faults on purpose, as a rig file or a test writes them down: `mock: faults: [...]`.
 
 Each kind of fault has a model of its own with the parameters that mean something for it, and no
 others; docs/faults.md is the same list for a reader. Cheap to import, as all settings are.
@@ -158,7 +158,7 @@ class PapillaTorn(_TimedFault):
 
 
 class MarkerOccluded(_TimedFault):
-    """Something hides a marker from the outside camera for some time."""
+    """A marker is hidden from the outside camera for some time."""
 
     kind: Literal["marker_occluded"]
     papilla: Papilla | None = None

@@ -1,4 +1,4 @@
-"""Which faults of a trial happen when: one book that all simulated devices look into.
+"""The faults of a trial and their times: one book that all simulated devices look into.
 
 Every fault has one true time at which it happens, whatever the devices do in which pieces; what it
 does then stands where it happens: with the pulses, the clocks, the frames, the arm.
@@ -79,7 +79,7 @@ class FaultBook:
     def arm_halt(
         self, begin_ns: int, end_ns: int, places: Callable[[I64], F64]
     ) -> tuple[int, bool] | None:
-        """When, from `begin_ns` up to `end_ns`, the arm stops by itself; each fault does it once.
+        """Return when the arm stops by itself in `begin_ns` to `end_ns`; each fault does it once.
 
         Args:
             places: true times (n,) to places of the tool (n, 3), mm, on the path as it is known.
@@ -139,26 +139,26 @@ class FaultBook:
     # -- any device ------------------------------------------------------------------------
 
     def gone(self, device: Device, now_ns: int) -> bool:
-        """Whether `device` has lost its power or its cable."""
+        """Return whether `device` has lost its power or its cable."""
         return any(
             fault.device == device and begin <= now_ns < end
             for fault, begin, end in self.spans(DeviceGone)
         )
 
     def lost_power_ns(self, device: Device, since_ns: int) -> int:
-        """When `device` first loses its power from `since_ns` on; `NEVER` if it does not."""
+        """Return when `device` first loses its power from `since_ns` on; `NEVER` if it does not."""
         times = [begin for fault, begin, _ in self.spans(DeviceGone) if fault.device == device]
         return min((begin for begin in times if begin >= since_ns), default=NEVER)
 
 
 class _Travel:
-    """How far the tool has gone since a moment, on a grid of true time that no caller decides."""
+    """Distance of the tool since a moment, on a grid of true time that no caller decides."""
 
     def __init__(self, origin_ns: int, target_mm: float) -> None:
         self._cell_ns, self._travelled, self._target = origin_ns, 0, round(target_mm * _PM)
 
     def reached_ns(self, end_ns: int, places: Callable[[I64], F64]) -> int | None:
-        """When the target is reached, if that is not after `end_ns`."""
+        """Return when the target is reached, if that is not after `end_ns`."""
         first = self._cell_ns - self._cell_ns % _GRID_NS + _GRID_NS
         inner = np.arange(first, end_ns, _GRID_NS, dtype=np.int64)
         edges = np.concatenate([[self._cell_ns], inner, [end_ns]]).astype(np.int64)

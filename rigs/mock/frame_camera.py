@@ -167,7 +167,7 @@ class MockFrameCamera:
         self.stop()
 
     def _tracks(self, view: PlateView, seen: Exposures, number: I64) -> tuple[F32, F32 | None]:
-        """What tracking the pictures of `seen` would give: markers and, if it is there, plate."""
+        """Return what tracking the pictures of `seen` would give: markers and the plate."""
         settings = self._world.settings.frame_camera
         noise = self._centroid_noise(number)
         markers = view.centre_px(seen.tips_mm)
@@ -254,7 +254,7 @@ class FrameFaults:
         self._world, self._trigger = world, trigger
 
     def lost(self, ticks: I64) -> Mask:
-        """Which frames never reach the host, (k,) for the frames on k ticks."""
+        """Return which frames never reach the host, (k,) for the frames on k ticks."""
         lost = np.zeros(len(ticks), np.bool_)
         if not len(ticks):
             return lost
@@ -268,7 +268,7 @@ class FrameFaults:
         return lost
 
     def arrival_ns(self, ticks: I64, on_time_ns: I64) -> I64:
-        """When frames reach the host, ns: their order is kept, so that one waits for the other.
+        """Return when frames reach the host, ns, in order: one waits for the other.
 
         Args:
             ticks: (k,), rising.
@@ -288,7 +288,7 @@ class FrameFaults:
         return arrival
 
     def hide(self, mid_ns: I64, seen: Exposures) -> Exposures:
-        """What k exposures about `mid_ns` see: hidden markers are moved out of the picture.
+        """Return what k exposures about `mid_ns` see: hidden markers are moved out of the picture.
 
         A torn papilla has no white spot any more, and an occluded marker none for a while.
         """

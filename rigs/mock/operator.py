@@ -70,7 +70,7 @@ class Asked:
 
 
 class SimulatedOperator:
-    """Does at once what it is asked, and says so.
+    """A simulated person, who does at once what is asked and says so.
 
     `changeover` mounts the mass that `expected` names (``0.205 kg``); `protective_stop` clears a
     stop at the pendant; `jog` brings the tip to a point and `board` holds a printed board before

@@ -1,4 +1,4 @@
-"""Where the arm is at any time: the true plate, the legs that it was told to follow, its deviation.
+"""The arm's place at any time: the true plate, the commanded legs, the deviation.
 
 Rotation vectors are in degrees; a state is xyz, rotation vector and the five numbers of the sensor
 over the true plate.
@@ -104,7 +104,7 @@ _X, _Y = 6, 7
 
 
 class Deviation:
-    """How far the tool is from where it was told to be, as an arm state to be added."""
+    """Deviation of the tool from where it was told to be, as an arm state to be added."""
 
     def __init__(
         self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
@@ -237,11 +237,11 @@ class ArmPath:
         return result
 
     def stirred(self, t_ns: I64) -> F64:
-        """How much the arm trembles at rising times, 0 to 1: it fades in and out with motion."""
+        """Return how much the arm trembles at rising times, 0 to 1; it fades with motion."""
         return stirred([(leg.start_ns, leg.end_ns) for leg in self.legs], t_ns)
 
     def moving(self, now_ns: int) -> bool:
-        """Whether a leg is yet to end."""
+        """Return whether a leg is yet to end."""
         return bool(self.legs) and self.legs[-1].end_ns > now_ns
 
     def _state(self, pose: Pose) -> F64:

@@ -53,7 +53,7 @@ class Physics:
         sensor_at: Callable[[I64], F64],
         torn: Callable[[], Sequence[tuple[int, int]]] = tuple,
     ) -> None:
-        """What the skin meets.
+        """Put the skin at rest on the plate.
 
         Args:
             sensor_at: from times to x, y, depth (mm) and slopes of depth, (k, 5) from (k,).

@@ -98,7 +98,7 @@ class Plate(StrictModel):
 
 
 class Contact(StrictModel):
-    """Where the plate truly is, in the arm's base frame: what teaching has to find out."""
+    """The plate's true place in the arm's base frame, which teaching has to find out."""
 
     nominal_origin_mm: Triple = (400.0, 0.0, 300.0)
     nominal_rotvec_deg: Triple = (69.28203230275508, 69.28203230275508, 69.28203230275508)
@@ -277,7 +277,7 @@ class Arm(StrictModel):
 
 
 class Clocks(StrictModel):
-    """How far the devices' clocks are from the truth. Drifts belong to the rig."""
+    """Deviations of the devices' clocks from the truth. Drifts belong to the rig."""
 
     arm_ppm: Annotated[float, Field(ge=0, le=20_000)] = 50.0
     """Largest drift, either way; each rig's seed draws its own. `timing` has to promise as much."""

@@ -324,7 +324,7 @@ class SyncInput:
 
 
 class _PulseFaults:
-    """What becomes of the pulses of one train on their way through one device."""
+    """Faults of the pulses of one train on their way through one device."""
 
     def __init__(self, world: World, box: MockSyncBox, device: PulseDevice) -> None:
         self._box, self._device, self._book = box, device, world.faults

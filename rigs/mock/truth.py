@@ -1,4 +1,4 @@
-"""What really happened in a simulated trial: the answers that labels are held against."""
+"""The truth of a simulated trial, which labels are checked against."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _counted_from(
     torn_ns = dict(world.faults.torn())
 
     def there(i: int, true_ns: float | None) -> float | None:
-        """What happened to a papilla after it was torn off is no slip."""
+        """Return the time, or None for a papilla that was torn off before: that is no slip."""
         late = true_ns is not None and true_ns >= torn_ns.get(i, NEVER)
         return None if late else true_ns
 
@@ -112,7 +112,7 @@ def _counted_from(
 def clocks_of(
     world: World, box: ClockMap, recorded_ns: tuple[int, int], frames: FrameGrade
 ) -> dict[str, list[list[int]]]:
-    """What the clocks showed every second of a recording, without any jitter.
+    """Return the readings of the clocks every second of a recording, without any jitter.
 
     Args:
         box: true time to sync box time.
@@ -136,7 +136,7 @@ def clocks_of(
 def _onsets(
     rows: F64, start: F64, t_ns: I64, threshold_mm: float
 ) -> tuple[list[float | None], list[float | None]]:
-    """When each marker's displacement exceeds the threshold, and when its tip began to slide.
+    """Return when each displacement exceeds the threshold, and when its tip began to slide.
 
     Both in true ns, or None. `rows` are the track's, the first of them `start` in effect.
     """

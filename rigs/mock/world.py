@@ -37,7 +37,7 @@ NEAR_MM = 5.0
 
 
 def start_pose(settings: MockSettings) -> Pose:
-    """Where the arm stands when the rig is switched on."""
+    """Return where the arm stands when the rig is switched on."""
     plane = ContactPlane.from_settings(settings.scene.contact, settings.arm.tip_offset_mm)
     start = plane.pose(0.0, 0.0, -CLEARANCE_MM)
     if settings.arm.start_xyz_mm is not None:
@@ -46,7 +46,7 @@ def start_pose(settings: MockSettings) -> Pose:
 
 
 class World:
-    """What is really there. Devices ask it; nothing outside the mock rig does.
+    """The simulated world. Devices ask it; nothing outside the mock rig does.
 
     Attributes:
         now_ns: true time since the trial began, which is also the host's monotonic clock.

@@ -130,7 +130,7 @@ class AbbArm(ArmDriver):
         return ArmState.READY if self._run.done else ArmState.MOVING
 
     def pose(self) -> Pose:
-        """Where the tool centre point is: the last pose by EGM, or the web services' without one.
+        """Return where the tool centre point is: by the last EGM pose, else by the web services.
 
         Raises:
             ArmFault: neither is there. Takes at most `REQUEST_S`.
@@ -157,7 +157,7 @@ class AbbArm(ArmDriver):
         return last.t_ns + time.monotonic_ns() - last.host_ns
 
     def health(self) -> DeviceHealth:
-        """What the controller says of itself; takes at most 6 `REQUEST_S`.
+        """Return the controller's own report; takes at most 6 `REQUEST_S`.
 
         Raises:
             ArmFault: it does not answer.
@@ -327,7 +327,7 @@ class AbbArm(ArmDriver):
             web.close()
 
     def _unseen_s(self, watched_s: float) -> float:
-        """How long to look at its poses for standing still; 0 where none come."""
+        """Return how long to look at its poses for standing still; 0 where none come."""
         last = self._stream.last
         if last is None or self._is_stale(last):
             return 0.0
@@ -353,7 +353,7 @@ class AbbArm(ArmDriver):
                 raise ArmFault("arm", "does not stop: press its emergency stop")
 
     def _stands_since(self, seconds: float) -> bool:
-        """Whether fresh poses have not moved for so long."""
+        """Return whether fresh poses have not moved for so long."""
         last, first = self._stream.last, self._stands_at
         if last is None or first is None or self._is_stale(last):
             return False
@@ -457,7 +457,7 @@ class AbbArm(ArmDriver):
                 raise ArmFault("arm", "runs a program already: stop it at the pendant")
 
     def _notes(self) -> tuple[str, ...]:
-        """What a person should know of its poses and of its watchdog."""
+        """Return notes for a person on its poses and its watchdog."""
         limit_s = self._settings.watchdog_s
         watch = (
             "no watchdog: a path runs to its end if this computer is gone"
@@ -575,7 +575,7 @@ class AbbArm(ArmDriver):
             self._may_move = False
 
     def _why_given_up(self) -> str | None:
-        """Why the path is not to be followed to its end, if so: no poses, or another speed."""
+        """Return why the path is to be given up, if it is: no poses, or another speed."""
         watch, last, status = self._watch, self._stream.last, self._status
         seen_s = max(self._began_s, last.host_ns / 1e9 if last is not None else 0.0)
         silent_s = time.monotonic() - seen_s
@@ -618,7 +618,7 @@ class AbbArm(ArmDriver):
                 self._halt(self._run)
 
     def _has_stopped(self, since_s: float) -> bool:
-        """Whether no program runs, by a question asked after `since_s`."""
+        """Return whether no program runs, by a question asked after `since_s`."""
         status = self._status
         return status is not None and self._asked_s > since_s and status.execution == "stopped"
 
@@ -630,7 +630,7 @@ class AbbArm(ArmDriver):
         return time.monotonic_ns() - sample.host_ns > SILENCE_S * 1e9
 
     def _seconds(self, run: Run) -> list[float]:
-        """How long each segment takes, without its ramps."""
+        """Return how long each segment takes, without its ramps."""
         places = [self._planned or run.path[0].to, *(segment.to for segment in run.path)]
         return [
             distance_mm(one, segment.to) / segment.speed_mm_s + PAUSE_S

@@ -161,7 +161,7 @@ class EgmReceiver:
         self._egm.close()
 
     def _is_next(self, number: int, t_ns: int) -> bool:
-        """Whether a packet is newer than the last one; counts those missing between the two."""
+        """Return whether a packet is newer than the last one; counts those missing between."""
         if self._last is not None:
             last, last_ns = self._last
             back_ns = last_ns - t_ns

@@ -257,7 +257,7 @@ class FakeAbb(FakeController):
 
     @property
     def sessions(self) -> int:
-        """How many clients are logged in."""
+        """Number of clients that are logged in."""
         return 0 if self._http is None else self._http.sessions
 
     def _unplug(self) -> None:

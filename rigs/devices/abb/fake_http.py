@@ -48,7 +48,7 @@ class HttpServer:
 
     @property
     def sessions(self) -> int:
-        """How many clients are logged in."""
+        """Number of clients that are logged in."""
         return len(self._server.sessions)
 
     def cut(self) -> None:

@@ -22,7 +22,7 @@ _UNIT_TOLERANCE = 0.01
 
 
 class Command(IntEnum):
-    """What can be asked."""
+    """Commands of the server."""
 
     INFO = 0
     MOVE_JOINTS = 1
@@ -113,7 +113,7 @@ class RapidSocket:
         return values
 
     def info(self, within_s: float) -> str:
-        """What the server says of itself: text without a length, taken as it comes in one piece.
+        """Return the server's own description: text without a length, taken as one piece.
 
         Raises:
             RapidError: as `ask`; another client that holds the one connection looks like that.
@@ -156,7 +156,7 @@ def pack(command: Command, values: Sequence[float]) -> bytes:
 
 
 def socket_health(info: str) -> DeviceHealth:
-    """Of the server that some labs run on an ABB controller, by what it says of itself."""
+    """Return the report of the server that some labs run on an ABB controller."""
     return DeviceHealth(
         device="arm",
         model=info or UNKNOWN,

@@ -53,7 +53,7 @@ class _Bounded(HTTPAdapter):  # type: ignore[misc, unused-ignore]
 
 @dataclass(frozen=True)
 class WebStatus:
-    """What the web services say of the controller."""
+    """The controller's status by its web services."""
 
     controller: str
     """motoron, motoroff, guardstop, emergencystop, ..."""
@@ -100,7 +100,7 @@ class WebServices:
         )
 
     def is_running(self) -> bool:
-        """Whether a program runs, in one request. Raises WebError."""
+        """Return whether a program runs, in one request. Raises WebError."""
         return self._ask(lambda: self._rws.get_execution_state().ctrlexecstate != "stopped")
 
     def flange(self) -> tuple[Pose, tuple[float, ...]]:
@@ -114,7 +114,7 @@ class WebServices:
         return joints
 
     def about(self, resource: str) -> dict[str, str]:
-        """What a resource such as ``rw/system`` says, by name; empty where it is not there.
+        """Return the fields of a resource such as ``rw/system``; empty where it is not there.
 
         Raises:
             WebError: no answer.
@@ -167,7 +167,7 @@ class WebServices:
 
 
 def abb_health(web: WebServices, notes: tuple[str, ...]) -> DeviceHealth:
-    """Of an ABB controller, by its web services (RobotWare 6).
+    """Return the report of an ABB controller, by its web services (RobotWare 6).
 
     Args:
         web: a session of them.

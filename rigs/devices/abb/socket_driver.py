@@ -98,7 +98,7 @@ class AbbSocketArm(ArmDriver):
         return ArmState.READY if self._run.done else ArmState.MOVING
 
     def pose(self) -> Pose:
-        """Where the arm was when it was asked last: now if it stands, else before this piece."""
+        """Return the pose that was asked for last: now if it stands, else before this piece."""
         if self._run.done and self._lost is None:
             with self._one:
                 self._watched(self._look)
@@ -112,7 +112,7 @@ class AbbSocketArm(ArmDriver):
         return time.monotonic_ns()
 
     def health(self) -> DeviceHealth:
-        """What the server said of itself when it was reached."""
+        """Return the server's own description from when it was reached."""
         return socket_health(self._info)
 
     def start(self, path: Sequence[Segment]) -> None:

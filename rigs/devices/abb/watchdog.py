@@ -72,7 +72,7 @@ class Watchdog:
         self._beating = self._begun
 
     def stopped_it(self, web: WebServices) -> bool:
-        """Whether the controller has stopped the arm for want of a beat. Raises WebError."""
+        """Return whether the controller has stopped the arm for want of a beat. Raises WebError."""
         return web.read_signal(LIMIT) == 0
 
     def close(self, watch: bool) -> None:

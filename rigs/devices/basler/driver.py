@@ -122,7 +122,7 @@ class BaslerCamera:
         self._in_force = read_back(nodes)
 
     def _abilities(self) -> Abilities:
-        """What the camera has; what of it is used is switched on."""
+        """Return the camera's abilities, with those switched on that are used."""
         nodes, settings = self._nodes, self.settings
         chunk = self._chunk("Timestamp")
         level = chunk and settings.sync_line is not None and self._chunk("LineStatusAll")
@@ -177,11 +177,11 @@ class BaslerCamera:
 
     @property
     def counts(self) -> GrabCounts:
-        """What became of the frames of this run, or of the last one."""
+        """Counts of the frames of this run, or of the last one."""
         return self._grab.counts if self._grab is not None else GrabCounts()
 
     def describe(self) -> Json:
-        """What a trial's record keeps of the camera: device, region, times and losses."""
+        """Return what a trial's record keeps of the camera: device, region, times and losses."""
         info, stamping = self._device.GetDeviceInfo(), self.stamping
         height, width = self._shape
         return {
@@ -197,7 +197,7 @@ class BaslerCamera:
         }
 
     def health(self) -> DeviceHealth:
-        """What it says of itself now, grabbing or not.
+        """Return the camera's own report now, grabbing or not.
 
         Raises:
             RigError: the camera is gone.
@@ -206,7 +206,7 @@ class BaslerCamera:
 
     @property
     def _buffers(self) -> int:
-        """Of pylon; as many frames fit into the queue."""
+        """Number of pylon's buffers; as many frames fit into the queue."""
         half = math.ceil(self.settings.rate_hz * self.settings.back_pressure_s / 2)
         return max(half, _LEAST_BUFFERS)
 

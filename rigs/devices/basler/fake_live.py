@@ -63,7 +63,7 @@ class Setting:
 
     @property
     def Value(self) -> Any:
-        """What is in force."""
+        """The value in force."""
         return self._value
 
     @Value.setter
@@ -85,11 +85,11 @@ class Setting:
 
     @property
     def simulated(self) -> bool:
-        """Whether what is in force is what the pictures show."""
+        """Whether the value in force is what the pictures show."""
         return self._simulates(self._value)
 
     def refusal(self, value: Any) -> str:
-        """Why a value is refused."""
+        """Return why a value is refused."""
         low, high = self._limits
         those = " or ".join(map(str, self._choices)) if self._choices else f"{low} to {high}"
         return f"the stand-in simulates {self.name} {those}, not {value}"
@@ -112,7 +112,7 @@ class Selected:
 
     @property
     def Value(self) -> bool:
-        """Of what is selected now."""
+        """The value of what is selected now."""
         return self._selector.Value in self._on
 
     @Value.setter
@@ -142,7 +142,7 @@ class Command:
             self._node.Execute()
 
     def IsDone(self) -> bool:
-        """Whether it has ended."""
+        """Return whether it has ended."""
         return True
 
     def GetAccessMode(self) -> int:
@@ -161,7 +161,7 @@ class ReadOnly:
 
     @property
     def Value(self) -> float:
-        """What it is now."""
+        """The value now."""
         return self._read()
 
     def GetAccessMode(self) -> int:
@@ -206,7 +206,7 @@ _Frame = tuple[U8, int, int, int]
 
 
 class Scene(Protocol):
-    """Where the frames come from."""
+    """The source of the frames."""
 
     on_frames: Callable[[FrameChunk], None]
 
@@ -277,7 +277,7 @@ class LiveBasler:
         return NodeMap(emulated, self._nodes)
 
     def _lay_over(self, emulated: Any) -> dict[str, Any]:
-        """What the scene shows, by name; open cameras have settings."""
+        """Return the settings that the scene shows, by name; open cameras have settings."""
         exposure_us = self._mid_exposure_ns / 500
         ticks = tuple(f"Line{number}" for number in LINES if number - 1 != self._bit)
         plain: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -341,7 +341,7 @@ class LiveBasler:
         return self._nodes["ChunkEnable"].on if active else frozenset()
 
     def IsCameraDeviceRemoved(self) -> bool:
-        """Whether it was unplugged."""
+        """Return whether it was unplugged."""
         return self._gone or bool(self._device.IsCameraDeviceRemoved())
 
     def StartGrabbing(self, strategy: Any) -> None:
@@ -462,7 +462,7 @@ class LiveBasler:
                     self._came.wait(LOOK_S)
 
     def _ready(self) -> bool:
-        """Whether the next trigger may come, after waiting for it."""
+        """Return whether the next trigger may come, after waiting for it."""
         from pypylon import pylon
 
         end = time.monotonic() + READY_S

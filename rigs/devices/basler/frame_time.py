@@ -1,4 +1,4 @@
-"""How a frame's time is known: the best means that the camera has, and the grade that follows.
+"""The time of a frame: the best means that the camera has to tell it, and the grade that follows.
 
 A camera is asked what it has and the answer is kept by name, for two cameras of one maker differ.
 Meaning of the stamps, from Basler's product documentation of chunks and events: a chunk's and a
@@ -19,7 +19,7 @@ Means = Literal["chunk", "grab result", "exposure end event", "host arrival"]
 
 @dataclass(frozen=True)
 class Abilities:
-    """What a camera has of all that helps to know a frame's time.
+    """Abilities of a camera that help to know a frame's time.
 
     Attributes:
         chunk: sends a time stamp with every frame.

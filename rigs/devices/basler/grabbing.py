@@ -36,7 +36,7 @@ NO_ID = (1 << 64) - 1
 
 @dataclass
 class GrabCounts:
-    """What became of the frames of one run.
+    """Counts of the frames of one run.
 
     Attributes:
         grabbed: whole frames in order, handed on or still in the queue.
@@ -85,7 +85,7 @@ class _Waiting:
 
 @dataclass(frozen=True)
 class GrabSettings:
-    """What the thread has to know of the camera.
+    """Settings of the grabbing thread.
 
     Attributes:
         first_id: block id of a run's first frame: 0 on USB, 1 on GigE.
@@ -135,13 +135,13 @@ class Grab:
 
     @property
     def counts(self) -> GrabCounts:
-        """What became of the frames so far."""
+        """Counts of the frames so far."""
         with self._changed:
             return self._counts.copy()
 
     @property
     def fault(self) -> RigError | None:
-        """Why no more frames will come, if that is so."""
+        """Return why no more frames will come, if that is so."""
         with self._changed:
             if self._fault is not None or self._stopping.is_set():
                 return self._fault
@@ -215,7 +215,7 @@ class Grab:
             self._fail(RigError(DEVICE, what))
 
     def _room(self) -> bool:
-        """Whether the queue has room, after waiting for it; a run that ends makes its own."""
+        """Return whether the queue has room, after waiting; a run that ends makes its own."""
         with self._changed:
             if len(self._ready) < self._settings.queue or self._stopping.is_set():
                 return True
@@ -292,7 +292,7 @@ class Grab:
                 )
 
     def _is_late(self, frame: _Waiting, stamp_ns: int) -> bool:
-        """Whether it took longer than the fastest one of this run by more than is allowed."""
+        """Return whether it took too much longer than the fastest one of this run."""
         if self._settings.stamping.means == "host arrival":
             before, self._before = self._before, (frame.number, frame.host_ns)
             if before is None or not self._settings.period_ns:

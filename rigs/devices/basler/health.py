@@ -1,4 +1,4 @@
-"""What an open frame camera says of itself, for a look at the rig before a campaign.
+"""The report of an open frame camera, for a look at the rig before a campaign.
 
 Names of Basler's nodes are those of its ace 2 USB family, and older ones after them. None of this
 was read from a real camera yet: what a camera does not have is left out or `unknown`.
@@ -17,7 +17,7 @@ from sliplab.rigs.devices.basler.nodes import Nodes
 def basler_health(
     device: Any, nodes: Nodes, stamping: Stamping, shape: tuple[int, int], buffers: int
 ) -> DeviceHealth:
-    """Of an open `InstantCamera` of pypylon whose region is `shape` (height, width), pixels.
+    """Return the report of an open `InstantCamera` of pypylon; `shape` is (rows, columns).
 
     Raises:
         RigError: the camera is gone.

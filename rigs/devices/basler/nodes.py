@@ -39,12 +39,12 @@ class Nodes:
         self._map, self._genicam = node_map, genicam
 
     def has(self, name: str) -> bool:
-        """Whether a setting is there and may be written now."""
+        """Return whether a setting is there and may be written now."""
         node = self._map.GetNode(name)
         return node is not None and node.GetAccessMode() in (self._genicam.RW, self._genicam.WO)
 
     def offers(self, name: str, choice: str) -> bool:
-        """Whether a setting can be set and `choice` is one of its values."""
+        """Return whether a setting can be set and `choice` is one of its values."""
         return self.has(name) and choice in self._map.GetNode(name).Symbolics
 
     def choices(self, name: str) -> tuple[str, ...]:
@@ -110,7 +110,7 @@ class Nodes:
                 raise RigError(DEVICE, f"{name} = {value}: {self._why(name, error)}") from None
 
     def _why(self, name: str, error: Exception) -> str:
-        """Why a value is refused; of an enumeration pylon says no more than its name."""
+        """Return why a value is refused; of an enumeration pylon says no more than its name."""
         choices, text = self.choices(name), _short(error)
         if choices and text.startswith("Feature "):
             return f"this camera has {', '.join(choices)}"
@@ -162,7 +162,7 @@ def centre_region(nodes: Nodes, width_px: int, height_px: int) -> None:
 
 
 def has_latch(nodes: Nodes) -> bool:
-    """Whether the host can read the camera's clock."""
+    """Return whether the host can read the camera's clock."""
     return any(nodes.has(command) for command, _, _ in _LATCHES)
 
 

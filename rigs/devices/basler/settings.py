@@ -1,4 +1,4 @@
-"""What a rig file says of a Basler camera; the driver asks the device for everything else."""
+"""Settings of a Basler camera in a rig file; the driver asks the device for everything else."""
 
 from __future__ import annotations
 

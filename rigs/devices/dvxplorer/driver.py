@@ -40,7 +40,7 @@ _LOOK_NS = 10_000_000
 
 @dataclass
 class EventCounts:
-    """What one run received.
+    """Counts of what one run received.
 
     Attributes:
         events: kept, read or not.
@@ -77,7 +77,7 @@ class Source(Protocol):
         """Take all that has come."""
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """What the camera says of itself. Raises RigError."""
+        """Return the camera's own report. Raises RigError."""
 
     def close(self) -> None:
         """Give it back; any number of times."""
@@ -119,12 +119,12 @@ class DvxplorerCamera:
 
     @property
     def counts(self) -> EventCounts:
-        """What this run, or the last one, has received so far."""
+        """Counts of what this run, or the last one, has received so far."""
         with self._lock:
             return EventCounts(**asdict(self._counts))
 
     def describe(self) -> Json:
-        """What a trial's record keeps of the camera."""
+        """Return what a trial's record keeps of the camera."""
         return {
             "camera": self._source.name,
             "resolution_px": [self.width, self.height],
@@ -134,7 +134,7 @@ class DvxplorerCamera:
         }
 
     def health(self) -> DeviceHealth:
-        """What it says of itself now, streaming or not.
+        """Return the camera's own report now, streaming or not.
 
         Raises:
             RigError: the camera is gone, or does not answer.
@@ -296,7 +296,7 @@ class DvxplorerCamera:
             self._events.append(chunk)
 
     def _in_order(self, t_us: I64) -> bool:
-        """Whether times go on without a step back; silences are counted on the way."""
+        """Return whether times go on without a step back; silences are counted on the way."""
         before = t_us[0] if self._last_us is None else self._last_us
         steps = np.diff(t_us, prepend=before)
         if int(steps.min()) < 0:

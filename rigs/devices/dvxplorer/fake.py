@@ -42,7 +42,7 @@ _MOST_WAITING = 256
 
 @dataclass(frozen=True)
 class Sent:
-    """What a server has sent."""
+    """Counts of what a server has sent."""
 
     events: int
     pulses: int
@@ -111,7 +111,7 @@ class DvxplorerServer:
         return self._pipe.poll(0)
 
     def finish(self, timeout_s: float) -> Sent:
-        """What was sent, once all of it has left. Raises ServerError."""
+        """Return what was sent, once all of it has left. Raises ServerError."""
         sent: Sent = self._expect("sent", timeout_s)
         return sent
 

@@ -38,7 +38,7 @@ _SIZE = '                <attr key="size{axis}" type="int">{value}</attr>\n'
 
 
 def events_header(size: tuple[int, int], source: str) -> bytes:
-    """What comes first on a stream of events of so many columns and rows."""
+    """Return the first bytes on a stream of events of so many columns and rows."""
     info = "".join(
         _SIZE.format(axis=axis, value=value) for axis, value in zip("XY", size, strict=True)
     )
@@ -47,7 +47,7 @@ def events_header(size: tuple[int, int], source: str) -> bytes:
 
 
 def triggers_header(source: str) -> bytes:
-    """What comes first on a stream of triggers."""
+    """Return the first bytes on a stream of triggers."""
     text = _INFO.format(output="triggers", kind="TRIG", info="", source=source)
     return header_buffer(text, 0)
 
@@ -102,7 +102,7 @@ class DvServer:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         with self._changed:
             return len(self._clients)
 
@@ -124,12 +124,12 @@ class DvServer:
             self._changed.notify_all()
 
     def wait_for_client(self, within_s: float) -> bool:
-        """Whether somebody is connected, after waiting for it."""
+        """Return whether somebody is connected, after waiting for it."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._clients), within_s)
 
     def drain(self, within_s: float) -> bool:
-        """Whether everything has left, after waiting for it."""
+        """Return whether everything has left, after waiting for it."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._waiting, within_s)
 

@@ -71,7 +71,7 @@ class EventProcess:
         return found
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """What the camera, or the stream, says of itself. Raises RigError."""
+        """Return the report of the camera, or of the stream. Raises RigError."""
         found: DeviceHealth = self._call("health", settings)
         return found
 

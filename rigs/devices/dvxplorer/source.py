@@ -1,4 +1,4 @@
-"""Where events and triggers come from: a DVXplorer on USB, or two streams on the network.
+"""The source of events and triggers: a DVXplorer on USB, or two streams on the network.
 
 All of them are `dv.io.InputBase` of dv-processing 2.0.4, whose `getNext...` calls return at once,
 with None where there is nothing. A network stream carries one kind of data, so there are two; a
@@ -41,7 +41,7 @@ class Input(Protocol):
         """A sequence of triggers, or None."""
 
     def isRunning(self) -> bool:
-        """Whether the device or the connection still lives."""
+        """Return whether the device or the connection still lives."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class EventSource:
         )
 
     def health(self, settings: DvxplorerSettings) -> DeviceHealth:
-        """What the camera, or the stream, says of itself.
+        """Return the report of the camera, or of the stream.
 
         Its only thermometer is the IMU's, and the IMU is off.
 

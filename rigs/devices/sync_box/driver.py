@@ -29,7 +29,7 @@ _MOST_MISSED = 10_000
 
 @dataclass
 class Losses:
-    """What did not reach the host since the last start; all 0 in a good trial."""
+    """Losses on the way to the host since the last start; all 0 in a good trial."""
 
     pulses: int = 0
     """Pulses whose report is missing, found by their numbers."""
@@ -168,7 +168,7 @@ class SerialSyncBox:
         self._port, self._train, self._running, self._clock_us = None, None, False, 0
 
     def health(self) -> DeviceHealth:
-        """What the box says of itself, and how far its clock has come since it got power.
+        """Return the box's own report, and its clock since it got power.
 
         Raises:
             SyncBoxFault: no answer.
@@ -289,7 +289,7 @@ class SerialSyncBox:
 
     @property
     def losses(self) -> Losses:
-        """What of the last train did not arrive."""
+        """Losses of the last train."""
         if self._port is None or self._train is None:
             return Losses()
         with self._port.news:

@@ -30,7 +30,7 @@ CODES: dict[str, Code] = {code: code for code in get_args(Code)}
 
 @dataclass(frozen=True)
 class _Plan:
-    """What ARM said: `last` ticks, 0 without end."""
+    """A train as ARM named it: `last` ticks, 0 without end."""
 
     millihertz: int
     last: int

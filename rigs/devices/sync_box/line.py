@@ -1,4 +1,4 @@
-"""How the sync box and the host write lines to each other; docs/sync-box.md has the protocol.
+"""Lines between the sync box and the host; docs/sync-box.md has the protocol.
 
 The driver and the fake on a pty share this file; the firmware has it in C (firmware/line.c).
 """

@@ -1,4 +1,4 @@
-"""How to reach a sync box, as a rig file says it; cheap to import."""
+"""Settings that reach a sync box, as a rig file gives them; cheap to import."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sliplab.rigs.devices.sync_box.line import BAUD
 
 
 class SyncBoxSettings(StrictModel):
-    """How to reach a sync box; the defaults fit the firmware that ships."""
+    """Settings that reach a sync box; the defaults fit the firmware that ships."""
 
     port: str = Field(min_length=1)
     """The serial port's name, best one that stays: /dev/serial/by-id/..."""

@@ -141,7 +141,7 @@ class UrArm(ArmDriver):
         return ArmState.READY if self._run.done else ArmState.MOVING
 
     def pose(self) -> Pose:
-        """Where the tool centre point was in the last packet. Raises ArmFault without one."""
+        """Return the tool centre point in the last packet. Raises ArmFault without one."""
         return self._last().pose
 
     def now_ns(self) -> int:
@@ -149,7 +149,7 @@ class UrArm(ArmDriver):
         return self._last().t_ns
 
     def health(self) -> DeviceHealth:
-        """What the controller says of itself; takes at most 8 s.
+        """Return the controller's own report; takes at most 8 s.
 
         Raises:
             ArmFault: it does not answer.
@@ -460,7 +460,7 @@ class UrArm(ArmDriver):
         return (self._rose_ns, self._fell_ns) if self._is_at(segment.to) else None
 
     def _ask_control_to_stop(self) -> bool:
-        """Whether the control client took a stop, behind any move that was on its way to it."""
+        """Return whether the control client took a stop, behind any move on its way to it."""
         if self._control is None or self._lost is not None:
             return False
         if not self._commanding.acquire(timeout=COMMAND_S):
@@ -480,7 +480,7 @@ class UrArm(ArmDriver):
         return ur_ports.end_program(self._settings.host, deceleration, PORT_S)
 
     def _wait_still(self) -> bool:
-        """Whether a packet that was read from now on shows the arm at rest, in time."""
+        """Return whether a packet that was read from now on shows the arm at rest, in time."""
         now_ns = time.monotonic_ns()
 
         def still() -> bool:
@@ -493,7 +493,7 @@ class UrArm(ArmDriver):
         return self._status is not None and _rests(self._status)
 
     def _is_still_anew(self) -> bool:
-        """Whether a connection made for this question alone shows the arm at rest, in time."""
+        """Return whether a new connection, made for this alone, shows the arm at rest in time."""
         reader = RtdeReader(self._settings.host, PORT_S, PORT_S)
         end = time.monotonic() + PORT_S + STILL_S
         with contextlib.suppress(RtdeError):
@@ -539,5 +539,5 @@ class UrArm(ArmDriver):
 
 
 def _rests(status: UrStatus) -> bool:
-    """Whether a packet says that the arm is at rest; a program that was ended clears nothing."""
+    """Return whether a packet shows the arm at rest; a program that was ended clears nothing."""
     return status.speed_mm_s < STILL_MM_S and not (status.move_runs and status.running)

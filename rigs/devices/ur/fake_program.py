@@ -43,7 +43,7 @@ class Runtime(IntEnum):
 
 
 class UrProgram:
-    """What the controller does in one cycle, and the values that it tells.
+    """The controller's work in one cycle, and the values that it tells.
 
     Args:
         motion: where the tool centre point is.
@@ -216,7 +216,7 @@ class UrProgram:
         return self.reader(name)(t_s)
 
     def reader(self, name: str) -> Callable[[float], int | float | list[float]]:
-        """What gives the value of an RTDE output at a controller time."""
+        """Return the function from controller time to the value of an RTDE output."""
         kind, _, index = name.rpartition("_")
         if kind == "output_int_register":
             return lambda t_s, k=int(index): self.ints_out[k]  # type: ignore[misc]
@@ -239,7 +239,7 @@ class UrProgram:
         return known.get(name, lambda _: 0)
 
     def _velocity(self) -> list[float]:
-        """Of the tool centre point in the last cycle, m/s; turning is left out."""
+        """Return the tool centre point's velocity in the last cycle, m/s, without turning."""
         return [*(v / MM_PER_M for v in self._speed_mm_s), 0.0, 0.0, 0.0]
 
     def _tcp(self, t_s: float) -> list[float]:

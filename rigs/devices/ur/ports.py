@@ -90,7 +90,7 @@ def _line(link: socket.socket, deadline: float) -> str:
 
 
 def ur_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
-    """Of a Universal Robots controller, by its dashboard (e-Series guide, PolyScope 5).
+    """Return the report of a UR controller, by its dashboard (e-Series guide, PolyScope 5).
 
     Raises:
         PortError: it does not answer.

@@ -11,12 +11,11 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fakes import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import WorkspaceError
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.abb import driver
 from sliplab.rigs.devices.abb.driver import AbbArm
-from sliplab.rigs.devices.abb.fake import HOME
 from sliplab.rigs.devices.abb.rws import REQUEST_S, START_REQUESTS
 from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings
 from tests.rigs.waiting import own_address, until

@@ -11,11 +11,11 @@ import pytest
 from abb_robot_client._egm_protobuf import egm_pb2
 
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
-from sliplab.rigs.core.fakes import PACKETS_LOST, Kind
+from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Kind
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.abb import driver
 from sliplab.rigs.devices.abb.driver import AbbArm
-from sliplab.rigs.devices.abb.fake import HOME, FakeAbb
+from sliplab.rigs.devices.abb.fake import FakeAbb
 from sliplab.rigs.devices.abb.rws import REQUEST_S, WebRefused, WebServices
 from tests.rigs.devices.conftest import EGM_PORT, MakeAbb, abb_settings, egm_message, mm_after_kill
 from tests.rigs.waiting import own_address, until

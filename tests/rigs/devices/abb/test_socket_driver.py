@@ -15,11 +15,11 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fakes import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SpeedError
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.abb import socket_driver as driver
-from sliplab.rigs.devices.abb.fake_socket import HOME, FakeRapidServer
+from sliplab.rigs.devices.abb.fake_socket import FakeRapidServer
 from sliplab.rigs.devices.abb.rapid_socket import Command, RapidError, RapidSocket
 from sliplab.rigs.devices.abb.settings import AbbSocketSettings
 from sliplab.rigs.devices.abb.socket_driver import AbbSocketArm

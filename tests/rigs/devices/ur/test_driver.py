@@ -10,10 +10,9 @@ import pytest
 
 from sliplab.rigs.build import build_arm
 from sliplab.rigs.core.capabilities import Arm, ArmFault, ArmState, Pose, RigError, Segment
-from sliplab.rigs.core.fakes import Fault, Kind, Stage
+from sliplab.rigs.core.fakes import HOME, Fault, Kind, Stage
 from sliplab.rigs.core.guard import SingularityError, SpeedError, WorkspaceError
 from sliplab.rigs.devices.ur.driver import UrArm
-from sliplab.rigs.devices.ur.fake import HOME
 from sliplab.storage.streams import PoseChunk
 from tests.rigs.devices.conftest import MakeArm, MakeRobot, ur_settings
 from tests.rigs.waiting import own_address, until

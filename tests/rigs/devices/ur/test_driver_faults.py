@@ -19,14 +19,13 @@ from collections.abc import Callable
 import pytest
 
 from sliplab.rigs.core.capabilities import ArmFault, ArmState, Pose, Segment
-from sliplab.rigs.core.fakes import PACKETS_LOST, Fault, Kind, Stage
+from sliplab.rigs.core.fakes import HOME, PACKETS_LOST, Fault, Kind, Stage
 from sliplab.rigs.core.pose import distance_mm
 from sliplab.rigs.devices.ur import control as ur_control
 from sliplab.rigs.devices.ur import driver
 from sliplab.rigs.devices.ur import ports as ur_ports
 from sliplab.rigs.devices.ur.control import ControlError, ControlProcess
 from sliplab.rigs.devices.ur.driver import UrArm
-from sliplab.rigs.devices.ur.fake import HOME
 from sliplab.rigs.devices.ur.rtde import HEADER, SETUP_INPUTS
 from sliplab.rigs.devices.ur.rtde import PORT as RTDE_PORT
 from tests.rigs.devices.conftest import MakeArm, MakeRobot, ur_settings

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 import pytest
 
 from sliplab.rigs.core.capabilities import Pose
-from sliplab.rigs.core.fakes import Kind
+from sliplab.rigs.core.fakes import HOME, Kind
 from sliplab.rigs.devices.ur import ports as ur_ports
-from sliplab.rigs.devices.ur.fake import HOME, FakeUr
+from sliplab.rigs.devices.ur.fake import FakeUr
 from sliplab.rigs.devices.ur.rtde import RtdeError, RtdeReader
 from tests.rigs.waiting import own_address, until
 
