@@ -1,1 +1,1 @@
-"""What is kept: recordings, the crash-safe trial store, derived results."""
+"""Stored data: typed documents, recordings, the crash-safe trial store, formats, remote storage."""

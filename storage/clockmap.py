@@ -90,7 +90,7 @@ class ClockMap:
         return cls(tuple(device_ns[:-1]), tuple(reference_ns[:-1]), tuple(drift))
 
     def drift_ppm(self, device_ns: int | None = None) -> float:
-        """What the reference gains at a time; by default the mean from first to last knot, ppm."""
+        """Return the reference's gain at a time; by default the mean over all knots, ppm."""
         if device_ns is not None or len(self.drift) == 1:
             k = 0 if device_ns is None else self._piece(device_ns)
             return self.drift[k] / 1e12

@@ -47,14 +47,14 @@ class NoStore(InputError, StoreError):
         super().__init__(place, "", None, why)
 
     def __reduce__(self) -> tuple[type[NoStore], tuple[str, ...]]:
-        """Its own arguments: it may come from another process."""
+        """Pickle its own arguments: it may come from another process."""
         return type(self), (str(self.file), self.expected)
 
 
 def disk_fault(error: BaseException | None) -> str | None:
-    """What is the matter with the disk if `error`, or what caused it, says so: ``is full``.
+    """Return the fault of the disk that `error` or its cause states, such as ``is full``.
 
-    HDF5 tells some of it in words only.
+    HDF5 states some of them in words only.
     """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None
@@ -68,17 +68,17 @@ def disk_fault(error: BaseException | None) -> str | None:
 
 
 def disk_full(error: BaseException | None) -> bool:
-    """Whether `error`, or what caused it, is a disk or a quota without room."""
+    """Return whether `error` or its cause is a disk or a quota without room."""
     return disk_fault(error) in {_FAULTS[errno.ENOSPC], _FAULTS[errno.EDQUOT]}
 
 
 def own_fault(error: Exception) -> bool:
-    """Whether a file could not be read for want of memory or open files: it is not damaged."""
+    """Return whether memory or open files ran out: the file that was read is not damaged."""
     return isinstance(error, OSError) and error.errno in _OWN_FAULTS
 
 
 def disk_error(folder: Path, error: BaseException) -> StoreError | None:
-    """What to say of an error that came from the disk under `folder`; None for any other."""
+    """Translate an error that came from the disk under `folder`; None for any other error."""
     fault = disk_fault(error)
     if fault is None:
         return None
@@ -117,10 +117,13 @@ def translated_disk_errors(folder: Path, *others: type[BaseException]) -> Iterat
 
 
 def masked(text: str) -> str:
-    """`text` with every secret replaced by ``****``.
+    """Return `text` with every secret replaced by ``****``.
 
     Secrets are the passwords of addresses (``scheme://user:password@host``), wherever they come
-    from, and the values of environment variables that are named as one.
+    from, and the values of environment variables that are named as one. Errors of other libraries
+    quote addresses with their credentials, and command lines are kept with locks: such text goes
+    through here before it is kept or said. Data do not: a condition must not change because it
+    looks like somebody's key.
     """
     for secret in _secrets():
         if secret in text:
@@ -129,7 +132,7 @@ def masked(text: str) -> str:
 
 
 def _secrets() -> list[str]:
-    """Longest first: one may be part of another."""
+    """Return all secrets, longest first: one may be part of another."""
     found = set()
     for name, value in os.environ.items():
         if len(value) < _SHORTEST:

@@ -1,8 +1,8 @@
-"""Writing files so that after a crash each one is whole or absent.
+"""Writing of files so that after a crash each one is complete or absent.
 
 Every write in the project goes through here: a temporary file beside the target, flushed to the
-disk, then renamed over it, then the folder flushed too. In a folder that is still aside and becomes
-visible by a rename of its own, files are only flushed.
+disk, then renamed over it, then the folder flushed too. In a folder that becomes visible by a
+rename of its own, files are only flushed.
 
 A killed program may leave a temporary file. Its name says whose it is (`.NAME.PID.tmp`), so that
 `sweep_temporary` takes away what nobody will finish.
@@ -26,7 +26,7 @@ from sliplab.storage.errors import StoreError
 _BLOCK = 1 << 20
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp")
 _NAME_BYTES = 200
-"""Of a target's name in that of its temporary file; a file's name has at most 255 bytes."""
+"""Bytes of a target's name in that of its temporary file; a file's name has at most 255."""
 _SAFE = re.compile(r"[A-Za-z0-9][A-Za-z0-9=,._+-]{0,250}")
 
 
@@ -92,14 +92,14 @@ def write_blocks(path: Path, blocks: Iterable[bytes], mode: int = 0o666) -> None
 
 
 def read_blocks(path: Path) -> Iterator[bytes]:
-    """A file's bytes, a megabyte at a time."""
+    """Yield a file's bytes, a megabyte at a time."""
     with path.open("rb") as handle:
         while block := handle.read(_BLOCK):
             yield block
 
 
 def write_new_json(path: Path, data: Any) -> bool:
-    """Write JSON whole and flushed under a name that is free.
+    """Write JSON, complete and flushed, under a name that is free.
 
     Returns:
         False if the name was taken; nothing was changed then.
@@ -125,7 +125,7 @@ def write_new_json(path: Path, data: Any) -> bool:
 
 
 def temporary_files(folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Temporary files in a folder, and whether the program that began each still runs."""
+    """Yield temporary files in a folder, each with whether its program still runs."""
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
@@ -134,7 +134,7 @@ def temporary_files(folder: Path) -> Iterator[tuple[Path, bool]]:
 
 
 def sweep_temporary(folder: Path) -> int:
-    """Delete temporary files that a killed program left in a folder; returns how many."""
+    """Delete temporary files that a killed program left in a folder; return their number."""
     left = [path for path, runs in temporary_files(folder) if not runs]
     for path in left:
         path.unlink(missing_ok=True)
@@ -168,7 +168,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_json_aside(path: Path, data: Any) -> None:
-    """Write JSON in a folder that nobody looks into yet: flushed, neither atomic nor its entry.
+    """Write JSON, flushed but not atomic, in a folder that is not visible yet.
 
     Whoever makes the folder visible flushes its entries before.
 
@@ -182,7 +182,7 @@ def write_json_aside(path: Path, data: Any) -> None:
 
 
 def json_text(data: Any) -> str:
-    """How JSON is written: keys sorted, one a line.
+    """Format JSON as it is written: keys sorted, one a line.
 
     Raises:
         ValueError: as `write_json`.
@@ -212,7 +212,7 @@ def _indented(data: Any, depth: int) -> str:
 
 @cache
 def _encoder(depth: int) -> json.JSONEncoder:
-    """Of what holds nothing nested."""
+    """Return the encoder of values without nested ones."""
     return json.JSONEncoder(
         sort_keys=True, allow_nan=False, ensure_ascii=False,
         separators=(",\n" + " " * depth, ": "),
@@ -249,7 +249,7 @@ def _finite(text: str) -> float:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's bytes, 64 hex digits."""
+    """Return the SHA-256 of a file's bytes, 64 hex digits."""
     digest = hashlib.sha256()
     for block in read_blocks(path):
         digest.update(block)
@@ -257,7 +257,7 @@ def sha256(path: Path) -> str:
 
 
 def safe_name(name: str) -> str:
-    """`name` if it is a plain file name.
+    """Return `name` if it is a plain file name.
 
     Raises:
         StoreError: it could lead out of its folder.
@@ -268,7 +268,7 @@ def safe_name(name: str) -> str:
 
 
 def inside(path: Path, store: Path) -> Path:
-    """`path`, if no link on the way to it leads out of the store's folder.
+    """Return `path`, if no link on the way to it leads out of the store's folder.
 
     Raises:
         StoreError: one does.

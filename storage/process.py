@@ -1,4 +1,4 @@
-"""Which process is which: numbers are used again, so a process is its number and its start."""
+"""Identity of a process: its number and its start, since numbers are used again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STARTED = 19
 
 
 def this_process() -> Json:
-    """Who runs here: ``pid``, ``host``, ``user``, ``command``, ``since``, ``boot``, ``ticks``."""
+    """Return ``pid``, ``host``, ``user``, ``command``, ``since``, ``boot`` and ``ticks``."""
     return {
         "pid": os.getpid(),
         "host": socket.gethostname(),
@@ -32,12 +32,12 @@ def this_process() -> Json:
 
 
 def now() -> str:
-    """This moment in UTC, to a second, as ISO 8601."""
+    """Return the time in UTC, to a second, as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def user_name() -> str:
-    """Who is logged in, or the number of a user without a name."""
+    """Return the name of the user, or the number of one without a name."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):
@@ -45,7 +45,7 @@ def user_name() -> str:
 
 
 def started_ticks(pid: int) -> int | None:
-    """When a process began, in ticks since the machine did; None if it is gone or not ours to see.
+    """Return when a process began, ticks after the machine did; None if it is gone or hidden.
 
     A process that ended and was not waited for yet counts as gone.
     """
@@ -57,7 +57,7 @@ def started_ticks(pid: int) -> int | None:
 
 
 def is_here(who: Json) -> bool:
-    """Whether the process that `this_process` described runs on this machine, now."""
+    """Return whether the process that `this_process` described runs on this machine, now."""
     pid = who.get("pid")
     if not isinstance(pid, int) or who.get("boot") != _boot() or who.get("ticks") is None:
         return False
@@ -88,7 +88,7 @@ def send(who: Json, number: signal.Signals) -> bool:
 
 
 def named(who: Json) -> str:
-    """``pid 12 of anna on bench, `sliplab collect ...`, since ...`` for messages.
+    """Name a process: ``pid 12 of anna on bench, `sliplab collect ...`, since ...``.
 
     Another user may have written it: nothing in it reaches a terminal that is no plain text.
     """
@@ -112,7 +112,7 @@ def _printable(value: object) -> str:
 
 
 def _boot() -> str:
-    """What tells one run of this machine from the next."""
+    """Return the id of this run of the machine."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

@@ -1,4 +1,4 @@
-"""What devices hand over, chunk by chunk: plain arrays with raw device times.
+"""Streams of devices, chunk by chunk: plain arrays with raw device times.
 
 A chunk is the unit that flows from a device through the rig into the recording being written.
 Nothing here converts a time: raw device times are kept as they came, and clock maps are added
@@ -42,7 +42,7 @@ class PulseChunk:
     """Rising edges as one device saw them, of the sync line or of another one, shape (n,)."""
 
     t_ns: I64
-    """That device's clock, nanoseconds (a microsecond counter times 1,000)."""
+    """Clock of that device, nanoseconds (a microsecond counter times 1,000)."""
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -53,7 +53,7 @@ class ClockReads:
     """A device's clock, read by the host between a question and its answer, n times."""
 
     device_ns: I64
-    """What the device's clock showed, nanoseconds, shape (n,)."""
+    """Reading of the device's clock, nanoseconds, shape (n,)."""
     before_ns: I64
     """Host's monotonic clock when it asked, nanoseconds, shape (n,)."""
     after_ns: I64
@@ -82,10 +82,10 @@ class PoseChunk:
 
 @dataclass(frozen=True)
 class FrameChunk:
-    """Frames of the outside camera in order, n of them: pictures, or the places found in them."""
+    """Frames of the outside camera in order, n of them: images, or the marker positions in them."""
 
     images: U8
-    """Grey levels, shape (n, height, width); (n, 0, 0) from a camera that hands over tracks."""
+    """Grey levels, shape (n, height, width); (n, 0, 0) from a camera that returns tracks."""
     number: I64
     """The camera's own frame counter, shape (n,); a gap is a lost frame."""
     t_ns: I64
@@ -96,7 +96,7 @@ class FrameChunk:
     sync: U8
     """Level of the sync line during the exposure: 0 or 1, shape (n,); 0 where none is wired."""
     markers_px: F32 | None = None
-    """Instead of pictures: column and row of every papilla's marker in the order of the skin's
+    """Instead of images: column and row of every papilla's marker in the order of the skin's
     layout, shape (n, m, 2), NaN where it was not seen whole."""
     plate_px: F32 | None = None
     """Beside `markers_px`: the centre of the plate's marker, shape (n, 2); None without one."""
@@ -107,7 +107,7 @@ class FrameChunk:
 
 @dataclass(frozen=True)
 class StepTimes:
-    """When one step of the motion program ran, on the arm's controller clock."""
+    """Start and end of one step of the motion program, on the arm's controller clock."""
 
     index: int
     phase: str
@@ -131,7 +131,7 @@ class PathSegment:
 
 @runtime_checkable
 class Sink(Protocol):
-    """Where a rig puts its streams; a trial being written is one."""
+    """Receiver of a rig's streams; a trial being written is one."""
 
     def add_events(self, chunk: EventChunk) -> None:
         """Append events (time order over all calls)."""

@@ -47,7 +47,7 @@ _PACKET_EVENTS = 1 << 16
 _PIECE = 1 << 20
 _ZSTD = 3
 _MOST_RATIO = 64
-"""Of a packet's content to its bytes, up to which the size in its header is believed."""
+"""Ratio of a packet's content to its bytes up to which the size in its header is trusted."""
 _START_OF_EXPOSURE, _END_OF_EXPOSURE = 3, 4
 """Fields of a frame."""
 _COLOUR = {16: 3, 24: 4}
@@ -56,7 +56,7 @@ _COLOUR = {16: 3, 24: 4}
 
 @dataclass(frozen=True)
 class Stream:
-    """One stream of a file: what is in it, and how large its pictures are."""
+    """One stream of a file: its kind, and the size of its images."""
 
     kind: str
     name: str
@@ -115,11 +115,11 @@ class Aedat4File:
         self._handle.close()
 
     def first(self, kind: str) -> int | None:
-        """The first stream of a kind."""
+        """Return the number of the first stream of a kind."""
         return next((n for n, s in sorted(self.streams.items()) if s.kind == kind), None)
 
     def events(self, number: int) -> Iterator[EventChunk]:
-        """The events of a stream, packets together up to `_PACKET_EVENTS` events.
+        """Yield the events of a stream, packets together up to `_PACKET_EVENTS` events.
 
         A camera's packet has a few hundred: what is done to a chunk would cost more than they do.
         """
@@ -147,7 +147,7 @@ class Aedat4File:
             yield _part(room, 0, filled)
 
     def triggers(self, number: int) -> Triggers:
-        """All triggers of a stream."""
+        """Return all triggers of a stream."""
         found = [
             (table.number(0, "<q"), table.number(1, "<B"))
             for data in self._packets(number)
@@ -159,7 +159,7 @@ class Aedat4File:
         return Triggers(times, np.array([kind for _, kind in found], np.uint8))
 
     def pictures(self, number: int) -> Iterator[Picture]:
-        """The frames of a stream, colours as grey levels."""
+        """Yield the frames of a stream, colours as grey levels."""
         last = -1
         for data in self._packets(number):
             table = Table.root(data, b"FRME")
@@ -178,7 +178,7 @@ class Aedat4File:
             yield Picture(_grey(np.frombuffer(pixels, np.uint8), height, width, channels), t_ns)
 
     def _packets(self, number: int) -> Iterator[memoryview]:
-        """Unpacked packets of one stream, each gone with the next; the others are passed over."""
+        """Yield the unpacked packets of one stream; each is valid until the next."""
         self._handle.seek(self._begin)
         while (at := self._handle.tell()) < self._end:
             stream, size = struct.unpack("<ii", self._exactly(8))
@@ -197,7 +197,7 @@ class Aedat4File:
                 ) from None
 
     def _unpacked(self, data: bytes) -> memoryview:
-        """A packet's content, which may stand in a buffer that is used again."""
+        """Return a packet's content, perhaps in a buffer that is used again."""
         if self._codec is None:
             return memoryview(data)
         if self._codec == "zstd" and 0 < (size := _zstd_size(data)) <= _MOST_RATIO * len(data):
@@ -221,7 +221,7 @@ class Aedat4File:
 
 
 def _middle_ns(frame: Table) -> int:
-    """The middle of a frame's exposure; its time stamp where the file has no start and end.
+    """Return the middle of a frame's exposure, or its time stamp without start and end, ns.
 
     The time stamp is the start of exposure in what dv-processing writes, and the middle in what
     older programs write, which leave start and end out.
@@ -282,7 +282,7 @@ def _prefixed(data: bytes) -> bytes:
 
 
 def _zstd_size(frame: bytes) -> int:
-    """The size of a zstd frame's content by its header (RFC 8878); 0 where it gives none."""
+    """Return the size of a zstd frame's content by its header (RFC 8878); 0 without one."""
     if len(frame) < 14 or frame[:4] != b"\x28\xb5\x2f\xfd":
         return 0
     single = frame[4] >> 5 & 1
@@ -319,10 +319,10 @@ def _streams(text: bytes) -> dict[int, Stream]:
 
 
 class Aedat4Writer:
-    """Writes a file; packets are compressed with zstd. A context manager.
+    """A file that is being written, packets compressed with zstd; a context manager.
 
     Args:
-        streams: those that will come, by number.
+        streams: all streams that will be written, by number.
     """
 
     def __init__(self, path: Path, streams: dict[int, Stream]) -> None:
@@ -382,11 +382,11 @@ def _described(streams: dict[int, Stream]) -> str:
 
 
 SIMULATED = "simulated"
-"""Stands in the source's name of a file that was written from simulated data."""
+"""Part of the source's name in a file that was written from simulated data."""
 
 
 def read_aedat4(path: Path, name: str) -> ForeignTrial:
-    """A file as a trial called `name`: its first streams of events, triggers and frames.
+    """Read a file as a trial called `name`: its first streams of events, triggers and frames.
 
     Raises:
         FormatError: it is damaged.

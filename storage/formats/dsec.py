@@ -35,7 +35,7 @@ _FAULTS = (OSError, RuntimeError, KeyError, TypeError, ValueError, MemoryError, 
 
 
 def read_dsec(path: Path, name: str) -> ForeignTrial:
-    """A file with ``events/{x,y,p,t}`` in us and an optional ``t_offset``.
+    """Read a file with ``events/{x,y,p,t}`` in us and an optional ``t_offset``.
 
     Raises:
         FormatError: it is damaged, or has another layout.
@@ -68,7 +68,7 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
 
 
 def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
-    """The lab's file with ``events/{ps,ts,xs,ys}``: float seconds, in any order.
+    """Read the lab's file with ``events/{ps,ts,xs,ys}``: float seconds, in any order.
 
     Raises:
         FormatError: it is damaged, or has another layout.
@@ -99,7 +99,7 @@ def read_lab_hdf5(path: Path, name: str) -> ForeignTrial:
 
 
 def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int] | None:
-    """Columns and rows of the camera, by the attribute `sensor_resolution`.
+    """Return columns and rows of the camera, by the attribute `sensor_resolution`.
 
     The lab writes columns first, other programs that share its layout rows first. Sensors are wider
     than high, so the larger number is the columns, unless the events fit only the other way.
@@ -121,7 +121,7 @@ def _resolution(stated: list[int] | None, xs: Rows, ys: Rows) -> tuple[int, int]
 
 
 def _end(column: Rows) -> int:
-    """One more than the largest pixel of a column."""
+    """Return one more than the largest pixel of a column."""
     starts = range(0, len(column), PIECE)
     pieces = (_pixels(column.read(start, start + PIECE)) for start in starts)
     return max((int(piece.max()) + 1 for piece in pieces), default=0)
@@ -136,7 +136,7 @@ def _same_length(columns: Mapping[str, Sized]) -> None:
 
 
 def is_lab_hdf5(path: Path) -> bool:
-    """Whether a file has the lab's names of columns.
+    """Return whether a file has the lab's names of columns.
 
     Raises:
         FormatError: it cannot be opened.
@@ -148,7 +148,7 @@ def is_lab_hdf5(path: Path) -> bool:
 def write_dsec(
     path: Path, events: EventChunk, triggers: Triggers | None, *, simulated: bool
 ) -> None:
-    """Events in DSEC's layout: Blosc and zstd, ``t`` in 32 bits after ``t_offset``, us.
+    """Write events in DSEC's layout: Blosc and zstd, ``t`` in 32 bits after ``t_offset``, us.
 
     Raises:
         ValueError: the recording is longer than 32 bits of microseconds (71.6 min).
@@ -179,7 +179,7 @@ def write_dsec(
 
 
 class _opened:
-    """A file and its columns of plain numbers; its faults are said as `FormatError`."""
+    """An open file and its columns of plain numbers; its faults become `FormatError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

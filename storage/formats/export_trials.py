@@ -23,7 +23,7 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
 SUFFIXES = {"aedat4": ".aedat4", "dsec": ".h5"}
-"""Of the files of each format."""
+"""Suffix of the files of each format."""
 _PIECE = 1 << 20
 
 
@@ -34,7 +34,7 @@ def export_trials(
     campaign: str,
     on_trial: Callable[[str], None] = lambda name: None,
 ) -> Json:
-    """Export trials to `folder`, each file whole or not at all, and a manifest last.
+    """Export trials to `folder`, each file complete or not at all, and a manifest last.
 
     Returns:
         ``trials``, ``events``, ``frames`` and ``triggers`` written, and ``files``.
@@ -86,7 +86,7 @@ def _source(recording: Recording) -> str:
 
 
 def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
-    """Everything on the event camera's clock, us; frames at the middle of their exposure."""
+    """Write everything on the event camera's clock, us; frames at the middle of their exposure."""
     triggers = _triggers(recording)
     streams = {0: Stream(EVENTS, "events", _size(recording), _source(recording))}
     frame_us = np.empty(0, np.int64)
@@ -111,7 +111,7 @@ def _aedat4(recording: Recording, path: Path) -> dict[str, int]:
 
 
 def _dsec(recording: Recording, path: Path) -> dict[str, int]:
-    """Events and triggers; frames have no place in DSEC's event file."""
+    """Write events and triggers; DSEC's event file holds no frames."""
     triggers = _triggers(recording)
     with recording.open() as reader:
         events = reader.events()
@@ -126,7 +126,7 @@ _WRITERS: dict[str, Callable[[Recording, Path], dict[str, int]]] = {
 
 
 def _pieces(recording: Recording) -> Iterator[EventChunk]:
-    """All events, about `_PIECE` at a time."""
+    """Yield all events, about `_PIECE` at a time."""
     with recording.open() as reader:
         cuts = np.unique(reader.event_times()[::_PIECE]).tolist()
         for start, end in zip(cuts, [*cuts[1:], None], strict=True):
@@ -134,7 +134,7 @@ def _pieces(recording: Recording) -> Iterator[EventChunk]:
 
 
 def _triggers(recording: Recording) -> Triggers:
-    """As they were imported, or else the sync pulses as rising edges."""
+    """Return triggers as they were imported, or else the sync pulses as rising edges."""
     with recording.open() as reader:
         if reader.has("triggers/t"):
             t_ns: I64 = reader.column("triggers/t")
@@ -146,7 +146,7 @@ def _triggers(recording: Recording) -> Triggers:
 
 
 def _size(recording: Recording) -> tuple[int, int]:
-    """Columns and rows of the event camera, or what its events need."""
+    """Return columns and rows of the event camera, or the least that its events need."""
     if (known := recording.record.geometry.event_px) is not None:
         return known
     with recording.open() as reader:
@@ -174,7 +174,7 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
 
 def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
-    """One row a labelled trial: what its label says in single values, times in integer ns.
+    """Return one row a labelled trial: the single values of its label, times in integer ns.
 
     Nested values become columns with a dot in their names; lists are left out. Values that are not
     in every label are missing, and integers stay integers.

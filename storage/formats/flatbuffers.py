@@ -31,7 +31,7 @@ class Table:
 
     @classmethod
     def root(cls, data: memoryview, identifier: bytes) -> Table:
-        """The table of a buffer with its length in front and an identifier.
+        """Return the table of a buffer with its length in front and an identifier.
 
         Raises:
             FormatError: it is another, or none.
@@ -41,12 +41,12 @@ class Table:
         return cls(data, 4 + _number(data, "<I", 4))
 
     def number(self, field: int, form: str, default: int = 0) -> int:
-        """An integer of the type `form`, as `struct` names it."""
+        """Return an integer of the type `form`, as `struct` names it."""
         at = self._place(field)
         return default if at is None else _number(self._data, form, at)
 
     def vector(self, field: int, size: int) -> tuple[int, memoryview]:
-        """Length and content of a vector of things of so many bytes."""
+        """Return length and content of a vector of items of `size` bytes."""
         at = self._place(field)
         if at is None:
             return 0, self._data[:0]
@@ -57,7 +57,7 @@ class Table:
         return count, self._data[at + 4 : at + 4 + count * size]
 
     def tables(self, field: int) -> list[Table]:
-        """A vector of tables."""
+        """Return a vector of tables."""
         at = self._place(field)
         if at is None:
             return []
@@ -94,20 +94,20 @@ GREY = 0
 _VECTOR = bytes.fromhex("0000 0600 0800 0400 06000000 04000000")
 """A table with one field, a vector, whose length follows: padding, vtable, table."""
 _TRIGGER_VTABLE = struct.pack("<4H", 8, 16, 8, 7)
-"""Of a trigger's table of 16 bytes: time at 8, kind at 7."""
+"""Vtable of a trigger's table of 16 bytes: time at 8, kind at 7."""
 _FRAME_VTABLE = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 44, 46, 48, 50, 52, 56)
 """Five times, kind, width, height, place, and where the pixels are."""
 
 
 def events_buffer(chunk: EventChunk) -> bytes:
-    """Events in order of time."""
+    """Encode events in order of time."""
     rows = np.zeros(len(chunk), EVENT)
     rows["t"], rows["x"], rows["y"], rows["p"] = chunk.t_us, chunk.x, chunk.y, chunk.p
     return _whole(b"EVTS", struct.pack("<I", len(chunk)) + rows.tobytes())
 
 
 def triggers_buffer(t_us: I64, kind: int | U8) -> bytes:
-    """Triggers at these times, us, of one kind or of a kind each."""
+    """Encode triggers at these times, us, of one kind or of a kind each."""
     n = len(t_us)
     # counted from the length in front of the flatbuffer: count at 28, then an offset for each
     tables = (32 + 4 * n + 8 + 7) // 8 * 8
@@ -131,7 +131,7 @@ def triggers_buffer(t_us: I64, kind: int | U8) -> bytes:
 
 
 def frame_buffer(image: U8, t_us: int) -> bytes:
-    """A frame of grey levels (height, width); all of its times are the middle of exposure, us."""
+    """Encode a frame of grey levels (height, width), timed at the middle of exposure, us."""
     height, width = image.shape
     # counted from the length in front: the list of fields at 12, its table at 44, pixels at 108
     table = struct.pack("<i5qbx4h2xI", 44 - 14, *(5 * [t_us]), GREY, width, height, 0, 0, 4)
@@ -140,7 +140,7 @@ def frame_buffer(image: U8, t_us: int) -> bytes:
 
 
 def header_buffer(text: str, compression: int) -> bytes:
-    """Compression (0: none, 3: zstd), position of an index (-1: none) and description."""
+    """Encode a header: compression (0: none, 3: zstd), no index, and description."""
     data = text.encode()
     table = struct.pack("<iiIq", 10, compression, 12, -1)
     body = struct.pack("<I", 24) + b"IOHE" + bytes(6) + struct.pack("<5H", 10, 20, 4, 12, 8) + table

@@ -1,4 +1,4 @@
-"""One trial out of somebody else's files, before it is in a store: what is known of it, checked."""
+"""A foreign trial before it is in a store: its streams and what is known of it, checked."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FormatError(ValueError):
 
 
 def read_head(path: Path) -> bytes:
-    """The first 16 KiB of a file.
+    """Return the first 16 KiB of a file.
 
     Raises:
         InputError: it cannot be read.
@@ -50,11 +50,11 @@ def read_head(path: Path) -> bytes:
 
 @dataclass(frozen=True)
 class Triggers:
-    """What else the event camera noted, as the file has it, shape (n,)."""
+    """Triggers of the event camera as the file has them, shape (n,)."""
 
     t_us: I64
     kind: U8
-    """As AEDAT4 numbers them; 1 is a rising edge of the external input."""
+    """Kinds as AEDAT4 numbers them; 1 is a rising edge of the external input."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class ForeignTrial:
         events: its events in order of time; read anew by each call.
         event_px: columns and rows of its camera, None if unknown; called once `events` were read.
         epoch: what the times count from, in words.
-        about: what else the file tells of itself, to be kept in the record.
-        unknown: what nobody knows of it any more.
+        about: further properties in the file, to be kept in the record.
+        unknown: names of what nobody knows of it any more.
     """
 
     name: str
@@ -86,7 +86,7 @@ class ForeignTrial:
 
 
 def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
-    """Columns of a foreign file as a chunk.
+    """Check columns of a foreign file and return them as a chunk.
 
     Raises:
         FormatError: they differ in length, a pixel or time is none, or times run backwards.
@@ -116,7 +116,7 @@ def event_chunk(x: Any, y: Any, p: Any, t_us: Any) -> EventChunk:
 
 
 def rounded_us(times: Any, per_unit: float) -> I64:
-    """Times in another unit as whole microseconds.
+    """Round times in another unit to whole microseconds.
 
     Args:
         per_unit: microseconds of one unit.

@@ -65,11 +65,11 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _UNSAFE = re.compile(r"[^A-Za-z0-9=,._+-]+")
 _LONG_GAP_US = 3_600_000_000
 _FRAME_RATE = 100
-"""Of the video's own time base only; when frames were taken stands in their times."""
+"""Time base of the video only; frames keep their own times."""
 
 
 def kind_of(path: Path) -> str:
-    """The format of a file, or of the files in a folder.
+    """Return the format of a file, or of the files in a folder.
 
     Raises:
         InputError: none of them is known, or they are of several.
@@ -88,7 +88,7 @@ def kind_of(path: Path) -> str:
 
 
 def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
-    """The trials of a file or folder, in the order of their names.
+    """Yield the trials of a file or folder, in the order of their names.
 
     Raises:
         InputError: there is none, or a file is damaged.
@@ -127,19 +127,19 @@ def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
 
 
 def _stem(file: Path) -> str:
-    """A file's name without its ending; a name without one may have dots in it."""
+    """Return a file's name without its ending; a name without one may have dots in it."""
     known = {ending for endings, _ in READERS.values() for ending in endings}
     return file.stem if file.suffix.lower() in known else file.name
 
 
 def name_of(stem: str) -> str:
-    """A file's name as that of a trial: what cannot stand in one becomes ``_``."""
+    """Make the name of a trial from a file's name: other characters become ``_``."""
     plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
     return plain or "trial"
 
 
 def _files(path: Path) -> list[Path]:
-    """Plain files; links are left out, for they may lead anywhere."""
+    """List plain files; links are left out, for they may lead anywhere."""
     if path.is_dir():
         found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
     elif path.is_file():
@@ -150,7 +150,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _possible(file: Path) -> tuple[str, ...]:
-    """Formats that a file may have: by how it begins, else by its name's ending."""
+    """Return the formats that a file may have: by its first bytes, else by its name's ending."""
     head = read_head(file)
     if head.startswith(LINE):
         return ("aedat4",)
@@ -173,7 +173,7 @@ def _kind(file: Path) -> str | None:
 
 
 def _read_manifest(folder: Path) -> Json | None:
-    """The description of an exported campaign, checked; None where there is none.
+    """Read and check the manifest of an exported campaign; None where there is none.
 
     Raises:
         InputError: it is damaged, or names a file outside of its folder.
@@ -209,7 +209,7 @@ def _check_exported(item: Json, path: Path) -> None:
 
 
 def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
-    """A trial with what the manifest says of it."""
+    """Return a trial with what the manifest states of it."""
     about: dict[str, Any] = {**trial.about, "exported": item.get("record", {})}
     return replace(
         trial,
@@ -238,7 +238,7 @@ def import_trials(
 
     Returns:
         ``imported`` and ``there`` (existing, skipped) with ids, ``events`` and ``frames`` imported,
-        and ``warnings`` for people where there are any.
+        and ``warnings`` where there are any.
 
     Raises:
         InputError: a file is damaged or cannot be right. Trials before it stay committed; of this
@@ -289,7 +289,7 @@ def _describe(campaign: Campaign, trial: ForeignTrial, origin: Path, kind: str) 
 
 
 def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str, int], list[str]]:
-    """Commit one trial; its counts and warnings."""
+    """Commit one trial; return its counts and warnings."""
     writer = campaign.begin(safe_name(trial.name), trial.frame_px, _FRAME_RATE)
     try:
         (first_us, last_us), warnings = _fill(writer, trial)
@@ -304,7 +304,7 @@ def _take(campaign: Campaign, trial: ForeignTrial, kind: str) -> tuple[dict[str,
 
 
 def _fill(writer: TrialWriter, trial: ForeignTrial) -> tuple[tuple[int, int], list[str]]:
-    """All streams into the trial; the times of the first and the last event, us, and warnings.
+    """Write all streams; return the times of the first and last event, us, and warnings.
 
     Raises:
         FormatError: there is no event, one lies outside of the camera's pixels, or times run

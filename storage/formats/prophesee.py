@@ -18,7 +18,7 @@ from sliplab.storage.streams import EventChunk
 
 LIBRARY = "faery"
 EVENT_STREAM = b"Event Stream"
-"""What a `.es` file begins with."""
+"""First bytes of a `.es` file."""
 _RAW = re.compile(rb"(?mi)^% (?:evt \d|format EVT\d)")
 _DAT = re.compile(rb"(?mi)^% version \d")
 _NO_SIZE = (2048, 2048)
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 def faery_type(head: bytes) -> str | None:
-    """faery's name for the format of a file that begins so; None for any other."""
+    """Return faery's name for the format of a file by its first bytes; None for any other."""
     if head.startswith(EVENT_STREAM):
         return "es"
     header = takewhile(lambda line: line.startswith(b"%"), head.split(b"\n"))
@@ -38,7 +38,7 @@ def faery_type(head: bytes) -> str | None:
 
 
 def read_by_faery(path: Path, name: str) -> ForeignTrial:
-    """A `.raw`, `.dat` or `.es` file as a trial called `name`.
+    """Read a `.raw`, `.dat` or `.es` file as a trial called `name`.
 
     Raises:
         InputError: faery is not installed.
@@ -81,7 +81,7 @@ def read_by_faery(path: Path, name: str) -> ForeignTrial:
 
 
 def _guarded(step: Callable[[], T], size: tuple[int, int] | None, count: int) -> T:
-    """A step in faery; a panic of its Rust code is no `Exception`."""
+    """Run a step in faery; a panic of its Rust code is no `Exception`."""
     try:
         return step()
     except (KeyboardInterrupt, SystemExit):

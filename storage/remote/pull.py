@@ -131,66 +131,66 @@ class _Differs(StoreError):
     """This store has something else under that name."""
 
 
+@dataclass
 class _Pull:
-    """Pull of one campaign."""
+    """Pull of one campaign.
 
-    def __init__(
-        self,
-        remote: Remote,
-        campaign: Campaign,
-        follows: bool,
-        small: bool,
-        done: PullResult,
-        on_bytes: OnBytes | None,
-    ) -> None:
-        self._remote, self._campaign, self._done = remote, campaign, done
-        self._follows, self._small, self._on_bytes = follows, small, on_bytes
+    Attributes:
+        follows: the store was pulled from this remote before, and is changed as the remote is.
+    """
+
+    remote: Remote
+    campaign: Campaign
+    follows: bool
+    small: bool
+    done: PullResult
+    on_bytes: OnBytes | None
 
     def run(self, quarantine: bool, on_trial: Callable[[str], None] | None) -> None:
-        name = self._campaign.name
-        about = read_manifests(self._remote, name, "about").get("")
+        name = self.campaign.name
+        about = read_manifests(self.remote, name, "about").get("")
         if about is None:  # its first push is still on its way
             return
         if isinstance(about, RemoteError):
-            self._done.problems.append(str(about))
+            self.done.problems.append(str(about))
             return
         try:
             self._describe(about)
         except (_Differs, RemoteError) as error:
-            self._done.problems.append(str(error))
+            self.done.problems.append(str(error))
             return
-        pushed = read_manifests(self._remote, name, "trials")
+        pushed = read_manifests(self.remote, name, "trials")
         for trial, known in pushed.items():
-            self._done.trials += 1
+            self.done.trials += 1
             try:
                 if isinstance(known, RemoteError):
                     raise known
                 self._pull_trial(known)
             except (_Differs, RemoteError) as error:
-                self._done.problems.append(str(error))
+                self.done.problems.append(str(error))
             if on_trial is not None:
                 on_trial(trial)
-        if self._follows:
-            for trial in sorted(self._campaign.committed() - pushed.keys()):
-                path = self._campaign.folder / "trials" / trial
-                self._campaign.quarantine(path, f"withdrawn: is no longer at {self._remote.url}")
-                self._done.withdrawn += 1
+        if self.follows:
+            for trial in sorted(self.campaign.committed() - pushed.keys()):
+                path = self.campaign.folder / "trials" / trial
+                self.campaign.quarantine(path, f"withdrawn: is no longer at {self.remote.url}")
+                self.done.withdrawn += 1
         if quarantine:
             self._pull_quarantine()
 
     def _describe(self, about: Manifest) -> None:
         """Download the campaign's own files: all of them, then their checksums."""
-        folder = self._campaign.folder
+        folder = self.campaign.folder
         for name in _FOLDERS:
-            make_folder(self._campaign.inside(folder / name))
+            make_folder(self.campaign.inside(folder / name))
         lacks = [name for name, known in about.files.items() if known.problem(folder / name)]
         if not lacks:
             return
-        if not self._follows:
+        if not self.follows:
             for name in lacks:
                 if (folder / name).exists():
                     raise _Differs(
-                        f"{folder / name}: differs from that at {self._remote.url}; pull into "
+                        f"{folder / name}: differs from that at {self.remote.url}; pull into "
                         "another store"
                     )
         files = {name: self._read_object(about, name) for name in lacks}
@@ -203,66 +203,66 @@ class _Pull:
 
     def _read_object(self, about: Manifest, name: str) -> bytes:
         key = about.object_key(name)
-        data = self._remote.read(key)
+        data = self.remote.read(key)
         if hashlib.sha256(data).hexdigest() != about.files[name].sha256:
-            raise RemoteError(f"{self._remote.where(key)}: {name} does not match its checksum")
+            raise RemoteError(f"{self.remote.where(key)}: {name} does not match its checksum")
         return data
 
     def _pull_trial(self, manifest: Manifest) -> None:
-        target = self._campaign.inside(self._campaign.folder / "trials" / manifest.name)
+        target = self.campaign.inside(self.campaign.folder / "trials" / manifest.name)
         replaced = False
         if target.exists():
             cause = incomplete(target) if target.is_dir() else "is no folder"
             if cause is None and take_of(target) == manifest.take:
                 self._complete(target, manifest)
-                self._done.there += 1
+                self.done.there += 1
                 return
-            if cause is None and not self._follows:
+            if cause is None and not self.follows:
                 raise _Differs(
-                    f"{target}: is another take than that at {self._remote.url}; pull into "
+                    f"{target}: is another take than that at {self.remote.url}; pull into "
                     "another store"
                 )
-            reason = f"damaged: {cause}" if cause else f"replaced: another is at {self._remote.url}"
-            self._campaign.quarantine(target, reason)
+            reason = f"damaged: {cause}" if cause else f"replaced: another is at {self.remote.url}"
+            self.campaign.quarantine(target, reason)
             replaced = cause is None
-        staging = self._campaign.inside(self._campaign.folder / "incoming" / manifest.name)
+        staging = self.campaign.inside(self.campaign.folder / "incoming" / manifest.name)
         if staging.exists() and not (staging / ELSEWHERE).exists():
-            self._campaign.quarantine(staging, "interrupted")
-        download(self._remote, manifest, staging, target, small=self._small, on_file=self._count)
+            self.campaign.quarantine(staging, "interrupted")
+        download(self.remote, manifest, staging, target, small=self.small, on_file=self._count)
         if replaced:
-            self._done.replaced += 1
+            self.done.replaced += 1
         else:
-            self._done.pulled += 1
+            self.done.pulled += 1
 
     def _complete(self, target: Path, manifest: Manifest) -> None:
         """Fetch the big files that a mirror left out."""
-        if self._small or not (target / ELSEWHERE).exists():
+        if self.small or not (target / ELSEWHERE).exists():
             return
         for name in sorted(BIG & manifest.files.keys()):
             if to_fetch(target / name):
-                self._count(_get(self._remote, manifest, name, target))
+                self._count(_get(self.remote, manifest, name, target))
         (target / ELSEWHERE).unlink()
         sync_folder(target)
 
     def _pull_quarantine(self) -> None:
-        for name, known in read_manifests(self._remote, self._campaign.name, "quarantine").items():
-            target = self._campaign.inside(self._campaign.folder / "quarantine" / name)
+        for name, known in read_manifests(self.remote, self.campaign.name, "quarantine").items():
+            target = self.campaign.inside(self.campaign.folder / "quarantine" / name)
             if target.exists():
                 continue
             try:
                 if isinstance(known, RemoteError):
                     raise known
-                staging = self._campaign.folder / "incoming" / f"{name}.aside"
-                download(self._remote, known, staging, target, on_file=self._count)
-                self._done.set_aside += 1
+                staging = self.campaign.folder / "incoming" / f"{name}.aside"
+                download(self.remote, known, staging, target, on_file=self._count)
+                self.done.set_aside += 1
             except RemoteError as error:
-                self._done.problems.append(str(error))
+                self.done.problems.append(str(error))
 
     def _count(self, size: int) -> None:
-        self._done.files += 1
-        self._done.bytes += size
-        if self._on_bytes is not None:
-            self._on_bytes(size)
+        self.done.files += 1
+        self.done.bytes += size
+        if self.on_bytes is not None:
+            self.on_bytes(size)
 
 
 def download(

@@ -28,7 +28,7 @@ from sliplab.storage.trials.store import AGAIN, INFO, Campaign, Store
 
 OnTrial = Callable[[str], None]
 _TRIES = 2
-"""Of sending an object that comes back with other bytes."""
+"""Attempts to send an object that comes back with other bytes."""
 _SAME = ("name", "protocol", "experiment", "rig", "simulated")
 """Keys that a campaign keeps for all its life; where these differ it is another campaign."""
 
@@ -110,6 +110,7 @@ class _Conflict(RemoteError):
     """Two stores have campaigns of one name."""
 
 
+@dataclass
 class _Push:
     """Push of one campaign.
 
@@ -118,82 +119,77 @@ class _Push:
         trusted: SHA-256 of objects that were read back, now or before a manifest was written.
     """
 
-    def __init__(
-        self,
-        remote: Remote,
-        campaign: Campaign,
-        options: PushOptions,
-        done: PushResult,
-        on_bytes: OnBytes | None,
-    ) -> None:
-        self._remote, self._campaign, self._options = remote, campaign, options
-        self._done, self._on_bytes = done, on_bytes
-        self._sizes: dict[str, int] = {}
-        self._trusted: set[str] = set()
+    remote: Remote
+    campaign: Campaign
+    options: PushOptions
+    done: PushResult
+    on_bytes: OnBytes | None
+    sizes: dict[str, int] = field(default_factory=dict)
+    trusted: set[str] = field(default_factory=set)
 
     def run(self, on_trial: OnTrial | None) -> None:
-        name = self._campaign.name
+        name = self.campaign.name
         try:
-            about = campaign_manifest(self._campaign)
+            about = campaign_manifest(self.campaign)
             self._check_same_campaign()
         except (OSError, ValueError, StoreError) as error:
             if isinstance(error, RemoteError) and not isinstance(error, _Conflict):
                 raise
             self._problem(f"{error}")
             return
-        self._sizes = self._remote.sizes(objects_folder(name))
+        self.sizes = self.remote.sizes(objects_folder(name))
         theirs = self._manifests("trials")
-        self._send(about, self._campaign.folder, self._manifests("about").get(""))
+        self._send(about, self.campaign.folder, self._manifests("about").get(""))
         ours = set()
-        for recording in self._campaign.recordings():
+        for recording in self.campaign.recordings():
             trial = recording.folder.name
             ours.add(trial)
-            self._done.trials += 1
+            self.done.trials += 1
             self._push_trial(trial, theirs.get(trial))
             if on_trial is not None:
                 on_trial(trial)
         for trial, pushed in theirs.items():
             if trial not in ours and pushed.take in self._takes(trial, AGAIN):
-                self._remote.remove(pushed.key)
-                self._done.withdrawn += 1
-        if self._options.quarantine:
+                self.remote.remove(pushed.key)
+                self.done.withdrawn += 1
+        if self.options.quarantine:
             self._push_quarantine()
 
     def _push_trial(self, trial: str, existing: Manifest | None) -> None:
-        folder = self._campaign.folder / "trials" / trial
+        folder = self.campaign.folder / "trials" / trial
         try:
-            made = trial_manifest(self._campaign, trial)
+            made = trial_manifest(self.campaign, trial)
         except (OSError, ValueError, StoreError) as error:
             self._problem(f"{trial}: {error}")
             return
         if existing is not None and existing.files == made.files:
-            self._done.there += not self._options.check or self._send(made, folder, existing)
+            self.done.there += not self.options.check or self._send(made, folder, existing)
             return
         foreign = existing is not None and existing.take not in {made.take, *self._takes(trial, "")}
-        if foreign and not self._options.replace:
+        if foreign and not self.options.replace:
             self._problem(
                 f"{trial}: another take of it is there that is not of this store; push to another "
                 "place, or replace it with --replace"
             )
         elif self._send(made, folder, existing):
             if existing is None:
-                self._done.pushed += 1
+                self.done.pushed += 1
             else:
-                self._done.replaced += 1
+                self.done.replaced += 1
 
     def _push_quarantine(self) -> None:
         existing = self._manifests("quarantine")
-        for item in self._campaign.quarantined():
+        for item in self.campaign.quarantined():
             name = item["folder"]
             try:
-                made = quarantine_manifest(self._campaign, name)
+                made = quarantine_manifest(self.campaign, name)
             except (OSError, StoreError) as error:
                 self._problem(f"quarantine/{name}: {error}")
                 continue
-            if name in existing and existing[name].files == made.files and not self._options.check:
+            if name in existing and existing[name].files == made.files and not self.options.check:
                 continue
-            if self._send(made, self._campaign.folder / "quarantine" / name, existing.get(name)):
-                self._done.set_aside += 1
+            if self._send(made, self.campaign.folder / "quarantine" / name, existing.get(name)):
+                self.done.set_aside += 1
 
     def _send(self, made: Manifest, folder: Path, existing: Manifest | None) -> bool:
         """Write the objects, then the manifest; False where a file is not what it should be."""
@@ -203,53 +199,53 @@ class _Push:
                 self._problem(f"{folder / name}: {problem}")
                 return False
         if made != existing:
-            self._remote.put(made.key, made.dump())
+            self.remote.put(made.key, made.dump())
         return True
 
     def _send_object(self, key: str, path: Path, known: Checksum) -> str | None:
         """Write a file under its checksum unless it exists; return the file's problem, if any."""
         sha, size = known.sha256, known.bytes
-        if self._sizes.get(sha) == size and (sha in self._trusted or self._arrived(key, known)):
-            self._trusted.add(sha)
+        if self.sizes.get(sha) == size and (sha in self.trusted or self._arrived(key, known)):
+            self.trusted.add(sha)
             return None
         if (problem := known.problem(path)) is not None:
             return problem
         for _ in range(_TRIES):
             try:
-                self._remote.put(key, path)
+                self.remote.put(key, path)
             except RemoteError:
                 if not path.exists():
                     return "went away meanwhile"
                 raise
-            if self._on_bytes is not None:
-                self._on_bytes(size)
+            if self.on_bytes is not None:
+                self.on_bytes(size)
             if self._arrived(key, known):
                 break
         else:
             raise RemoteError(
-                f"{self._remote.where(key)}: came back with other bytes than were sent; see to "
+                f"{self.remote.where(key)}: came back with other bytes than were sent; see to "
                 "the storage, then run the same command to go on"
             )
-        self._sizes[sha] = size
-        self._trusted.add(sha)
-        self._done.files += 1
-        self._done.bytes += size
+        self.sizes[sha] = size
+        self.trusted.add(sha)
+        self.done.files += 1
+        self.done.bytes += size
         return None
 
     def _arrived(self, key: str, known: Checksum) -> bool:
         try:
-            if self._options.read_back:
-                return self._remote.matches(key, known, self._on_bytes)
-            return self._remote.size(key) == known.bytes
+            if self.options.read_back:
+                return self.remote.matches(key, known, self.on_bytes)
+            return self.remote.size(key) == known.bytes
         except RemoteMissing:
             return False
 
     def _manifests(self, kind: Kind) -> dict[str, Manifest]:
         """Read the visible manifests; one that cannot be read is sent anew."""
-        found = read_manifests(self._remote, self._campaign.name, kind)
+        found = read_manifests(self.remote, self.campaign.name, kind)
         good = {name: item for name, item in found.items() if isinstance(item, Manifest)}
-        if not self._options.check:
-            self._trusted |= {known.sha256 for m in good.values() for known in m.files.values()}
+        if not self.options.check:
+            self.trusted |= {known.sha256 for m in good.values() for known in m.files.values()}
         return good
 
     def _check_same_campaign(self) -> None:
@@ -257,12 +253,12 @@ class _Push:
         Raises:
             _Conflict: the place has another campaign of this name.
         """
-        theirs = read_manifests(self._remote, self._campaign.name, "about").get("")
+        theirs = read_manifests(self.remote, self.campaign.name, "about").get("")
         if not isinstance(theirs, Manifest):
             return
         try:
-            info = json.loads(self._remote.read(theirs.object_key(INFO)))
-            differ = [name for name in _SAME if self._campaign.info.get(name) != info.get(name)]
+            info = json.loads(self.remote.read(theirs.object_key(INFO)))
+            differ = [name for name in _SAME if self.campaign.info.get(name) != info.get(name)]
         except (RemoteMissing, ValueError, AttributeError):
             return  # it is sent anew
         if differ:
@@ -274,10 +270,10 @@ class _Push:
     def _takes(self, trial: str, cause: str) -> set[str]:
         """Return earlier takes of a trial that were quarantined for a cause that begins so."""
         return {
-            take_of(self._campaign.folder / "quarantine" / item["folder"])
-            for item in self._campaign.quarantined()
+            take_of(self.campaign.folder / "quarantine" / item["folder"])
+            for item in self.campaign.quarantined()
             if item["trial"] == trial and str(item["cause"]).startswith(cause)
         } - {""}
 
     def _problem(self, text: str) -> None:
-        self._done.problems.append(f"{self._campaign.name}: {text}")
+        self.done.problems.append(f"{self.campaign.name}: {text}")

@@ -36,7 +36,7 @@ from sliplab.storage.trials.store import Campaign, Store, StoreError
 VERSION = 1
 """Of the index and of the catalogue's rows: a change of either counts on."""
 FRESH_NS = 2_000_000_000
-"""What changed so lately may change again without its time moving: some disks count in seconds."""
+"""Age below which a change may not show in a time stamp: some disks count in seconds."""
 _NAME, _ROW, _INODE, _CHANGED, _SYNC = (
     f"index.{name}" for name in ("name", "row", "inode", "changed", "sync")
 )

@@ -9,9 +9,8 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sliplab.storage.errors import own_fault
 from sliplab.storage.files import read_json, sha256, write_json
@@ -25,8 +24,7 @@ ELSEWHERE = "elsewhere.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-@dataclass(frozen=True)
-class Checksum:
+class Checksum(NamedTuple):
     """A file's SHA-256, 64 hex digits, and its size in bytes."""
 
     sha256: str
@@ -48,14 +46,14 @@ class Checksum:
             return Checksum(data["sha256"], data["bytes"])
         return None
 
-    def size_problem(self, path: Path) -> str | None:
+    def size_problem(self, path: str | Path) -> str | None:
         """Say what is wrong with a file without reading it; None when it has all its bytes.
 
         Raises:
             OSError: this program has no more memory or open files; nothing is known of the file.
         """
         try:
-            found = path.lstat()
+            found = os.lstat(path)
         except OSError as error:
             if own_fault(error):
                 raise
@@ -83,7 +81,7 @@ class Checksum:
 
 
 Checksums = dict[str, Checksum]
-"""Of the files of one folder, by name."""
+"""Checksums of the files of one folder, by name."""
 Fetch = Callable[[Path, Checksum], None]
 """Brings a missing file of a mirrored trial, held against its checksum."""
 
@@ -117,7 +115,7 @@ def read_sums(folder: Path, needed: Iterable[str] = (DATA, RECORD)) -> Checksums
 
 def as_json(sums: Checksums) -> Json:
     """Return checksums as plain data, as they stand in files."""
-    return {name: vars(known) for name, known in sums.items()}
+    return {name: known._asdict() for name, known in sums.items()}
 
 
 def write_sums(folder: Path, names: Iterable[str]) -> None:
@@ -141,7 +139,7 @@ def incomplete(folder: Path) -> str | None:
     except ValueError as error:
         return str(error)
     for name, known in sums.items():
-        problem = known.size_problem(folder / name)
+        problem = known.size_problem(os.path.join(folder, name))  # no Path: asked of every trial
         if problem is not None and not to_fetch(folder / name):
             return f"{folder / name}: {problem}"
     return None

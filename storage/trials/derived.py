@@ -26,7 +26,7 @@ DocumentT = TypeVar("DocumentT", bound=Document)
 
 
 def make_key(step: str, version: int, inputs: Any, parameters: Any) -> str:
-    """The key of a result."""
+    """Return the key of a result."""
     return hash_data([step, version, inputs, parameters])
 
 
@@ -38,20 +38,20 @@ class Derived:
 
     @staticmethod
     def of(store: Store, step: str, campaign: str | None = None) -> Derived:
-        """Results of `step`; those about single trials stand under their campaign."""
+        """Return the results of `step`; those about single trials stand under their campaign."""
         folder = store.folder / "derived" / safe_name(step)
         folder = folder if campaign is None else folder / safe_name(campaign)
         return Derived(inside(folder, store.folder))
 
     def key(self, name: str) -> str | None:
-        """The key that the result `name` was made with; None if there is none."""
+        """Return the key that the result `name` was made with; None if there is none."""
         try:
             return str(read_json(self.folder / f"{safe_name(name)}.json")["key"])
         except (OSError, ValueError, KeyError):
             return None
 
     def fresh(self, name: str, key: str) -> bool:
-        """Whether `name` was made with `key`."""
+        """Return whether `name` was made with `key`."""
         return self.key(name) == key
 
     def write(
@@ -67,7 +67,7 @@ class Derived:
         write_json(self.folder / f"{safe_name(name)}.json", {**plain, "key": key})
 
     def read(self, name: str) -> Json:
-        """A result's JSON.
+        """Return a result's JSON.
 
         Raises:
             FileNotFoundError: it was never made.
@@ -91,10 +91,10 @@ class Derived:
             ) from None
 
     def arrays_path(self, name: str) -> Path:
-        """The file that holds a result's arrays."""
+        """Return the path of a result's arrays."""
         return self.folder / f"{safe_name(name)}.npz"
 
     def arrays(self, name: str) -> dict[str, npt.NDArray[Any]]:
-        """A result's arrays."""
+        """Return a result's arrays."""
         with np.load(self.arrays_path(name), allow_pickle=False) as file:
             return {key: file[key] for key in file.files}

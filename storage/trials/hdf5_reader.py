@@ -29,7 +29,6 @@ from sliplab.storage.trials.hdf5_writer import (
     INDEX,
     INDEX_CUT_FORMAT,
     OFFSET,
-    READS,
     TIMES,
     TIMING,
     TRACKS,
@@ -39,8 +38,8 @@ from sliplab.storage.trials.hdf5_writer import (
 _BLOCK = 1 << 15
 _FEW = 16
 _CACHE_BYTES, _CACHE_SLOTS = 1 << 18, 521
-"""Of unpacked chunks, a column. A chunk of events fits; more than the processor's own cache holds
-would make every chunk go through main memory."""
+"""Cache of unpacked chunks, a column. A chunk of events fits; with more than the processor's own
+cache holds, every chunk would go through main memory."""
 
 
 @cache
@@ -88,7 +87,7 @@ class RowFile:
         return [int(value) for value in values]
 
     def has(self, name: str) -> bool:
-        """Whether there is a column of this name."""
+        """Return whether there is a column of this name."""
         if name in self._opened:
             return True
         parts = name.split("/")
@@ -96,7 +95,7 @@ class RowFile:
         return all(self._file.links.exists(path) for path in paths)
 
     def rows(self, name: str) -> Rows:
-        """A column, opened once.
+        """Return a column, opened once.
 
         Raises:
             KeyError: there is none of this name.
@@ -135,7 +134,7 @@ class Rows:
         return self.shape[0]
 
     def read(self, low: int = 0, high: int | None = None) -> Array:
-        """Rows low to high, the last one not included; all by default."""
+        """Read rows low to high, the last one not included; all by default."""
         if not self.shape or (low == 0 and high in {None, self.shape[0]}):
             values = np.empty(self.shape, self._dtype)
             if values.size:
@@ -155,7 +154,7 @@ class Rows:
             self._data.read(h5py.h5s.create_simple(values.shape), place, values)
 
     def added(self, low: int, high: int, amount: int) -> I64:
-        """Rows low to high of a column of integers, as int64, with `amount` added to each.
+        """Read rows low to high of a column of integers, as int64, with `amount` added to each.
 
         Narrower rows are read into the end of the result and widened from its beginning, block by
         block: fresh memory costs as much as unpacking what goes into it.
@@ -205,15 +204,15 @@ class StreamReader:
         self._file.close()
 
     def event_times(self) -> I64:
-        """Times of all events on the camera's clock, us."""
+        """Return the times of all events on the camera's clock, us."""
         return self._times(0, len(self._file.rows(TIMES)))
 
     def _times(self, low: int, high: int) -> I64:
-        """Times of some events on the camera's clock, us."""
+        """Return the times of some events on the camera's clock, us."""
         return self._file.rows(TIMES).added(low, high, self.t_offset_us)
 
     def events(self, start_us: int | None = None, end_us: int | None = None) -> EventChunk:
-        """Events with start <= t < end on the camera's clock; all by default.
+        """Return the events with start <= t < end on the camera's clock; all by default.
 
         Only the part of the file that holds them is read.
         """
@@ -235,7 +234,7 @@ class StreamReader:
         )
 
     def _bracket(self, marks: Rows, t_us: int, count: int) -> tuple[int, int]:
-        """Indices that enclose time `t_us` after the offset, from the index or behind its end."""
+        """Return rows that enclose `t_us` after the offset, from the index or behind its end."""
         ms = t_us // 1000
         near = marks.read(max(0, ms), max(0, ms + 2)).tolist()  # shorter at the end
         if ms < 0:
@@ -249,38 +248,37 @@ class StreamReader:
         return near[0], near[1]
 
     def pulses(self, group: str) -> I64:
-        """Times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
+        """Return times of ``event_pulses``, ``arm_pulses``, ``sync_pulses`` or ``exposures``, ns.
 
         Exposures are empty where the sync box sees none.
         """
         return self._late(f"{group}/t")
 
     def clock_reads(self, group: str) -> ClockReads:
-        """All of ``box_reads`` or ``frame_camera_reads``; empty where nobody read that clock."""
-        return ClockReads(*(self._late(f"{group}/{name}") for name in READS))
+        """Return all of ``box_reads`` or ``frame_camera_reads``; empty without any."""
+        return ClockReads(*(self._late(f"{group}/{name}") for name in ("t", "before", "after")))
 
     def _late(self, name: str) -> I64:
-        """A column of times; empty if it is one of `TIMING` that was never made."""
+        """Return a column of times; empty if it is one of `TIMING` that was never made."""
         if name in TIMING and not self.has(name):
             return np.empty(0, np.int64)
         return self.column(name)
 
     def poses(self) -> PoseChunk:
-        """All arm poses."""
+        """Return all arm poses."""
         return PoseChunk(*(self.column(f"poses/{name}") for name in ("t", "host", "xyz", "rotvec")))
 
     def column(self, name: str) -> Array:
-        """One column by its name in the file, such as ``frames/t``; times are int64."""
+        """Return a column by its name in the file, such as ``frames/t``; times are int64."""
         values = self._file.rows(name).read()
         return values.astype(np.int64) if name == TIMES else values
 
     def has(self, name: str) -> bool:
-        """Whether the file has a column of this name; those of `TRACKS` and
-        `TIMING` may be missing."""
+        """Return whether the file has a column of this name; some of `TRACKS` and `TIMING` have."""
         return self._file.has(name)
 
     def counts(self) -> dict[str, int]:
-        """Rows of every column; 0 for one that is missing."""
+        """Count the rows of every column; 0 for one that is missing."""
         return {
             name: len(self._file.rows(name)) if self.has(name) else 0
             for name in (*COLUMNS, *TRACKS, *TIMING)

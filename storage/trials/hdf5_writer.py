@@ -30,12 +30,8 @@ import numpy.typing as npt
 
 from sliplab.storage.streams import (
     I64,
-    U8,
-    ClockReads,
     EventChunk,
     FrameChunk,
-    PoseChunk,
-    PulseChunk,
 )
 
 Array = npt.NDArray[Any]
@@ -43,7 +39,7 @@ Kind = tuple[str, tuple[int, ...], str]
 """Type, shape of a row, unit."""
 
 FORMAT, INDEX_CUT_FORMAT = 2, 3
-"""What a file is written as; the second one where its index ends before its events do."""
+"""Formats of new files; the second one where the index ends before the events do."""
 EVENT_CHUNK = 1 << 16
 SMALL_CHUNK = 1 << 10
 SMALL_HELD = 1 << 14
@@ -87,8 +83,6 @@ TIMES = "events/t"
 WIDE: Kind = ("int64", (), COLUMNS[TIMES][2])
 """The times of events from the first one on that comes 2**32 us (71.6 min) after the offset."""
 INDEX, OFFSET = "ms_to_idx", "t_offset"
-READS = ("t", "before", "after")
-"""Columns of the reads of a clock."""
 _LAST_32 = 2**32 - 1
 INDEXED_MS = 2**32 // 1000 + 1
 """Milliseconds that the index reaches to: those that DSEC's 32-bit times can tell."""
@@ -101,7 +95,7 @@ _TIMES = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFL
 
 @cache
 def blank() -> bytes:
-    """A file with every column of `COLUMNS`, an index and an offset, and no rows."""
+    """Make a file with every column of `COLUMNS`, an index and an offset, and no rows."""
     made = BytesIO()
     with h5py.File(made, "w", libver="latest") as file:
         file.attrs["format"] = FORMAT
@@ -114,7 +108,7 @@ def blank() -> bytes:
 
 
 def create(file: Any, name: str, kind: Kind) -> None:
-    """A dataset without rows in an open `h5py.File`."""
+    """Make a dataset without rows in an open `h5py.File`."""
     dtype, shape, unit = kind
     data = file.create_dataset(
         name,
@@ -182,7 +176,7 @@ class Column:
         self._written, self._waiting = end, 0
 
     def widened(self, file: Any, name: str, kind: Kind) -> Column:
-        """The same rows as another type, in place of the dataset `name`."""
+        """Return the same rows as another type, in place of the dataset `name`."""
         self.flush()
         wider = f"{name}64"
         create(file, wider, kind)
@@ -254,49 +248,21 @@ class StreamFile:
             self._append(INDEX, before + np.searchsorted(times, marks, side="left"))
         self._next_ms = max(end_ms, self._next_ms)
 
-    def add_pulses(self, group: str, chunk: PulseChunk) -> None:
-        """Append pulses to ``event_pulses``, ``arm_pulses`` or ``sync_pulses``."""
-        self._append(f"{group}/t", chunk.t_ns)
+    def append(self, group: str, **columns: Array) -> None:
+        """Append rows to columns of a group, such as ``append("poses", t=..., xyz=...)``.
 
-    def add_exposures(self, chunk: PulseChunk) -> None:
-        """Append starts of exposures to ``exposures``."""
-        self._append_late({"exposures/t": chunk.t_ns})
-
-    def add_clock_reads(self, group: str, chunk: ClockReads) -> None:
-        """Append reads of a clock to ``box_reads`` or ``frame_camera_reads``."""
-        columns = zip(READS, (chunk.device_ns, chunk.before_ns, chunk.after_ns), strict=True)
-        self._append_late({f"{group}/{name}": values for name, values in columns})
-
-    def add_triggers(self, t_ns: I64, kind: U8) -> None:
-        """Append what else an event camera noted, of an imported trial."""
-        self._append_late({"triggers/t": t_ns, "triggers/kind": kind})
-
-    def _append_late(self, columns: dict[str, Array]) -> None:
-        """Append to columns of `TIMING`, which are made when the first row comes."""
-        for name, values in columns.items():
+        Columns of `TIMING` are made when their first row comes.
+        """
+        for part, values in columns.items():
+            name = f"{group}/{part}"
             if not len(values):
                 continue
             if name not in self._columns:
-                create(self._file, name, TIMING[name])
-                self._columns[name] = Column(self._file, name)
-            self._append(name, values)
-
-    def add_poses(self, chunk: PoseChunk) -> None:
-        """Append arm poses."""
-        self._append("poses/t", chunk.t_ns)
-        self._append("poses/host", chunk.host_ns)
-        self._append("poses/xyz", chunk.xyz_mm)
-        self._append("poses/rotvec", chunk.rotvec_deg)
-
-    def add_frame_times(self, chunk: FrameChunk) -> None:
-        """Append what is known of frames besides their pixels."""
-        self._append("frames/number", chunk.number)
-        self._append("frames/t", chunk.t_ns)
-        self._append("frames/host", chunk.host_ns)
-        self._append("frames/sync", chunk.sync)
+                self._create(name, TIMING[name])
+            self._columns[name].append(values)
 
     def add_tracks(self, chunk: FrameChunk) -> None:
-        """Append the places that a camera found in its frames instead of handing them over.
+        """Append the marker positions that a camera returns instead of its frames.
 
         The frames' times come first. Every column of tracks gets a row a frame: NaN where a plate's
         marker came later than the first frame, or went.
@@ -309,14 +275,17 @@ class StreamFile:
                 continue
             if values is not None and name not in self._columns:
                 dtype, _, unit = TRACKS[name]
-                create(self._file, name, (dtype, values.shape[1:], unit))
-                self._columns[name] = Column(self._file, name)
+                self._create(name, (dtype, values.shape[1:], unit))
             column = self._columns[name]
             missing = (before if values is not None else after) - column.count
             if missing:
                 column.append(np.full((missing, *column.shape), np.nan, np.float32))
             if values is not None:
                 column.append(values)
+
+    def _create(self, name: str, kind: Kind) -> None:
+        create(self._file, name, kind)
+        self._columns[name] = Column(self._file, name)
 
     def finish(self) -> None:
         """Write what is held back and the index, and close the file, whatever happens."""

@@ -23,16 +23,16 @@ from sliplab.storage.process import named, this_process
 from sliplab.storage.streams import Json
 
 STORE_LOCK = ".lock"
-"""Of a store, in its folder."""
+"""Name of a store's lock file."""
 PATIENCE_S = 3.0
-"""How long a holder that is done at once (`brief`) is waited for."""
+"""Longest wait for a holder that is done at once (`brief`), s."""
 _LOOK_S = 0.05
 _HOLDER_BYTES = 4000
 MOUNTS = Path("/proc/self/mountinfo")
 _ALONE = {"9p", "vboxsf", "prl_fs", "virtiofs", "fuse"}
 """Types of file systems whose locks are kept by each machine for itself; also all of `fuse.*`."""
 _ALONE_OPTIONS = {"nobrl", "nolock", "local_lock=flock", "local_lock=all"}
-"""Of NFS and SMB mounts: locks are not sent to the server."""
+"""Options of NFS and SMB mounts by which locks are not sent to the server."""
 
 
 class NoLocks(StoreError):
@@ -43,7 +43,7 @@ class Locked(RuntimeError):
     """Somebody else holds the lock; the message says who.
 
     Attributes:
-        holder: what the holder said of itself, as `storage.process.this_process`.
+        holder: the holder as `storage.process.this_process` describes it.
     """
 
     def __init__(self, message: str, holder: Json | None = None) -> None:
@@ -58,11 +58,11 @@ def exclusive(
     """Hold the lock file at `path` while the block runs.
 
     Args:
-        what: what is locked, for the message.
+        what: name of the locked thing, for the message.
         brief: the block is over at once; others may wait for that.
         mode: of the file, if it is made. In a folder for all users (0666) anybody may have put
             something else there: then it must be a plain file with no other name.
-        about: what else is said of the holder, such as its store.
+        about: further keys of the holder, such as its store.
 
     Raises:
         Locked: it is held. Only a brief holder is waited for, `PATIENCE_S` at most.
@@ -90,7 +90,10 @@ def exclusive(
 
 
 def _open(path: Path, mode: int) -> int:
-    """In a folder that all may write to, the system refuses to *make* what somebody else made."""
+    """Open a lock file, making it if it is missing.
+
+    In a folder that all may write to, the system refuses to *make* what somebody else made.
+    """
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         return os.open(path, flags)

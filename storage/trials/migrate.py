@@ -1,4 +1,4 @@
-"""Brings a store of an older format to this version's, with copies of what is changed.
+"""Migration of a store to the newest format, with copies of what is changed.
 
 | from | to | what changes |
 | --- | --- | --- |
@@ -39,7 +39,7 @@ STEPS: dict[int, Step] = {1: _describe_with_sums}
 
 
 def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
-    """Bring a store to the newest format; whoever calls this holds the store's lock.
+    """Bring a store to the newest format; the caller holds the store's lock.
 
     Args:
         steps: by the format that each begins with; all that there are by default.
@@ -61,7 +61,7 @@ def migrate(store: Store, steps: dict[int, Step] | None = None) -> list[int]:
 
 
 def kept(store: Store, number: int) -> Path:
-    """Where copies of what a migration changed are kept, by the format that they are of."""
+    """Return the folder with copies of what the migration from a format changed."""
     return store.folder / "before" / f"format-{number}"
 
 
@@ -77,7 +77,7 @@ def _keep(store: Store, number: int) -> None:
 
 
 def _changeable(store: Store) -> Iterable[Path]:
-    """Everything that is not a committed trial and not made by analysis."""
+    """Yield the files that are neither of a committed trial nor made by analysis."""
     for campaign in store.campaigns():
         for name in (PROTOCOL, RIG, INFO, CHECKSUMS):
             yield campaign.folder / name

@@ -1,4 +1,4 @@
-"""A committed trial as the analysis sees it: raw streams, clock maps, record."""
+"""A committed trial as analysis reads it: raw streams, clock maps, record."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sliplab.storage.trials.video import FrameReader, read_frame, read_frames
 
 @dataclass(frozen=True)
 class Tracks:
-    """Where the markers were in each of n frames, by the camera's own account; pixels."""
+    """Positions of the markers in each of n frames as the camera found them, pixels."""
 
     markers_px: F64
     """(n, m, 2) in the order of the record's layout, NaN where a marker was not seen whole."""

@@ -129,7 +129,7 @@ class Spool:
             return self._waiting.popleft() if self._waiting else None
 
     def _send_on(self, end: int) -> None:
-        """Begin to write to the disk, and forget what is there already, where one can ask so."""
+        """Begin to write to the disk, and drop what is there from memory, where the system can."""
         if hasattr(os, "posix_fadvise"):
             os.posix_fadvise(self._file.fileno(), 0, end, os.POSIX_FADV_DONTNEED)
 
@@ -138,8 +138,8 @@ class TrialWriter:
     """A `storage.streams.Sink` that ends in exactly one of `commit` and `abandon`.
 
     Args:
-        folder: the trial's folder aside; must not exist.
-        target: where it stands once committed.
+        folder: the trial's folder while it is written; must not exist.
+        target: its folder once committed.
         frame_px: (width, height) of the frames, or None without a frame camera. Whether there will
             be a video shows with the first frame: a camera may hand over tracks instead.
         spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
@@ -175,41 +175,48 @@ class TrialWriter:
 
     def add_event_pulses(self, chunk: PulseChunk) -> None:
         """Append pulses seen by the event camera."""
-        self._streams.add_pulses("event_pulses", chunk)
+        self._streams.append("event_pulses", t=chunk.t_ns)
 
     def add_arm_pulses(self, chunk: PulseChunk) -> None:
         """Append pulses seen by the arm."""
-        self._streams.add_pulses("arm_pulses", chunk)
+        self._streams.append("arm_pulses", t=chunk.t_ns)
 
     def add_sync_pulses(self, chunk: PulseChunk) -> None:
         """Append pulses sent by the sync box."""
-        self._streams.add_pulses("sync_pulses", chunk)
+        self._streams.append("sync_pulses", t=chunk.t_ns)
 
     def add_exposures(self, chunk: PulseChunk) -> None:
         """Append starts of exposures seen by the sync box."""
-        self._streams.add_exposures(chunk)
+        self._streams.append("exposures", t=chunk.t_ns)
 
     def add_box_reads(self, chunk: ClockReads) -> None:
         """Append reads of the sync box's clock."""
-        self._streams.add_clock_reads("box_reads", chunk)
+        self._add_reads("box_reads", chunk)
 
     def add_frame_camera_reads(self, chunk: ClockReads) -> None:
         """Append reads of the frame camera's clock."""
-        self._streams.add_clock_reads("frame_camera_reads", chunk)
+        self._add_reads("frame_camera_reads", chunk)
+
+    def _add_reads(self, group: str, chunk: ClockReads) -> None:
+        self._streams.append(group, t=chunk.device_ns, before=chunk.before_ns, after=chunk.after_ns)
 
     def add_triggers(self, t_ns: I64, kind: U8) -> None:
-        """Append what else an event camera noted, of an imported trial."""
-        self._streams.add_triggers(t_ns, kind)
+        """Append triggers of the event camera, of an imported trial."""
+        self._streams.append("triggers", t=t_ns, kind=kind)
 
     def add_poses(self, chunk: PoseChunk) -> None:
         """Append arm poses."""
-        self._streams.add_poses(chunk)
+        self._streams.append(
+            "poses", t=chunk.t_ns, host=chunk.host_ns, xyz=chunk.xyz_mm, rotvec=chunk.rotvec_deg
+        )
 
     def add_frames(self, chunk: FrameChunk) -> None:
-        """Append frames, or the tracks that stand for them, and their times."""
+        """Append frames, or the tracks in place of them, and their times."""
         if self._frame_px is None or not len(chunk):
             return
-        self._streams.add_frame_times(chunk)
+        self._streams.append(
+            "frames", number=chunk.number, t=chunk.t_ns, host=chunk.host_ns, sync=chunk.sync
+        )
         if chunk.markers_px is not None:
             self._streams.add_tracks(chunk)
         elif self._spool is not None:
@@ -223,7 +230,7 @@ class TrialWriter:
         """Finish data and video files, so that they can be read before the commit.
 
         Returns:
-            The folder aside.
+            The folder of these files.
         """
         if self._sealed:
             return self.folder
@@ -231,23 +238,20 @@ class TrialWriter:
         self._streams.finish()
         if self._spool is not None and self._frame_px is not None:
             self._spool.close()
-            self._encode_spool(self._spool.path, self._frame_px)
+            self._encode_spool(self._spool.path, *self._frame_px)
         if self._video is not None:
             self._video.close()
         return self.folder
 
-    def _encode_spool(self, spool: Path, frame_px: tuple[int, int]) -> None:
-        width, height = frame_px
-        frames = (
-            np.memmap(spool, np.uint8, "r").reshape(-1, height, width)
-            if (spool.stat().st_size)
-            else np.empty((0, height, width), np.uint8)
-        )
+    def _encode_spool(self, spool: Path, width: int, height: int) -> None:
+        empty = spool.stat().st_size == 0  # which cannot be mapped
+        levels = np.empty(0, np.uint8) if empty else np.memmap(spool, np.uint8, "r")
+        frames = levels.reshape(-1, height, width)
         self._video = VideoWriter(self.folder / FRAMES, width, height, self._rate_hz)
         for start in range(0, len(frames), 64):
             self._video.write(frames[start : start + 64])
         self._video.close()
-        del frames
+        del frames, levels
         spool.unlink()
 
     def commit(self, record: TrialRecord, provenance: Provenance) -> Path:

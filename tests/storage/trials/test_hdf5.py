@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.storage.streams import EventChunk, PulseChunk
+from sliplab.storage.streams import EventChunk
 from sliplab.storage.trials.hdf5_reader import StreamReader
 from sliplab.storage.trials.hdf5_writer import COLUMNS, SMALL_HELD, StreamFile
 from tests.storage.trial_files import events
@@ -144,8 +144,8 @@ def test_small_columns_come_back_from_beyond_what_is_held(tmp_path: Path) -> Non
     times = np.arange(2 * SMALL_HELD + 5, dtype=np.int64)
     file = StreamFile(tmp_path / "t.h5")
     for start in range(0, len(times), 1000):
-        file.add_pulses("arm_pulses", PulseChunk(times[start : start + 1000]))
-    file.add_pulses("sync_pulses", PulseChunk(times))
+        file.append("arm_pulses", t=times[start : start + 1000])
+    file.append("sync_pulses", t=times)
     assert file.counts["arm_pulses/t"] == len(times)
     file.finish()
     with StreamReader(tmp_path / "t.h5") as reader:
