@@ -37,7 +37,6 @@ from sliplab.flows.learning.trial_scores import summaries
 from sliplab.flows.other_rig import Judged, judge, other_request, retake
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Detection
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError
@@ -65,10 +64,7 @@ class Guesses:
         self.folder = store.folder / "derived" / STEP
         if not all(item.info.get("simulated") for item in campaigns):
             raise StoreError(f"{store.folder}: holds real trials; only simulated ones have guesses")
-        _, evaluated = evaluation_of(store)
-        self.detection = {
-            name: Detection.model_validate(value) for name, value in evaluated["detection"].items()
-        }
+        self.detection = evaluation_of(store).detection
         self.model = choose_model(wanted_models(store, campaigns))
         self.trials = {item.name: self._chosen(item, trials) for item in campaigns}
         head = {"simulated": True, "change": CHANGE}
@@ -121,9 +117,10 @@ class Guesses:
         store, campaigns = retake(run_requests)
         judged = judge(self.fitted, self.detection, store, campaigns)
         rows = [
-            {**row, "depth_zero_mm": recording.record.depth_zero_mm}
+            {**row.to_json(), "depth_zero_mm": recording.record.depth_zero_mm}
             for row, recording in judged.trials
         ]
+        experiments = summaries([row for row, _ in judged.trials])
         shutil.rmtree(folder)
         return {
             "parameter": setting.parameter,
@@ -131,7 +128,7 @@ class Guesses:
             "value": setting.value(self.simulated[self.campaigns[0].name]),
             "windows": _windows_by_trial(judged, bool(several(training_campaigns(campaigns)))),
             "trials": rows,
-            "experiments": summaries(rows),
+            "experiments": {name: scores.to_json() for name, scores in experiments.items()},
         }
 
     def _key(self, setting: Setting) -> str:

@@ -28,7 +28,6 @@ from sliplab.flows.learning.trial_scores import summaries
 from sliplab.flows.other_rig import judge, other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console
-from sliplab.protocols.settings import Detection
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -67,9 +66,9 @@ class Holdout:
                 f"{store.folder}: its slides are real; a campaign of another skin has to be "
                 "collected with another protocol seed, into a store of its own"
             )
-        _, evaluated = evaluation_of(store)
-        self.detection = Detection.model_validate(evaluated["detection"][self.item.name])
-        reviewed = evaluated.get("reviewed") is not None
+        evaluated = evaluation_of(store)
+        self.detection = evaluated.detection[self.item.name]
+        reviewed = evaluated.reviewed is not None
         self.model = choose_model(wanted_models(store, campaigns, reviewed))
         made_of = [self.item.plan.collection_hash, self.item.info["rig_hash"], trials, seeds]
         used = [labelling.VERSION, dataset.VERSION, *several(campaigns)]
@@ -106,6 +105,7 @@ class Holdout:
         rows = [row for row, _ in judged.trials]
         counts, y, trial = judged.counts, judged.samples.y, judged.samples.trial
         windows = metrics.score(counts, y, self.detection.margin)
+        strict = window_groups.share(window_groups.strict_hits(counts, y), trial)
         now = {
             "version": version("sliplab"),
             "at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -119,12 +119,12 @@ class Holdout:
             "skin_seed": self.seeds[1],
             "model": self.model.key,
             "windows": {
-                **windows.as_dict(),
-                "strict": window_groups.share(window_groups.strict_hits(counts, y), trial),
-                "argmax": window_groups.share(window_groups.credit(counts, y), trial),
+                **windows.to_json(),
+                "strict": strict.to_json(),
+                "argmax": window_groups.share(window_groups.credit(counts, y), trial).to_json(),
             },
-            "rows": rows,
-            "kinematic": summaries(rows)["kinematic"],
+            "rows": [row.to_json() for row in rows],
+            "kinematic": summaries(rows)["kinematic"].to_json(),
             "evaluations": [*self.evaluations(), now],
         }
 

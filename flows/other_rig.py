@@ -24,6 +24,7 @@ from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import make_folder, write_text
+from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
@@ -92,7 +93,7 @@ class Judged:
 
     counts: npt.NDArray[np.int64]
     samples: dataset.SampleSet
-    trials: list[tuple[dict[str, Any], Recording]]
+    trials: list[tuple[TrialScore, Recording]]
 
 
 def judge(

@@ -60,7 +60,7 @@ def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
 
 def _key(store: Store, campaigns: list[Collected]) -> str:
     """Return the key of all that the report is made of."""
-    evaluated, evaluation = evaluate.evaluation_of(store)
+    evaluation = evaluate.evaluation_of(store)
     collected = [
         [
             item.name,
@@ -70,13 +70,13 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
         ]
         for item in campaigns
     ]
-    reviewed = evaluation.get("reviewed") is not None
+    reviewed = evaluation.reviewed is not None
     others = other_networks.kept(store, campaigns, reviewed).values()
     inputs = [
-        evaluated,
+        evaluation.key,
         collected,
         (report_folder(store) / CLOCKS).exists(),
-        sorted(found["key"] for found in others),
+        sorted(found.key for found in others),
         window_baselines.fresh_keys(store),
         read_programs(store),
         Derived.of(store, label_errors.CHECK).key(label_errors.CHECK),
@@ -105,17 +105,20 @@ def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
 
 def _sources(store: Store, campaigns: list[Collected]) -> Sources:
     """Read what earlier steps kept."""
-    key, evaluation = evaluate.evaluation_of(store)
-    reviewed = evaluation.get("reviewed") is not None
+    evaluation = evaluate.evaluation_of(store)
+    networks = other_networks.kept(store, campaigns, evaluation.reviewed is not None)
+    baselines = window_baselines.baselines(store)
+    spans = window_scores.window_intervals(store, evaluation.key)
+    check = label_errors.read_check(store)
     return Sources(
         store,
         campaigns,
         settings=training_settings(campaigns),
-        evaluation=evaluation,
-        networks=other_networks.kept(store, campaigns, reviewed),
-        baselines=window_baselines.baselines(store),
-        window_intervals=window_scores.window_intervals(store, key),
-        label_check=label_errors.read_check(store),
+        evaluation=evaluation.to_json(),
+        networks={name: found.to_json() for name, found in networks.items()},
+        baselines={name: found.to_json() for name, found in baselines.items()},
+        window_intervals={} if spans is None else spans.to_json(),
+        label_check=None if check is None else check.to_json(),
         holds=label_errors.holds_compared(store, campaigns),
         planned_bytes={item.name: _planned_bytes(item) for item in campaigns},
         step_seconds=step_seconds(store),

@@ -27,7 +27,6 @@ from sliplab.analysis.detectors.detectors import (
     learn,
 )
 from sliplab.analysis.detectors.latency import (
-    TrialLatency,
     TrueSlip,
     score_trial,
     summarise_latency,
@@ -35,6 +34,17 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.protocols.settings import Comparison, Detection, Windows
+from sliplab.storage.schema.evaluation import (
+    CurvePoint,
+    DetectorComparison,
+    DetectorLevels,
+    DetectorRate,
+    DetectorScores,
+    DetectorTrials,
+    PartTrials,
+    Rate,
+    TrialLatency,
+)
 
 
 @dataclass(frozen=True)
@@ -133,8 +143,8 @@ class Parts:
 
 def compare(
     parts: Parts, windows: Windows, settings: Detection, fine_ms: int, most: int
-) -> dict[str, Any] | None:
-    """Every detector at every stride and rate, as plain data for JSON.
+) -> DetectorComparison | None:
+    """Compare every detector at every stride and rate.
 
     Args:
         windows: their length.
@@ -145,10 +155,6 @@ def compare(
 
     Returns:
         None where nothing is to be compared, or training, validation or test trials are missing.
-        ``trials``: how many of each.
-        ``detectors``: one entry for each detector and stride, with ``name``, ``stride_ms``,
-        ``rates`` (one entry for each of the rates) and ``curve`` (false early validation
-        trials, and what the test trials then give).
     """
     asked = settings.compare
     if asked is None or not (parts.train and parts.validation and parts.test):
@@ -164,12 +170,15 @@ def compare(
                 key: (judge(detector, validation), judge(detector, test))
                 for key, detector in choices.items()
             }
-            found.append({"name": name, "stride_ms": stride, **_scores(judged, settings, asked)})
-    return {
-        "trials": {name: len(getattr(parts, name)) for name in ("train", "validation", "test")},
-        "strides_ms": sorted({windows.length_ms, fine_ms}),
-        "detectors": found,
-    }
+            rates, curve = _scores(judged, settings, asked)
+            found.append(DetectorScores(name=name, stride_ms=stride, rates=rates, curve=curve))
+    return DetectorComparison(
+        trials=PartTrials(
+            train=len(parts.train), validation=len(parts.validation), test=len(parts.test)
+        ),
+        strides_ms=tuple(sorted({windows.length_ms, fine_ms})),
+        detectors=tuple(found),
+    )
 
 
 def thinned(trial: Labelled, every: int) -> Labelled:
@@ -197,35 +206,46 @@ def _scores(
     judged: Mapping[int, tuple[list[Judged], list[Judged]]],
     settings: Detection,
     asked: Comparison,
-) -> dict[str, Any]:
+) -> tuple[tuple[DetectorRate, ...], tuple[CurvePoint, ...]]:
     tolerance = round(settings.false_early_ms * 1e6)
     trials = len(next(iter(judged.values()))[0])
-    known: dict[int, dict[str, Any]] = {}
+    known: dict[int, _Best] = {}
 
-    def at(allowed: int) -> dict[str, Any]:
+    def at(allowed: int) -> _Best:
         if allowed not in known:
             known[allowed] = _best(judged, allowed, tolerance)
         return known[allowed]
 
-    rates = [
-        {"asked": rate, "allowed": allowed_early(rate, trials), **at(allowed_early(rate, trials))}
+    rates = tuple(
+        DetectorRate(asked=rate, allowed=allowed, **vars(at(allowed)))
         for rate in asked.rates
-    ]
+        for allowed in (allowed_early(rate, trials),)
+    )
     last = min(allowed_early(CURVE_RATE, trials), trials - 1)
-    curve = [
-        {
-            "allowed": allowed,
-            "rate": allowed / trials,
-            "median_ms": at(allowed)["test"]["median_with_missed_ms"],
-        }
+    curve = tuple(
+        CurvePoint(
+            allowed=allowed,
+            rate=allowed / trials,
+            median_ms=at(allowed).test.median_with_missed_ms,
+        )
         for allowed in range(last + 1)
-    ]
-    return {"rates": rates, "curve": curve}
+    )
+    return rates, curve
+
+
+@dataclass(frozen=True)
+class _Best:
+    """One detector at one rate."""
+
+    choice: int
+    levels: DetectorLevels
+    validation: DetectorTrials
+    test: DetectorTrials
 
 
 def _best(
     judged: Mapping[int, tuple[list[Judged], list[Judged]]], allowed: int, tolerance: int
-) -> dict[str, Any]:
+) -> _Best:
     """One detector at one rate; of several the one that validation trials find quickest."""
     ranked = []
     for key, (validation, _) in judged.items():
@@ -234,19 +254,16 @@ def _best(
         ranked.append((*merit(scored), key, levels))
     # keys differ, so levels are never compared
     _, _, key, levels = min(ranked, key=lambda entry: entry[:3])
-    return {
-        "choice": key,
-        "levels": {name: _plain(value) for name, value in vars(levels).items()},
-        **{
-            name: _summary(trials, outcomes(trials, levels, tolerance), levels)
-            for name, trials in zip(("validation", "test"), judged[key], strict=True)
-        },
-    }
+    parts = [
+        _summary(trials, outcomes(trials, levels, tolerance), levels) for trials in judged[key]
+    ]
+    plain = {name: _plain(value) for name, value in vars(levels).items()}
+    return _Best(key, DetectorLevels(**plain), *parts)
 
 
 def _summary(
     trials: Sequence[Judged], scored: Sequence[TrialLatency], levels: Levels
-) -> dict[str, Any]:
+) -> DetectorTrials:
     early = sum(trial.false_early_incipient for trial in scored)
     low, high = exact_interval(early, len(scored))
     before = []
@@ -254,13 +271,13 @@ def _summary(
         found = decide(trial.evidence, levels).incipient_ns
         if score.false_early_incipient and found is not None:
             before.append((trial.slip.incipient_ns - found) / 1e6)
-    return {
-        "false_early_before_ms": sorted(before),
-        "false_early_rate": {"value": early / len(scored), "low": low, "high": high},
-        "median_with_missed_ms": _plain(merit(scored)[0]),
-        "latency_ms": summarise_latency(scored),
-        "lead_ms": summarise_lead(scored),
-    }
+    return DetectorTrials(
+        false_early_before_ms=tuple(sorted(before)),
+        false_early_rate=Rate(value=early / len(scored), low=low, high=high),
+        median_with_missed_ms=_plain(merit(scored)[0]),
+        latency_ms=summarise_latency(scored),
+        lead_ms=summarise_lead(scored),
+    )
 
 
 def _plain(value: float) -> float | None:

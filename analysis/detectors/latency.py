@@ -18,9 +18,13 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.detectors.detection import Found
-from sliplab.storage.schema.label import TrialLabel
-
-Summary = dict[str, float | int | None]
+from sliplab.storage.schema.evaluation import (
+    LatencyByOnset,
+    LatencyFigures,
+    LeadFigures,
+    TrialLatency,
+)
+from sliplab.storage.schema.label import Kind, TrialLabel
 
 NEVER = int(np.iinfo(np.int64).max)
 """The time of what was not detected, where times are held in an array."""
@@ -84,47 +88,6 @@ def is_late(found_ns: Any, end_ns: Any) -> Any:
     return (found_ns >= end_ns) & (found_ns != NEVER)
 
 
-@dataclass(frozen=True)
-class TrialLatency:
-    """One trial's detections against its true onsets.
-
-    Attributes:
-        latency_incipient_ms: detection minus true onset; negative down to the tolerance where it
-            came early; None where missed, false early or late.
-        latency_gross_ms: the same for gross slip.
-        lead_ms: true gross onset minus incipient detection, above zero; None where the incipient
-            detection is not counted.
-        late_incipient_ms, late_gross_ms: a late detection minus the event's end, zero or more;
-            None where it is not late.
-        missed_incipient, missed_gross: there was no detection.
-        false_early_incipient, false_early_gross: it came before the true onset by more than the
-            tolerance.
-    """
-
-    latency_incipient_ms: float | None
-    latency_gross_ms: float | None
-    lead_ms: float | None
-    late_incipient_ms: float | None
-    late_gross_ms: float | None
-    missed_incipient: bool
-    missed_gross: bool
-    false_early_incipient: bool
-    false_early_gross: bool
-
-    @property
-    def uncounted(self) -> tuple[int, int, int, int]:
-        """Numbers, 0 or 1, against a choice's bounds: false early, then missed or late, by onset.
-
-        Incipient slip stands before gross slip.
-        """
-        return (
-            int(self.false_early_incipient),
-            int(self.false_early_gross),
-            int(self.missed_incipient or self.late_incipient_ms is not None),
-            int(self.missed_gross or self.late_gross_ms is not None),
-        )
-
-
 def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> TrialLatency:
     """Judge one trial; see the module.
 
@@ -155,35 +118,27 @@ def score_trial(detections: Found, slip: TrueSlip, false_early_ns: int) -> Trial
     )
 
 
-def summarise_latency(trials: Sequence[TrialLatency]) -> dict[str, Summary]:
-    """Latency over trials: ``{"incipient": {...}, "gross": {...}}``.
-
-    Each holds mean, std, median, p95, min, max (milliseconds) over the n counted detections, and
-    missed, late and false_early; the four numbers add up to the trials.
-    """
-    return {
-        "incipient": {
+def summarise_latency(trials: Sequence[TrialLatency]) -> LatencyByOnset:
+    """Latency over trials, of either onset."""
+    return LatencyByOnset(
+        incipient=LatencyFigures(
             **_describe([t.latency_incipient_ms for t in trials]),
             **_not_counted(trials, "incipient"),
-        },
-        "gross": {
+        ),
+        gross=LatencyFigures(
             **_describe([t.latency_gross_ms for t in trials]),
             **_not_counted(trials, "gross"),
-        },
-    }
+        ),
+    )
 
 
-def summarise_lead(trials: Sequence[TrialLatency]) -> Summary:
-    """Lead over trials: min, mean, std, median, p95, max (milliseconds) over n counted leads.
-
-    ``detected_first`` is n under the name that readers look for; missed, late and false_early are
-    those of the incipient detection.
-    """
+def summarise_lead(trials: Sequence[TrialLatency]) -> LeadFigures:
+    """Lead over trials; missed, late and false early ones are those of the incipient detection."""
     found = _describe([t.lead_ms for t in trials])
-    return {**found, "detected_first": found["n"], **_not_counted(trials, "incipient")}
+    return LeadFigures(**found, detected_first=found["n"], **_not_counted(trials, "incipient"))
 
 
-def _not_counted(trials: Sequence[TrialLatency], kind: str) -> dict[str, int]:
+def _not_counted(trials: Sequence[TrialLatency], kind: Kind) -> dict[str, int]:
     return {
         "missed": sum(getattr(t, f"missed_{kind}") for t in trials),
         "late": sum(getattr(t, f"late_{kind}_ms") is not None for t in trials),

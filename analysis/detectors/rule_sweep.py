@@ -32,6 +32,7 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT
 from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.evaluation import Choice
 
 I64 = npt.NDArray[np.int64]
 F64 = npt.NDArray[np.float64]
@@ -211,35 +212,6 @@ class Counted:
     slip: TrueSlip
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The pair chosen from a grid, and how it did.
-
-    Attributes:
-        smoothing, margin: the chosen ones.
-        split: the trials that chose, ``validation`` or ``test``.
-        trials: how many there were.
-        allowed: trials that may be false early, for either onset.
-        false_early, false_early_gross: trials that were.
-        missed, missed_gross: trials without a detection; late, late_gross: trials where it came
-            after the event. As many of either kind together are allowed.
-        median_ms: their median incipient latency, a missed or late one infinite; None if so.
-    """
-
-    smoothing: int
-    margin: float
-    split: str
-    trials: int
-    allowed: int
-    false_early: int
-    false_early_gross: int
-    missed: int
-    missed_gross: int
-    late: int
-    late_gross: int
-    median_ms: float | None
-
-
 def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str) -> Choice:
     """The pair of the grid with the lowest median incipient latency within the bound.
 
@@ -273,8 +245,8 @@ def choose_smoothing(trials: Sequence[Counted], settings: Detection, split: str)
     (_, median, *_, smoothing, negative), scored = min(found, key=lambda entry: entry[0])
     latency = summarise_latency(scored)
     counts = {
-        f"{name}{suffix}": int(latency[kind][name] or 0)
-        for kind, suffix in (("incipient", ""), ("gross", "_gross"))
+        f"{name}{suffix}": getattr(figures, name)
+        for figures, suffix in ((latency.incipient, ""), (latency.gross, "_gross"))
         for name in ("false_early", "missed", "late")
     }
     return Choice(

@@ -8,11 +8,12 @@ nothing depends on the order of the classes.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from sliplab.storage.schema.evaluation import Accuracy, Classification
 
 CLASSES = ("no_slip", "incipient", "gross")
 """Class names; their positions are the labels 0, 1, 2 and the columns of spike counts."""
@@ -22,54 +23,6 @@ NO_SLIP, INCIPIENT, GROSS = range(3)
 Counts = npt.NDArray[Any]
 Labels = npt.NDArray[np.integer[Any]]
 IntArray = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """Three accuracies in 0..1 over the same samples; None where there are no samples.
-
-    Attributes:
-        argmax: a sample whose class ties for the maximum with k-1 others counts 1/k, so a silent
-            network scores 1/3 and the order of the classes cannot matter.
-        strict: only a unique winner counts; a tie is wrong.
-        margin: only a unique winner that leads every other by at least the margin counts.
-        n: number of samples.
-    """
-
-    argmax: float | None
-    strict: float | None
-    margin: float | None
-    n: int
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Everything the report prints about one set of classified windows.
-
-    Attributes:
-        accuracy: the three accuracies.
-        confusion: int64 (3, 4); rows are true classes, columns predicted ones in the order of
-            `CLASSES`, and the fourth column holds the undecided samples (no unique winner).
-        precision: right among all decided for the class; undecided samples are in no class.
-        recall: right among all that truly are of the class; undecided samples are not right.
-        balance: share of each class among the samples.
-    """
-
-    accuracy: Accuracy
-    confusion: IntArray
-    precision: dict[str, float | None]
-    recall: dict[str, float | None]
-    balance: dict[str, float | None]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; what cannot be computed is None."""
-        return {
-            "accuracy": asdict(self.accuracy),
-            "confusion": self.confusion.tolist(),
-            "precision": dict(self.precision),
-            "recall": dict(self.recall),
-            "balance": dict(self.balance),
-        }
 
 
 def check(counts: Counts, labels: Labels) -> tuple[Counts, IntArray]:
@@ -117,7 +70,7 @@ def accuracy(counts: Counts, labels: Labels, margin: float = 0.0) -> Accuracy:
     counts, labels = check(counts, labels)
     n = len(labels)
     if n == 0:
-        return Accuracy(None, None, None, 0)
+        return Accuracy(argmax=None, strict=None, margin=None, n=0)
     top = counts == counts.max(axis=1, keepdims=True)
     hit = top[np.arange(n), labels]
     # sixths are whole numbers for 1, 1/2 and 1/3: the sum is exact in any order
@@ -150,7 +103,7 @@ def class_balance(labels: Labels) -> dict[str, float | None]:
     return {name: _share(each[k], len(labels)) for k, name in enumerate(CLASSES)}
 
 
-def score(counts: Counts, labels: Labels, margin: float = 0.0) -> Scores:
+def score(counts: Counts, labels: Labels, margin: float = 0.0) -> Classification:
     """Accuracies, confusion matrix, precision, recall and class balance in one.
 
     Args:
@@ -162,9 +115,9 @@ def score(counts: Counts, labels: Labels, margin: float = 0.0) -> Scores:
         ValueError: shapes that do not fit, a label that is no class, a count not finite.
     """
     table = confusion(counts, labels)
-    return Scores(
+    return Classification(
         accuracy=accuracy(counts, labels, margin),
-        confusion=table,
+        confusion=tuple(map(tuple, table.tolist())),
         precision={n: _share(table[k, k], table[:, k].sum()) for k, n in enumerate(CLASSES)},
         recall={n: _share(table[k, k], table[k].sum()) for k, n in enumerate(CLASSES)},
         balance=class_balance(labels),

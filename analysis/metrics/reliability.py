@@ -17,6 +17,7 @@ from scipy.special import log_softmax
 
 from sliplab.analysis.metrics.classification import Counts, IntArray, Labels, check
 from sliplab.analysis.metrics.window_groups import share
+from sliplab.storage.schema.evaluation import Calibration, CalibrationScores, LeadShare
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,15 +37,14 @@ def lead(counts: Counts) -> npt.NDArray[Any]:
     return np.asarray(ordered[:, -1] - ordered[:, -2])
 
 
-def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[dict[str, Any]]:
+def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[LeadShare]:
     """Share right by lead in whole spikes, from 0 (a tie, no winner, never right) up.
 
     Args:
         trial: integer (n,), the trial of each window.
 
     Returns:
-        a row for each of `EDGES` with windows: ``lead`` and ``to``, the least and the most of it
-        (None: and more), ``right``, and what `analysis.metrics.window_groups.share` gives.
+        a row for each of `EDGES` with windows.
     """
     counts, labels = check(counts, labels)
     by = lead(counts)
@@ -55,13 +55,13 @@ def by_lead(counts: Counts, labels: Labels, trial: IntArray) -> list[dict[str, A
         there = place == group
         found = share(right[there].astype(np.float64), trial[there])
         rows.append(
-            {
-                "lead": EDGES[group],
-                "to": EDGES[group + 1] - 1 if group + 1 < len(EDGES) else None,
-                "right": int(right[there].sum()),
-                **found,
-            }
-        )  # fmt: skip
+            LeadShare(
+                lead=EDGES[group],
+                to=EDGES[group + 1] - 1 if group + 1 < len(EDGES) else None,
+                right=int(right[there].sum()),
+                **dict(found),
+            )
+        )
     return rows
 
 
@@ -108,28 +108,25 @@ def expected_calibration_error(
 
 def calibration(
     counts: Counts, labels: Labels, held_counts: Counts, held_labels: Labels
-) -> dict[str, Any]:
+) -> Calibration:
     """The temperature that validation windows give, and its scores on test windows.
 
     Args:
         counts, labels: of test windows.
         held_counts, held_labels: of validation windows; nothing else is fitted.
-
-    Returns:
-        ``temperature``; ``ece`` and ``cross_entropy`` of test windows with it, and with 1 under
-        ``uncalibrated``; None where a part has no windows.
     """
     counts, labels = check(counts, labels)
     temperature = fit_temperature(held_counts, held_labels)
     if temperature is None or not len(labels):
-        return {"temperature": temperature, "ece": None, "cross_entropy": None,
-                "uncalibrated": None}  # fmt: skip
+        return Calibration(temperature=temperature, ece=None, cross_entropy=None, uncalibrated=None)
 
-    def scores(t: float) -> dict[str, float]:
+    def scores(t: float) -> CalibrationScores:
         p = np.exp(log_softmax(counts / t, axis=1))
-        return {
-            "ece": expected_calibration_error(p, labels),
-            "cross_entropy": cross_entropy(counts, labels, t),
-        }
+        return CalibrationScores(
+            ece=expected_calibration_error(p, labels),
+            cross_entropy=cross_entropy(counts, labels, t),
+        )
 
-    return {"temperature": temperature, **scores(temperature), "uncalibrated": scores(1.0)}
+    return Calibration(
+        temperature=temperature, **dict(scores(temperature)), uncalibrated=scores(1.0)
+    )

@@ -8,7 +8,6 @@ over trials (`analysis.metrics.intervals`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +21,12 @@ from sliplab.analysis.metrics.classification import (
     winners,
 )
 from sliplab.analysis.metrics.intervals import mean_interval, share_interval
+from sliplab.storage.schema.evaluation import Share, Tenth, TrialWindows
 
 FloatArray = npt.NDArray[np.float64]
 
+TrialName = tuple[str, str, dict[str, str]]
+"""Campaign, trial id, and levels by factor in words."""
 TENTHS = 10
 """Parts of a phase."""
 
@@ -42,20 +44,17 @@ def strict_hits(counts: Counts, labels: Labels) -> FloatArray:
     return (winners(counts) == labels).astype(np.float64)
 
 
-def share(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+def share(values: FloatArray, trial: IntArray) -> Share:
     """Share that `values` come to, its interval over trials, windows and trials.
 
     Args:
         values: (n,), what a window counts, 0..1.
         trial: integer (n,), the trial of each window.
-
-    Returns:
-        ``share``, ``low``, ``high`` (None where there is none), ``n`` windows and ``trials``.
     """
     return _summary(values, trial, share_interval)
 
 
-def mean(values: FloatArray, trial: IntArray) -> dict[str, Any]:
+def mean(values: FloatArray, trial: IntArray) -> Share:
     """The same of values of any sign, such as differences, with Student's interval."""
     return _summary(values, trial, mean_interval)
 
@@ -64,25 +63,25 @@ def _summary(
     values: FloatArray,
     trial: IntArray,
     measure: Callable[[FloatArray, FloatArray], tuple[float, float] | None],
-) -> dict[str, Any]:
+) -> Share:
     which, place = np.unique(trial, return_inverse=True)
     sums, sizes = (
         np.bincount(place, weights, minlength=len(which)).astype(np.float64)
         for weights in (values, None)
     )
     span = measure(sums, sizes)
-    return {
-        "share": float(values.mean()) if len(values) else None,
-        "low": None if span is None else span[0],
-        "high": None if span is None else span[1],
-        "n": len(values),
-        "trials": len(which),
-    }
+    return Share(
+        share=float(values.mean()) if len(values) else None,
+        low=None if span is None else span[0],
+        high=None if span is None else span[1],
+        n=len(values),
+        trials=len(which),
+    )
 
 
 def by_factor(
     hits: FloatArray, trial: IntArray, levels: Mapping[int, Mapping[str, str]]
-) -> dict[str, dict[str, dict[str, Any]]]:
+) -> dict[str, dict[str, Share]]:
     """Share of hits by each factor's levels.
 
     Args:
@@ -91,7 +90,7 @@ def by_factor(
         levels: of each trial, its level of each factor in words; levels come out in the order in
             which they are first seen here.
     """
-    found: dict[str, dict[str, dict[str, Any]]] = {}
+    found: dict[str, dict[str, Share]] = {}
     for factor in dict.fromkeys(name for of in levels.values() for name in of):
         found[factor] = {}
         for text in dict.fromkeys(of[factor] for of in levels.values() if factor in of):
@@ -104,7 +103,7 @@ def by_factor(
 
 def by_tenth(
     hits: FloatArray, labels: Labels, trial: IntArray, fraction: FloatArray
-) -> dict[str, list[dict[str, Any]]]:
+) -> dict[str, tuple[Tenth, ...]]:
     """Recall of each class by tenths of its phase, ten rows a class.
 
     Args:
@@ -120,18 +119,18 @@ def by_tenth(
         rows = []
         for part in range(TENTHS):
             there = inside & (labels == k) & (tenth == part)
-            rows.append({"tenth": part + 1, **share(hits[there], trial[there])})
-        result[name] = rows
+            rows.append(Tenth(tenth=part + 1, **dict(share(hits[there], trial[there]))))
+        result[name] = tuple(rows)
     return result
 
 
 def by_trial(
-    counts: Counts, labels: Labels, trial: IntArray, name: Callable[[int], dict[str, Any]]
-) -> list[dict[str, Any]]:
+    counts: Counts, labels: Labels, trial: IntArray, named: Callable[[int], TrialName]
+) -> list[TrialWindows]:
     """One row a trial, the worst first: windows, errors, and what was taken for what.
 
     Args:
-        name: gives what identifies a trial, put first into its row.
+        named: gives campaign, id and condition of a trial.
     """
     counts, labels = check(counts, labels)
     said = winners(counts)
@@ -148,8 +147,11 @@ def by_trial(
             for j in (*range(len(CLASSES)), -1)
             if j != k and ((true == k) & (called == j)).any()
         }
+        campaign, name, condition = named(number)
         rows.append(
-            {**name(number), "n": int(there.sum()), "errors": int(wrong.sum()),
-             "strict": float(1 - wrong.mean()), "taken": taken}
+            TrialWindows(
+                campaign=campaign, trial=name, condition=condition, n=int(there.sum()),
+                errors=int(wrong.sum()), strict=float(1 - wrong.mean()), taken=taken,
+            )
         )  # fmt: skip
-    return sorted(rows, key=lambda row: row["strict"])
+    return sorted(rows, key=lambda row: row.strict)

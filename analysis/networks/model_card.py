@@ -53,7 +53,7 @@ def model_card(
             "trials": part.trials,
             "samples": len(part.labels),
             "balance": class_balance(part.labels),
-            **score(part.counts, part.labels, margin).as_dict(),
+            **score(part.counts, part.labels, margin).to_json(),
         }
         for name, part in splits.items()
     }

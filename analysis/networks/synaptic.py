@@ -10,8 +10,6 @@ synapses, none of them in the padding.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,45 +21,12 @@ from sliplab.analysis.networks.spiking import Trainer, side_by_side
 from sliplab.analysis.networks.spiking_gradients import forward_kept
 from sliplab.analysis.networks.training import Fitted, restore
 from sliplab.analysis.windows.sparse import SparseWindows
+from sliplab.storage.schema.evaluation import WindowWork
 
 I64 = npt.NDArray[np.int64]
 
 CHUNK = 64
 """Windows that a thread counts at a time."""
-
-
-@dataclass(frozen=True)
-class Work:
-    """Means a window.
-
-    Attributes:
-        synaptic: synaptic operations by weighted layer: additions that its input spikes cause.
-        dense: multiply-adds of the same layer when every place and step is computed.
-        spikes: by spiking layer.
-        rates: spikes per neuron and step by spiking layer, 0..1.
-        events: input events.
-        n: windows that were counted.
-    """
-
-    synaptic: dict[str, float]
-    dense: dict[str, int]
-    spikes: dict[str, float]
-    rates: dict[str, float]
-    events: float
-    n: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON, with the sums over layers."""
-        total, dense = sum(self.synaptic.values()), sum(self.dense.values())
-        return {
-            "synaptic_operations": {**self.synaptic, "all": total},
-            "dense_multiply_adds": {**self.dense, "all": dense},
-            "share": total / dense,
-            "spikes": self.spikes,
-            "rates": self.rates,
-            "events": self.events,
-            "n": self.n,
-        }
 
 
 def reached(side: int, kernel: int, stride: int) -> I64:
@@ -94,12 +59,12 @@ def fan_out(trainer: Trainer, cells: int) -> list[I64]:
     return result
 
 
-def count_work(fitted: Fitted, x: SparseWindows) -> Work | None:
+def count_work(fitted: Fitted, x: SparseWindows) -> WindowWork | None:
     """Count what a trained network does for each window, from rest; None without windows."""
     return count_net_work(restore(fitted), fitted.windows.cells, x)
 
 
-def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | None:
+def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> WindowWork | None:
     """The same of any network that the kernels compute, with so many cells along a side."""
     if not len(x):
         return None
@@ -135,12 +100,16 @@ def count_net_work(net: nn.Sequential, cells: int, x: SparseWindows) -> Work | N
         name: 0 if getattr(net, name).bias is None else neurons * trainer.steps
         for name, neurons in zip(WEIGHTED, trainer.layout.neurons, strict=True)
     }
-    return Work(
-        synaptic={name: int(operations[k]) / n + always[name] for k, name in enumerate(WEIGHTED)},
-        dense={
-            name: int(synapses[k].sum()) * trainer.steps + always[name]
-            for k, name in enumerate(WEIGHTED)
-        },
+    synaptic = {name: int(operations[k]) / n + always[name] for k, name in enumerate(WEIGHTED)}
+    dense = {
+        name: int(synapses[k].sum()) * trainer.steps + always[name]
+        for k, name in enumerate(WEIGHTED)
+    }
+    total, all_dense = sum(synaptic.values()), sum(dense.values())
+    return WindowWork(
+        synaptic_operations={**synaptic, "all": total},
+        dense_multiply_adds={**dense, "all": all_dense},
+        share=total / all_dense,
         spikes={name: int(spikes[k]) / n for k, name in enumerate(SPIKING)},
         rates={
             name: int(spikes[k]) / (n * trainer.steps * trainer.layout.neurons[k])

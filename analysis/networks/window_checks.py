@@ -23,6 +23,7 @@ from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.networks.training import Fitted, restore
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.schema.evaluation import Classification
 
 
 class CheckFailed(Exception):
@@ -50,7 +51,7 @@ def permuted(fitted: Fitted, x: SparseWindows) -> Predict:
 
 
 def check_permutations(
-    predict: Predict, labels: Labels, score: Callable[[Counts, Labels], metrics.Scores]
+    predict: Predict, labels: Labels, score: Callable[[Counts, Labels], Classification]
 ) -> int:
     """Rename the classes in all six ways, in outputs and labels: nothing may change.
 
@@ -70,7 +71,7 @@ def check_permutations(
     for order in orders:
         place = np.argsort(order)  # old class -> new class
         found = score(predict(order), place[labels])
-        table = first.confusion[list(order)][:, [*order, len(CLASSES)]]
+        table = np.asarray(first.confusion)[list(order)][:, [*order, len(CLASSES)]]
         if found.accuracy != first.accuracy:
             raise CheckFailed(
                 f"classes in the order {order} give the accuracies {found.accuracy}, in their own "

@@ -446,7 +446,7 @@ def _window_figures(
     return {
         "test": {"strict": found.strict, "argmax": found.argmax, "windows": found.n},
         "validation": {"strict": chosen.strict, "windows": chosen.n},
-        "synaptic_operations": None if work is None else sum(work.synaptic.values()),
+        "synaptic_operations": None if work is None else work.synaptic_operations["all"],
         "events": None if work is None else work.events,
         "us_single": single,
         "us_batched": batched,

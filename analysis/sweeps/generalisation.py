@@ -102,7 +102,7 @@ def scored(counts: I64, y: I64, trial: I64) -> Json:
     """Return strict accuracy with its interval over trials, argmax accuracy, recall by class."""
     found = metrics.score(counts, y)
     return {
-        **window_groups.share(window_groups.strict_hits(counts, y), trial),
+        **window_groups.share(window_groups.strict_hits(counts, y), trial).to_json(),
         "argmax": found.accuracy.argmax,
         "recall": found.recall,
     }

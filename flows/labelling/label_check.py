@@ -21,6 +21,7 @@ from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text
+from sliplab.storage.schema.evaluation import LabelCheck
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
@@ -71,5 +72,6 @@ def check_labels(run_request: RunRequest, trials: int = TRIALS) -> dict[str, Any
     stale = not kept.fresh(CHECK, key)
     if stale:
         figures = rules_compared(store, campaigns)
-        kept.write(CHECK, key, {"trials": len(made_of), "simulated": True, "rules_ms": figures})
+        found = LabelCheck(trials=len(made_of), simulated=True, rules_ms=figures)
+        kept.write(CHECK, key, found)
     return {"step": CHECK, "done": taken or int(stale), "fresh": len(made_of) - taken}

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.storage.schema.evaluation import (
+    Coverage,
+    Deviation,
+    DeviationByOnset,
+    LabelCheck,
+    LabelErrors,
+    RuleErrors,
+)
 from sliplab.storage.schema.label import KINDS, LABELS, Kind, Rule, TrialLabel
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -23,7 +31,7 @@ _TRUTH: dict[Rule, dict[Kind, str]] = {
 the hold, or the true start of the slip in the motion."""
 
 
-def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
+def label_errors(store: Store, campaigns: list[Collected]) -> LabelErrors:
     """Ruling labels against what is true of their rule, over every labelled simulated trial; ms."""
     rules = {item.settings.labelling.rule for item in campaigns}
     errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
@@ -31,15 +39,15 @@ def label_errors(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
         onset = label.at_ns(kind)
         if label.rule == rule and onset is not None and truth is not None:
             errors[kind].append((onset - truth) / 1e6)
-    return {"rule": "+".join(sorted(rules)), **{k: spread(v) for k, v in errors.items()}}
+    return LabelErrors(
+        rule="+".join(sorted(rules)),
+        incipient=spread(errors["incipient"]),
+        gross=spread(errors["gross"]),
+    )
 
 
-def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
-    """Both rules: each less its truth, and the paper's less the change point; ms.
-
-    `paper` and `change_point` hold a spread by kind, `apart` too; `papillae` that of all papillae's
-    change points, with `coverage`, the share of 95 % intervals that hold the truth.
-    """
+def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
+    """Both rules: each less its truth, and the paper's less the change point; ms."""
     found: dict[str, dict[str, list[float]]] = {
         name: {kind: [] for kind in KINDS} for name in ("paper", "change_point", "apart")
     }
@@ -66,10 +74,11 @@ def rules_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
                 if at != -1 and true is not None:
                     errors.append((at - true) / 1e6)
                     inside.append(low <= true <= high)
-    return {
-        **{name: {k: spread(v) for k, v in kinds.items()} for name, kinds in found.items()},
-        "papillae": {**spread(errors), "coverage": float(np.mean(inside)) if inside else None},
-    }
+    coverage = float(np.mean(inside)) if inside else None
+    return RuleErrors(
+        **{name: by_onset(kinds) for name, kinds in found.items()},
+        papillae=Coverage(**dict(spread(errors)), coverage=coverage),
+    )
 
 
 def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
@@ -101,7 +110,7 @@ def holds_compared(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
             "slipped": sum(limit is not None and px > limit for px in most),
             "limit_px": limit,
             "most_px": max(most),
-            "apart_ms": {kind: spread(values) for kind, values in apart.items()},
+            "apart_ms": by_onset(apart).to_json(),
         }
     return found
 
@@ -120,15 +129,20 @@ def distances(store: Store, campaigns: list[Collected]) -> dict[str, dict[str, l
     return found
 
 
-def spread(values: list[float]) -> dict[str, Any]:
-    """Number, median, median distance and largest."""
+def by_onset(values: Mapping[str, list[float]]) -> DeviationByOnset:
+    """Summarise differences of either onset."""
+    return DeviationByOnset(incipient=spread(values["incipient"]), gross=spread(values["gross"]))
+
+
+def spread(values: list[float]) -> Deviation:
+    """Summarise differences."""
     there = np.asarray(values)
-    return {
-        "n": len(values),
-        "median": float(np.median(there)) if len(there) else None,
-        "median_abs": float(np.median(np.abs(there))) if len(there) else None,
-        "max_abs": float(np.max(np.abs(there))) if len(there) else None,
-    }
+    return Deviation(
+        n=len(values),
+        median=float(np.median(there)) if len(there) else None,
+        median_abs=float(np.median(np.abs(there))) if len(there) else None,
+        max_abs=float(np.max(np.abs(there))) if len(there) else None,
+    )
 
 
 def _cases(
@@ -150,7 +164,7 @@ def _cases(
                     yield rule, kind, label, true[centre] if isinstance(true, list) else true
 
 
-def read_check(store: Store) -> dict[str, Any] | None:
-    """The figures of the last check; None where there was none."""
+def read_check(store: Store) -> LabelCheck | None:
+    """Return the figures of the last check; None where there was none."""
     kept = Derived.of(store, CHECK)
-    return kept.read(CHECK) if kept.key(CHECK) is not None else None
+    return kept.load(CHECK, LabelCheck) if kept.key(CHECK) is not None else None

@@ -9,10 +9,11 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
-from sliplab.analysis.detectors.rule_sweep import Choice, Counted, choose_smoothing
+from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing
 from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.storage.schema.evaluation import Choice, DetectorComparison
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -85,8 +86,8 @@ class DetectorWork:
 
     def compare(
         self, store: Store, settings: AnalysisSettings, detection: Detection
-    ) -> dict[str, Any] | None:
-        """The comparison as `analysis.detectors.detector_comparison` gives it; None without one.
+    ) -> DetectorComparison | None:
+        """Compare detectors; None where nothing is to be compared.
 
         Args:
             settings: windows and strides; detection: what the paper's rule is set to.
@@ -100,8 +101,8 @@ class DetectorWork:
         if found is None or carried is None:
             return found
         stateful = compare(carried, settings.windows, detection, fine, settings.most_spikes)
-        stateful = stateful or {"detectors": []}
-        return {**found, "carried": stateful["detectors"]}
+        ours = () if stateful is None else stateful.detectors
+        return found.model_copy(update={"carried": ours})
 
 
 def detector_work(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
@@ -27,7 +26,7 @@ from sliplab.flows.learning.window_scores import key_inputs, score_windows
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols.settings import Detection
-from sliplab.storage.files import read_json
+from sliplab.storage.schema.evaluation import Evaluation, TrialScore
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 STEP = "evaluation"
 VERSION = 4
 NAME = "evaluation"
-FORMAT = [VERSION, window_scores.VERSION]
+FORMAT = (VERSION, window_scores.VERSION)
 """Stands in an evaluation, so that who reads it knows that its keys are those of today."""
 
 
@@ -53,7 +52,7 @@ def choose_model(models: list[Model]) -> Model:
                 f"{model.path}: is missing or stale; run `sliplab train` first, with `--reviewed` "
                 "where the evaluation has it"
             )
-    return max(models, key=lambda model: read_json(model.info_path)["validation"]["strict"])
+    return max(models, key=lambda model: model.info.validation.strict or 0.0)
 
 
 def make_job(
@@ -102,22 +101,20 @@ def make_job(
     return Job(store, campaigns, labels, model, models, detection, trials, detectors, key, cluster)
 
 
-def evaluation_of(store: Store) -> tuple[str, dict[str, Any]]:
-    """The store's evaluation with its key.
+def evaluation_of(store: Store) -> Evaluation:
+    """Return the store's evaluation.
 
     Raises:
         StoreError: there is none, or another version of the program made it.
     """
     kept = Derived.of(store, STEP)
-    key = kept.key(NAME)
-    if key is None:
+    if kept.key(NAME) is None:
         raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
-    found = kept.read(NAME)
-    if found.get("format") != FORMAT:
+    if kept.read(NAME).get("format") != list(FORMAT):
         raise StoreError(
             f"{store.folder}: evaluated by another version of this program; run `sliplab evaluate`"
         )
-    return key, found
+    return kept.load(NAME, Evaluation)
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
@@ -129,23 +126,24 @@ def score(wanted: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
     detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
     kinematic = training_campaigns(job.campaigns)[0].name
     rows = _score_trials(job, detection)
-    result = {
-        "format": FORMAT,
-        "seed": job.model.seed,
-        "windows": score_windows(job, train, test, detection[kinematic].margin),
-        "trials": rows,
-        "experiments": summaries(rows),
-        "label_error_ms": label_errors(job.store, job.campaigns),
-        "label_rules_ms": rules_compared(job.store, job.campaigns),
-        "reviewed": job.labels.states(job.campaigns),
-        "detection": {n: d.model_dump(mode="json") for n, d in detection.items()},
-        "choices": {n: None if c is None else asdict(c) for n, c in choices.items()},
-        "detectors": job.detectors.compare(job.store, settings, job.detection[kinematic]),
-    }
+    states = job.labels.states(job.campaigns)
+    result = Evaluation(
+        format=FORMAT,
+        seed=job.model.seed,
+        windows=score_windows(job, train, test, detection[kinematic].margin),
+        trials=tuple(rows),
+        experiments=summaries(rows),
+        label_error_ms=label_errors(job.store, job.campaigns),
+        label_rules_ms=rules_compared(job.store, job.campaigns),
+        reviewed=None if states is None else {str(name): n for name, n in states.items()},
+        detection=detection,
+        choices=choices,
+        detectors=job.detectors.compare(job.store, settings, job.detection[kinematic]),
+    )
     Derived.of(job.store, STEP).write(NAME, job.key, result)
 
 
-def _score_trials(job: Job, detection: dict[str, Detection]) -> list[dict[str, Any]]:
+def _score_trials(job: Job, detection: dict[str, Detection]) -> list[TrialScore]:
     """One row a trial: onsets, detections, latency."""
     rows = []
     for item, trial, recording, _ in job.trials:

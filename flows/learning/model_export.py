@@ -43,7 +43,8 @@ from sliplab.flows.learning.train import (
 )
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import json_text, make_folder, read_json, sha256, write_bytes, write_text
+from sliplab.storage.files import json_text, make_folder, sha256, write_bytes, write_text
+from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.store import Store, StoreError
 
 SPLITS = ("train", "validation", "test")
@@ -175,8 +176,8 @@ def _made_from_these(source: _Source) -> bool:
         for model in make(source.store, source.campaigns)
     }
     try:
-        return read_json(source.path.with_suffix(".json"))["key"] in wanted
-    except (OSError, ValueError, KeyError):
+        return TrainedModel.load(source.path.with_suffix(".json")).key in wanted
+    except (OSError, ValueError):
         return False
 
 
@@ -233,7 +234,7 @@ def _speck(
         for name, spiking in zip(WEIGHTED, SPIKING, strict=True)
     }
     accuracy = {
-        name: vars(metrics.accuracy(each, seen.y, margin))
+        name: metrics.accuracy(each, seen.y, margin).to_json()
         for name, each in (("real", counts), ("whole", ran.counts))
     }
     return {

@@ -53,6 +53,6 @@ def latencies(
 
 def _summary(rows: dict[str, list[Any]]) -> Latency:
     return {
-        experiment: {"trials": len(each), "latency_ms": summarise_latency(each)}
+        experiment: {"trials": len(each), "latency_ms": summarise_latency(each).to_json()}
         for experiment, each in rows.items()
     }

@@ -39,6 +39,11 @@ from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
+from sliplab.storage.schema.evaluation import (
+    OtherEvaluation,
+    OtherWindowScores,
+    TrialScore,
+)
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
@@ -234,8 +239,8 @@ def judge_model(
             "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
         )
     done = judgement.run()
-    found = Derived.of(store, STEP).read(network.name)
-    kinematic = found["experiments"]["kinematic"]
+    found = Derived.of(store, STEP).load(network.name, OtherEvaluation)
+    kinematic = found.experiments["kinematic"]
     return {
         "step": "evaluate",
         "done": int(done),
@@ -245,10 +250,14 @@ def judge_model(
         "same_as_sinabs": network.exact or network.engine == "sinabs",
         "simulated": store.simulated,
         "margin": {name: rule.margin for name, rule in rules.items()},
-        "accuracy": found["windows"]["accuracy"],
-        "interval": found["windows"]["interval"],
-        "latency_ms": kinematic["latency_ms"],
-        "lead_ms": {k: v["lead_ms"] for k, v in found["experiments"].items() if k != "kinematic"},
+        "accuracy": found.windows.accuracy.to_json(),
+        "interval": found.windows.interval.to_json(),
+        "latency_ms": kinematic.latency_ms.to_json(),
+        "lead_ms": {
+            name: scores.lead_ms.to_json()
+            for name, scores in found.experiments.items()
+            if name != "kinematic"
+        },
         **labels.report_states(campaigns),
     }
 
@@ -288,15 +297,16 @@ def evaluate_comparison(
     return done
 
 
-def kept(store: Store, campaigns: list[Collected], reviewed: bool = False) -> dict[str, Json]:
+def kept(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> dict[str, OtherEvaluation]:
     """Results on the trials and labels of today, by name."""
     folder = Derived.of(store, STEP)
     wanted = data_key(Labels(store, reviewed), campaigns)
     found = {}
     for path in sorted(folder.folder.glob("*.json")):
-        result = folder.read(path.stem)
-        if result.get("data_key") == wanted:
-            found[path.stem] = result
+        if folder.read(path.stem).get("data_key") == wanted:
+            found[path.stem] = folder.load(path.stem, OtherEvaluation)
     return found
 
 
@@ -379,7 +389,7 @@ def _counter(
 def _score(job: Judgement) -> None:
     """Windows, detections and latencies, kept as one result."""
     network = job.network
-    rows: list[Json] = []
+    rows: list[TrialScore] = []
     counts: list[I64] = []
     labels: list[I64] = []
     places: list[I64] = []
@@ -395,29 +405,29 @@ def _score(job: Judgement) -> None:
                 labels.append(arrays["y"])
                 places.append(np.full(len(arrays["y"]), len(places), np.int64))
     margin = job.rules[training_campaigns(job.campaigns)[0].name].margin
-    result = {
-        "data_key": job.data_key,
-        "title": network.title,
-        "engine": network.engine,
-        "exact": network.exact,
+    result = OtherEvaluation(
+        data_key=job.data_key,
+        title=network.title,
+        engine=network.engine,
+        exact=network.exact,
         **job.about,
-        "windows": _windows(counts, labels, places, margin),
-        "trials": rows,
-        "experiments": summaries(rows),
-        "detection": {name: rule.model_dump(mode="json") for name, rule in job.rules.items()},
-    }
+        windows=_windows(counts, labels, places, margin),
+        trials=tuple(rows),
+        experiments=summaries(rows),
+        detection=job.rules,
+    )
     Derived.of(job.store, STEP).write(network.name, job.key, result)
 
 
 def _windows(
     counts: Sequence[I64], labels: Sequence[I64], places: Sequence[I64], margin: float
-) -> Json:
+) -> OtherWindowScores:
     """Figures of the sample windows, with intervals over trials."""
     none = np.empty(0, np.int64)
     all_counts = np.concatenate([np.empty((0, 3), np.int64), *counts])
     y, trial = np.concatenate([none, *labels]), np.concatenate([none, *places])
-    return {
-        **metrics.score(all_counts, y, margin).as_dict(),
-        "interval": window_groups.share(window_groups.strict_hits(all_counts, y), trial),
-        "window_intervals": intervals_of(all_counts, y, trial),
-    }
+    return OtherWindowScores(
+        **dict(metrics.score(all_counts, y, margin)),
+        interval=window_groups.share(window_groups.strict_hits(all_counts, y), trial),
+        window_intervals=intervals_of(all_counts, y, trial),
+    )

@@ -26,7 +26,8 @@ from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
-from sliplab.storage.files import read_json, write_bytes, write_json, write_text
+from sliplab.storage.files import write_bytes, write_json, write_text
+from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
 from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -54,6 +55,16 @@ class Model:
         return self.path.with_suffix(".json")
 
     @property
+    def info(self) -> TrainedModel:
+        """The document beside the model file.
+
+        Raises:
+            OSError: there is none.
+            DocumentError, NewerFormat: it cannot be read.
+        """
+        return TrainedModel.load(self.info_path)
+
+    @property
     def state_path(self) -> Path:
         """Where its training is kept after each epoch, to go on there after a stop."""
         return self.path.with_suffix(f".{self.key[:16]}.state")
@@ -67,8 +78,8 @@ class Model:
     def fresh(self) -> bool:
         """Whether the file was made with `key`."""
         try:
-            return self.path.exists() and read_json(self.info_path)["key"] == self.key
-        except (OSError, ValueError, KeyError):
+            return self.path.exists() and self.info.key == self.key
+        except (OSError, ValueError):
             return False
 
 
@@ -166,19 +177,19 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     for warning in fitted.warnings:
         console.say(f"warning: {warning}")
     model_file.save(model.path, fitted)
-    info = {
-        "key": model.key,
-        "seed": model.seed,
-        "samples": {"train": len(train), "validation": len(validation)},
-        "chosen_epoch": fitted.chosen_epoch,
-        "validation": {
-            "argmax": fitted.chosen.val_argmax,
-            "strict": fitted.chosen.val_strict,
-            "margin": fitted.chosen.val_margin,
-        },
-        "warnings": list(fitted.warnings),
-    }
-    write_json(model.info_path, info)
+    info = TrainedModel(
+        key=model.key,
+        seed=model.seed,
+        samples=ModelSamples(train=len(train), validation=len(validation)),
+        chosen_epoch=fitted.chosen_epoch,
+        validation=ValidationAccuracy(
+            argmax=fitted.chosen.val_argmax,
+            strict=fitted.chosen.val_strict,
+            margin=fitted.chosen.val_margin,
+        ),
+        warnings=fitted.warnings,
+    )
+    write_json(model.info_path, info.to_json())
     for left in model.path.parent.glob(f"{model.path.stem}.*.state"):
         left.unlink()
     return model.seed

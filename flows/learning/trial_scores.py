@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy.typing as npt
@@ -11,7 +10,6 @@ import numpy.typing as npt
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import (
-    TrialLatency,
     score_trial,
     summarise_latency,
     summarise_lead,
@@ -19,9 +17,8 @@ from sliplab.analysis.detectors.latency import (
 )
 from sliplab.protocols import Trial
 from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.evaluation import ExperimentScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
-
-Json = dict[str, Any]
 
 
 def score_row(
@@ -31,7 +28,7 @@ def score_row(
     counts: npt.NDArray[Any],
     end_ns: npt.NDArray[Any],
     settings: Detection,
-) -> Json:
+) -> TrialScore:
     """Onsets, detections and latency of a trial; ``latency`` is None without both onsets.
 
     Args:
@@ -43,31 +40,31 @@ def score_row(
     latency = None
     if slip is not None:
         tolerance = round(settings.false_early_ms * 1e6)
-        latency = asdict(score_trial(detections, slip, tolerance))
-    return {
-        "campaign": item.name,
-        "experiment": item.experiment,
-        "trial": trial.id,
-        "condition": item.plan.describe(trial),
-        "incipient_ns": label.incipient_ns,
-        "gross_ns": label.gross_ns,
-        "end_ns": None if slip is None else slip.end_ns,
-        "detected_incipient_ns": detections.incipient_ns,
-        "detected_gross_ns": detections.gross_ns,
-        "latency": latency,
-    }
+        latency = score_trial(detections, slip, tolerance)
+    return TrialScore(
+        campaign=item.name,
+        experiment=item.experiment,
+        trial=trial.id,
+        condition=item.plan.describe(trial),
+        incipient_ns=label.incipient_ns,
+        gross_ns=label.gross_ns,
+        end_ns=None if slip is None else slip.end_ns,
+        detected_incipient_ns=detections.incipient_ns,
+        detected_gross_ns=detections.gross_ns,
+        latency=latency,
+    )
 
 
-def summaries(rows: Sequence[Json]) -> dict[str, Json]:
+def summaries(rows: Sequence[TrialScore]) -> dict[str, ExperimentScores]:
     """Latency and lead by experiment, of rows of `score_row`."""
     result = {}
     for experiment in ("kinematic", "gravity", "disturbance"):
-        ours = [row for row in rows if row["experiment"] == experiment]
-        scored = [TrialLatency(**row["latency"]) for row in ours if row["latency"] is not None]
-        result[experiment] = {
-            "trials": len(ours),
-            "without_onsets": len(ours) - len(scored),
-            "latency_ms": summarise_latency(scored),
-            "lead_ms": summarise_lead(scored),
-        }
+        ours = [row for row in rows if row.experiment == experiment]
+        scored = [row.latency for row in ours if row.latency is not None]
+        result[experiment] = ExperimentScores(
+            trials=len(ours),
+            without_onsets=len(ours) - len(scored),
+            latency_ms=summarise_latency(scored),
+            lead_ms=summarise_lead(scored),
+        )
     return result

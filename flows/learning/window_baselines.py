@@ -22,6 +22,7 @@ from sliplab.flows.learning.samples import STEP as SAMPLES
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console
 from sliplab.flows.running.run_records import timed
+from sliplab.storage.schema.evaluation import BaselineResult, TrainedBaseline
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
@@ -53,14 +54,14 @@ def fresh_keys(store: Store) -> list[str]:
     return [key for name in NAMES if kept.fresh(name, key := _key(store, name))]
 
 
-def baselines(store: Store) -> dict[str, dict[str, Any]]:
+def baselines(store: Store) -> dict[str, TrainedBaseline]:
     """Compare each baseline in the store with the network, by name; see `window_scores.compared`.
 
     A network's figures of other windows than the baseline's are not compared.
     """
     kept = Derived.of(store, STEP)
     network = window_scores.kept_counts(store, Derived.of(store, EVALUATION).key(EVALUATION))
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, TrainedBaseline] = {}
     if network is None:
         return found
     for name in NAMES:
@@ -70,7 +71,7 @@ def baselines(store: Store) -> dict[str, dict[str, Any]]:
         if len(votes) != len(network["y"]):
             continue
         row = window_scores.compared(votes, network["counts"], network["y"], network["trial"])
-        found[name] = {**row, "made": kept.read(name)["made"]}
+        found[name] = TrainedBaseline(**dict(row), made=kept.load(name, BaselineResult).made)
     return found
 
 
@@ -120,11 +121,11 @@ def window_baselines(
             for name in stale:
                 console.say(f"{name}: {len(train)} training windows")
                 votes, made = _made(name, train, validation, test)
-                result = {"made": made, "argmax": metrics.accuracy(votes, test.y).argmax}
+                result = BaselineResult(made=made, argmax=metrics.accuracy(votes, test.y).argmax)
                 kept.write(name, _key(store, name), result, {"votes": votes})
     return {
         "step": "baselines",
         "done": len(stale),
         "fresh": len(NAMES) - len(stale),
-        "argmax": {name: kept.read(name)["argmax"] for name in NAMES},
+        "argmax": {name: kept.load(name, BaselineResult).argmax for name in NAMES},
     }

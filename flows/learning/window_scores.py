@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +28,17 @@ from sliplab.flows.learning.samples import (
     split_trials,
 )
 from sliplab.flows.learning.train import Model, training_settings
-from sliplab.storage.files import read_json
+from sliplab.storage.schema.evaluation import (
+    Baseline,
+    NoSlip,
+    SampleCounts,
+    Seeds,
+    SeedScores,
+    Spread,
+    Tenth,
+    WindowIntervals,
+    WindowScores,
+)
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -43,7 +52,7 @@ STEP = "windows"
 NAME = "test"
 
 
-def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) -> dict[str, Any]:
+def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) -> WindowScores:
     """All figures of the test windows; see docs/metrics.md.
 
     Args:
@@ -64,35 +73,36 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) ->
         },
     )  # fmt: skip
     cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
-    work = synaptic.count_work(fitted, test.windows)
-    return {
-        **metrics.score(counts, test.y, margin).as_dict(),
-        "interval": window_groups.share(hits, trial),
-        "reliability": reliability.by_lead(counts, test.y, trial),
-        "calibration": reliability.calibration(
+    by_tenth, no_slip = _phases(job.labels, known, test, trial, hits, settings.windows.length_ms)
+    return WindowScores(
+        **dict(metrics.score(counts, test.y, margin)),
+        interval=window_groups.share(hits, trial),
+        reliability=tuple(reliability.by_lead(counts, test.y, trial)),
+        calibration=reliability.calibration(
             counts,
             test.y,
             training.predict_counts(fitted, validation.windows),
             validation.y,
         ),
-        "by_factor": window_groups.by_factor(
+        by_factor=window_groups.by_factor(
             hits, trial, {k: item.plan.describe(of) for k, (item, of, _) in enumerate(known)}
         ),
-        **_phases(job.labels, known, test, trial, hits, settings.windows.length_ms),
-        "by_trial": window_groups.by_trial(counts, test.y, trial, lambda k: _named(known[k])),
-        "seeds": _seeds(job, test, margin),
-        "work": None if work is None else work.as_dict(),
-        "baselines": {name: score.argmax for name, score in cheap.items()},
-        "beside": {
+        by_tenth=by_tenth,
+        no_slip=no_slip,
+        by_trial=tuple(window_groups.by_trial(counts, test.y, trial, lambda k: _named(known[k]))),
+        seeds=_seeds(job, test, margin),
+        work=synaptic.count_work(fitted, test.windows),
+        baselines={name: score.argmax for name, score in cheap.items()},
+        beside={
             name: compared(score.votes, counts, test.y, trial) for name, score in cheap.items()
         },
-        "samples": {"train": len(train), "test": len(test)},
-    }
+        samples=SampleCounts(train=len(train), test=len(test)),
+    )
 
 
-def _named(of: TrialRef) -> dict[str, Any]:
+def _named(of: TrialRef) -> tuple[str, str, dict[str, str]]:
     item, trial, _ = of
-    return {"campaign": item.name, "trial": trial.id, "condition": item.plan.describe(trial)}
+    return item.name, trial.id, item.plan.describe(trial)
 
 
 def _phases(
@@ -102,7 +112,7 @@ def _phases(
     trial: npt.NDArray[np.int64],
     hits: npt.NDArray[np.float64],
     length_ms: int,
-) -> dict[str, Any]:
+) -> tuple[dict[str, tuple[Tenth, ...]], NoSlip]:
     """Recall by tenths of each class's phase, and of no slip before and during motion.
 
     A phase ends with the recording or where the next begins; a window belongs where its middle is.
@@ -123,38 +133,38 @@ def _phases(
                 fraction[ours] = (middle[ours] - begin) / (over - begin)
     still = test.y == metrics.NO_SLIP
     hold, loading = still & ~moving, still & moving
-    return {
-        "by_tenth": window_groups.by_tenth(hits, test.y, trial, fraction),
-        "no_slip": {
-            "hold": window_groups.share(hits[hold], trial[hold]),
-            "loading": window_groups.share(hits[loading], trial[loading]),
-        },
-    }
+    return (
+        window_groups.by_tenth(hits, test.y, trial, fraction),
+        NoSlip(
+            hold=window_groups.share(hits[hold], trial[hold]),
+            loading=window_groups.share(hits[loading], trial[loading]),
+        ),
+    )
 
 
-def _seeds(job: Job, test: SampleSet, margin: float) -> dict[str, Any]:
+def _seeds(job: Job, test: SampleSet, margin: float) -> Seeds:
     """Every trained seed on the same windows: each, and mean, lowest and highest."""
     rows = []
     for model in job.models:
         counts = training.predict_counts(model_file.load(model.path), test.windows)
-        found = asdict(metrics.accuracy(counts, test.y, margin))
+        found = metrics.accuracy(counts, test.y, margin)
         rows.append(
-            {
-                "seed": model.seed,
-                "chosen": model.seed == job.model.seed,
-                "validation_strict": read_json(model.info_path)["validation"]["strict"],
-                **{kind: found[kind] for kind in _KINDS},
-            }
+            SeedScores(
+                seed=model.seed,
+                chosen=model.seed == job.model.seed,
+                validation_strict=model.info.validation.strict,
+                **found.model_dump(exclude={"n"}),
+            )
         )
     spread = {}
     for kind in _KINDS:
-        values = [row[kind] for row in rows if row[kind] is not None]
-        spread[kind] = {
-            "mean": float(np.mean(values)) if values else None,
-            "min": min(values, default=None),
-            "max": max(values, default=None),
-        }
-    return {"each": rows, "spread": spread}
+        values = [value for row in rows if (value := getattr(row, kind)) is not None]
+        spread[kind] = Spread(
+            mean=float(np.mean(values)) if values else None,
+            min=min(values, default=None),
+            max=max(values, default=None),
+        )
+    return Seeds(each=tuple(rows), spread=spread)
 
 
 _KINDS = ("argmax", "strict", "margin")
@@ -170,21 +180,16 @@ def compared(
     counts: npt.NDArray[np.int64],
     y: npt.NDArray[np.int64],
     trial: npt.NDArray[np.int64],
-) -> dict[str, Any]:
-    """Another method's votes (n, 3) beside the network's counts, on the same windows.
-
-    Returns:
-        ``argmax`` accuracy of the method with its interval over trials, and ``network_ahead``: the
-        network's less the method's, of the same windows, with the interval of the difference.
-    """
+) -> Baseline:
+    """Compare another method's votes (n, 3) with the network's counts, on the same windows."""
     ours, theirs = window_groups.credit(counts, y), window_groups.credit(votes, y)
     found = window_groups.share(theirs, trial)
-    return {
-        "argmax": found["share"],
-        "low": found["low"],
-        "high": found["high"],
-        "network_ahead": window_groups.mean(ours - theirs, trial),
-    }
+    return Baseline(
+        argmax=found.share,
+        low=found.low,
+        high=found.high,
+        network_ahead=window_groups.mean(ours - theirs, trial),
+    )
 
 
 def kept_counts(store: Store, evaluated: str | None) -> dict[str, npt.NDArray[Any]] | None:
@@ -196,31 +201,27 @@ def kept_counts(store: Store, evaluated: str | None) -> dict[str, npt.NDArray[An
     return kept.arrays(NAME) if evaluated is not None and kept.fresh(NAME, evaluated) else None
 
 
-def window_intervals(store: Store, evaluated: str | None) -> dict[str, Any]:
-    """Accuracy, and incipient precision and recall, of the test windows with intervals over trials.
+def window_intervals(store: Store, evaluated: str | None) -> WindowIntervals | None:
+    """Intervals over trials of the test windows' figures; None where the evaluation kept none.
 
     Args:
         evaluated: the evaluation's key.
-
-    Returns:
-        what `analysis.metrics.window_groups.share` gives, by name; empty where the evaluation
-        kept none.
     """
     found = kept_counts(store, evaluated)
     if found is None:
-        return {}
+        return None
     return intervals_of(found["counts"], found["y"], found["trial"])
 
 
 def intervals_of(
     counts: npt.NDArray[np.int64], y: npt.NDArray[np.int64], trial: npt.NDArray[np.int64]
-) -> dict[str, Any]:
+) -> WindowIntervals:
     """The same of counts (n, 3) with their classes (n,) and trials (n,)."""
     said = metrics.winners(counts)
     true, called = y == metrics.INCIPIENT, said == metrics.INCIPIENT
     both = (true & called).astype(np.float64)
-    return {
-        "accuracy": window_groups.share(window_groups.credit(counts, y), trial),
-        "incipient_precision": window_groups.share(both[called], trial[called]),
-        "incipient_recall": window_groups.share(both[true], trial[true]),
-    }
+    return WindowIntervals(
+        accuracy=window_groups.share(window_groups.credit(counts, y), trial),
+        incipient_precision=window_groups.share(both[called], trial[called]),
+        incipient_recall=window_groups.share(both[true], trial[true]),
+    )

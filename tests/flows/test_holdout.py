@@ -76,7 +76,7 @@ def test_it_is_judged_once_a_version_and_written_down(
     first = measure_holdout(store, campaigns, 4, seeds=SEEDS)
     assert first["done"] == 0
     (line,) = first["result"]["evaluations"]
-    key, _ = evaluation_of(store)
+    key = evaluation_of(store).key
     assert key is not None
     assert line["model"] == first["result"]["model"]
     assert line["strict"] == first["result"]["windows"]["accuracy"]["strict"]

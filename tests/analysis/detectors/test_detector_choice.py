@@ -81,8 +81,10 @@ def test_a_share_is_a_whole_number_of_trials(rate: float, trials: int, allowed: 
 
 def scored(latency: float | None, early: bool = False) -> TrialLatency:
     return TrialLatency(
-        latency, None, None, None, None, latency is None and not early, True, early, False
-    )
+        latency_incipient_ms=latency, latency_gross_ms=None, lead_ms=None, late_incipient_ms=None,
+        late_gross_ms=None, missed_incipient=latency is None and not early, missed_gross=True,
+        false_early_incipient=early, false_early_gross=False,
+    )  # fmt: skip
 
 
 def test_a_missed_onset_is_late_and_a_false_one_is_left_out() -> None:

@@ -12,6 +12,7 @@ from sliplab.analysis.detectors.detector_comparison import Parts, compare, thinn
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip
 from sliplab.protocols.settings import Comparison, Detection, Windows
+from sliplab.storage.schema.evaluation import DetectorComparison, PartTrials
 
 MS = 1_000_000
 WINDOWS = Windows()
@@ -51,38 +52,38 @@ def compared() -> dict[str, object]:
     return found
 
 
-def test_every_detector_at_every_stride_and_rate(compared: dict) -> None:
-    assert compared["trials"] == {"train": 9, "validation": 10, "test": 10}
-    assert compared["strides_ms"] == [10, 30]
-    names = [(entry["name"], entry["stride_ms"]) for entry in compared["detectors"]]
+def test_every_detector_at_every_stride_and_rate(compared: DetectorComparison) -> None:
+    assert compared.trials == PartTrials(train=9, validation=10, test=10)
+    assert compared.strides_ms == (10, 30)
+    names = [(entry.name, entry.stride_ms) for entry in compared.detectors]
     assert len(names) == len(set(names)) == 16
     assert names[0] == ("smoothing", 30)
-    for entry in compared["detectors"]:
-        assert [rate["allowed"] for rate in entry["rates"]] == [0, 2]
-        for rate in entry["rates"]:
-            early = rate["validation"]["latency_ms"]["incipient"]["false_early"]
-            assert early <= rate["allowed"]
-            for split in ("validation", "test"):
-                values = rate[split]["latency_ms"]["incipient"]
-                assert values["n"] + values["missed"] + values["false_early"] == 10
-                assert len(rate[split]["false_early_before_ms"]) == values["false_early"]
-                assert all(before > 30 for before in rate[split]["false_early_before_ms"])
-                share = rate[split]["false_early_rate"]
-                assert share["low"] <= share["value"] == values["false_early"] / 10 <= share["high"]
-    json.dumps(compared, allow_nan=False)
+    for entry in compared.detectors:
+        assert [rate.allowed for rate in entry.rates] == [0, 2]
+        for rate in entry.rates:
+            early = rate.validation.latency_ms.incipient.false_early
+            assert early <= rate.allowed
+            for part in (rate.validation, rate.test):
+                values = part.latency_ms.incipient
+                assert values.n + values.missed + values.false_early == 10
+                assert len(part.false_early_before_ms) == values.false_early
+                assert all(before > 30 for before in part.false_early_before_ms)
+                share = part.false_early_rate
+                assert share.low <= share.value == values.false_early / 10 <= share.high
+    json.dumps(compared.to_json(), allow_nan=False)
 
 
-def test_what_adds_up_evidence_beats_the_average_here(compared: dict) -> None:
+def test_what_adds_up_evidence_beats_the_average_here(compared: DetectorComparison) -> None:
     late = {
-        (entry["name"], entry["stride_ms"]): entry["rates"][0]["test"]["median_with_missed_ms"]
-        for entry in compared["detectors"]
+        (entry.name, entry.stride_ms): entry.rates[0].test.median_with_missed_ms
+        for entry in compared.detectors
     }
     # independent windows of known distribution: what CUSUM and the filter are the best for
     assert late["hmm counts", 10] < late["smoothing", 30]
     assert late["cusum counts", 10] < late["smoothing", 30]
 
 
-def test_no_level_and_no_choice_knows_the_test_trials(compared: dict) -> None:
+def test_no_level_and_no_choice_knows_the_test_trials(compared: DetectorComparison) -> None:
     other = compare(
         Parts(parts().train, parts().validation, [trial(900, 10)]),
         WINDOWS,
@@ -91,10 +92,10 @@ def test_no_level_and_no_choice_knows_the_test_trials(compared: dict) -> None:
         WINDOWS.steps,
     )
     assert other is not None
-    for mine, theirs in zip(compared["detectors"], other["detectors"], strict=True):
-        for a, b in zip(mine["rates"], theirs["rates"], strict=True):
-            assert (a["levels"], a["choice"], a["validation"]) == (
-                b["levels"], b["choice"], b["validation"]
+    for mine, theirs in zip(compared.detectors, other.detectors, strict=True):
+        for a, b in zip(mine.rates, theirs.rates, strict=True):
+            assert (a.levels, a.choice, a.validation) == (
+                b.levels, b.choice, b.validation
             )  # fmt: skip
 
 
@@ -105,8 +106,8 @@ def test_one_stride_is_compared_once() -> None:
     )
     found = compare(few, WINDOWS, SETTINGS, 30, WINDOWS.steps)
     assert found is not None
-    assert found["strides_ms"] == [30]
-    assert len(found["detectors"]) == 8
+    assert found.strides_ms == (30,)
+    assert len(found.detectors) == 8
 
 
 def test_thinned_windows_are_the_consecutive_ones() -> None:

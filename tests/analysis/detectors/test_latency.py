@@ -77,9 +77,9 @@ def test_gross_slip_cried_while_the_plate_lies_still_is_not_detected() -> None:
     # the audit's case: 8 plates that rest, and a detector that says gross slip 0.3 to 2 s later
     after = (299, 480, 655, 810, 1100, 1400, 1700, 1959)
     trials = [judge(1400, 1800 + ms) for ms in after]
-    found = summarise_latency(trials)["gross"]
-    assert (found["n"], found["missed"], found["late"], found["false_early"]) == (0, 0, 8, 0)
-    assert found["mean"] is None
+    found = summarise_latency(trials).gross
+    assert (found.n, found.missed, found.late, found.false_early) == (0, 0, 8, 0)
+    assert found.mean is None
 
 
 def run(counts: np.ndarray) -> list[TrialLatency]:
@@ -94,24 +94,24 @@ def test_crying_incipient_at_once_earns_nothing() -> None:
     trials = run(np.tile([0, 9, 0], (60, 1)))
     assert all(t.false_early_incipient and t.missed_gross for t in trials)
     lead = summarise_lead(trials)
-    assert (lead["n"], lead["detected_first"], lead["false_early"]) == (0, 0, 20)
-    assert lead["mean"] is lead["min"] is lead["std"] is None
+    assert (lead.n, lead.detected_first, lead.false_early) == (0, 0, 20)
+    assert lead.mean is lead.min is lead.std is None
     latency = summarise_latency(trials)
-    assert latency["incipient"]["mean"] is None
-    assert latency["gross"]["missed"] == 20
+    assert latency.incipient.mean is None
+    assert latency.gross.missed == 20
 
 
 def test_a_silent_detector_misses_everything() -> None:
     trials = run(np.zeros((60, 3), int))
-    for summary in (*summarise_latency(trials).values(), summarise_lead(trials)):
-        assert (summary["n"], summary["missed"], summary["false_early"]) == (0, 20, 0)
+    for summary in (*dict(summarise_latency(trials)).values(), summarise_lead(trials)):
+        assert (summary.n, summary.missed, summary.false_early) == (0, 20, 0)
 
 
 def test_a_perfect_detector() -> None:
     trials = [judge(1000, 1500) for _ in range(5)]
     latency = summarise_latency(trials)
     for side in ("incipient", "gross"):
-        assert latency[side] == {
+        assert getattr(latency, side).to_json() == {
             **dict.fromkeys(("mean", "std", "median", "p95", "min", "max"), 0.0),
             "n": 5,
             "missed": 0,
@@ -119,24 +119,24 @@ def test_a_perfect_detector() -> None:
             "false_early": 0,
         }
     lead = summarise_lead(trials)
-    assert (lead["min"], lead["mean"], lead["std"], lead["detected_first"]) == (500, 500, 0, 5)
+    assert (lead.min, lead.mean, lead.std, lead.detected_first) == (500, 500, 0, 5)
 
 
 def test_statistics_in_closed_form() -> None:
     trials = [judge(1000 + 10 * k, None) for k in range(21)]  # 0, 10 .. 200
-    found = summarise_latency(trials)["incipient"]
-    assert (found["mean"], found["median"], found["min"], found["max"]) == (100, 100, 0, 200)
-    assert found["p95"] == pytest.approx(190)
-    assert found["std"] == pytest.approx(10 * np.sqrt(21 * 22 / 12))  # divisor n - 1
+    found = summarise_latency(trials).incipient
+    assert (found.mean, found.median, found.min, found.max) == (100, 100, 0, 200)
+    assert found.p95 == pytest.approx(190)
+    assert found.std == pytest.approx(10 * np.sqrt(21 * 22 / 12))  # divisor n - 1
 
 
 def test_one_value_has_no_spread() -> None:
-    found = summarise_latency([judge(1010, 1510)])["incipient"]
-    assert (found["mean"], found["std"], found["n"]) == (10, None, 1)
+    found = summarise_latency([judge(1010, 1510)]).incipient
+    assert (found.mean, found.std, found.n) == (10, None, 1)
 
 
 def test_no_trials() -> None:
-    text = json.dumps([summarise_latency([]), summarise_lead([])], allow_nan=False)
+    text = json.dumps([each.to_json() for each in (summarise_latency([]), summarise_lead([]))])
     assert json.loads(text)[1]["n"] == 0
 
 
@@ -147,11 +147,10 @@ moments = st.none() | st.integers(0, 3000)
 def test_every_trial_is_counted_once(found: list[tuple[int | None, int | None]]) -> None:
     trials = [judge(a, b) for a, b in found]
     lead = summarise_lead(trials)
-    for summary in (*summarise_latency(trials).values(), lead):
-        numbers = [summary[key] for key in ("n", "missed", "late", "false_early")]
-        assert sum(n for n in numbers if n is not None) == len(trials)
-        assert (summary["mean"] is None) == (summary["n"] == 0)
-    assert lead["detected_first"] == sum((t.lead_ms or 0) > 0 for t in trials)
+    for summary in (*dict(summarise_latency(trials)).values(), lead):
+        assert summary.n + summary.missed + summary.late + summary.false_early == len(trials)
+        assert (summary.mean is None) == (summary.n == 0)
+    assert lead.detected_first == sum((t.lead_ms or 0) > 0 for t in trials)
     assert all(t.lead_ms is None or t.lead_ms > 0 for t in trials)
 
 

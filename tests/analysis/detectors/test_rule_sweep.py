@@ -61,14 +61,14 @@ def test_pairs_and_figures_are_those_of_the_rule(found: list[Counted]) -> None:
             scored = [score_trial(one, t.slip, 30 * MS) for one, t in zip(said, found, strict=True)]
             latency, lead = summarise_latency(scored), summarise_lead(scored)
             figures, n = score(each[:, s, m], truth), len(found)
-            assert figures.mean_ms == pytest.approx(latency["incipient"]["mean"])
-            assert figures.p95_ms == pytest.approx(latency["incipient"]["p95"])
-            assert figures.gross_mean_ms == pytest.approx(latency["gross"]["mean"])
-            assert figures.lead_min_ms == pytest.approx(lead["min"])
+            assert figures.mean_ms == pytest.approx(latency.incipient.mean)
+            assert figures.p95_ms == pytest.approx(latency.incipient.p95)
+            assert figures.gross_mean_ms == pytest.approx(latency.gross.mean)
+            assert figures.lead_min_ms == pytest.approx(lead.min)
             for kind, suffix in (("incipient", ""), ("gross", "_gross")):
                 for name in ("missed", "late", "false_early"):
                     share = getattr(figures, f"{name}{suffix}")
-                    assert share * n == pytest.approx(latency[kind][name])
+                    assert share * n == pytest.approx(getattr(getattr(latency, kind), name))
             either = sum(t.false_early_incipient or t.false_early_gross for t in scored)
             assert figures.false_early_either * n == pytest.approx(either)
             lost = sum(any(t.uncounted[2:]) for t in scored)

@@ -76,7 +76,7 @@ def test_strict_and_margin_only_take_away(rows: list[tuple[int, ...]]) -> None:
 def test_confusion_precision_and_recall() -> None:
     counts, labels = arrays()
     result = score(counts, labels)
-    assert result.confusion.tolist() == [[2, 0, 0, 0], [0, 1, 0, 1], [1, 0, 0, 2]]
+    assert result.confusion == ((2, 0, 0, 0), (0, 1, 0, 1), (1, 0, 0, 2))
     assert result.precision == {"no_slip": 2 / 3, "incipient": 1.0, "gross": None}
     assert result.recall == {"no_slip": 1.0, "incipient": 1 / 2, "gross": 0.0}
     assert result.balance == {"no_slip": 2 / 7, "incipient": 2 / 7, "gross": 3 / 7}
@@ -91,7 +91,7 @@ def test_no_samples_give_none_and_plain_json() -> None:
     result = score(np.zeros((0, 3), int), np.zeros(0, int))
     assert result.accuracy.argmax is result.accuracy.strict is result.accuracy.margin is None
     assert set(class_balance(np.zeros(0, int)).values()) == {None}
-    text = json.dumps(result.as_dict(), allow_nan=False)
+    text = json.dumps(result.to_json(), allow_nan=False)
     assert json.loads(text)["confusion"] == [[0] * 4] * 3
 
 

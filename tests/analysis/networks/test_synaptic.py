@@ -75,12 +75,12 @@ def test_operations_are_those_of_sinabs_spikes_followed_one_by_one(biases: bool)
                 spikes[name] = float(signal.double().sum()) / len(x)
     reset_states(net)
     assert min(spikes.values()) > 0
-    assert found.synaptic == pytest.approx(synapses, rel=1e-12)
+    every = sum(synapses.values())
+    assert found.synaptic_operations == pytest.approx({**synapses, "all": every}, rel=1e-12)
     assert found.spikes == pytest.approx(spikes, rel=1e-12)
-    assert found.dense == dense
+    assert found.dense_multiply_adds == {**dense, "all": sum(dense.values())}
     assert found.events == pytest.approx(x.sum() / len(x))
-    said = found.as_dict()
-    assert said["share"] == pytest.approx(sum(synapses.values()) / sum(dense.values()))
+    assert found.share == pytest.approx(every / sum(dense.values()))
     assert found.rates["iaf4"] == pytest.approx(spikes["iaf4"] / (8 * 12))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.metrics import classification as metrics
-from sliplab.analysis.metrics.classification import CLASSES, Scores, score
+from sliplab.analysis.metrics.classification import CLASSES, score
 from sliplab.analysis.networks.training import Fitted, fit
 from sliplab.analysis.networks.window_checks import (
     Chance,
@@ -18,6 +18,7 @@ from sliplab.analysis.networks.window_checks import (
 )
 from sliplab.analysis.windows.sparse import SparseWindows
 from sliplab.protocols.settings import Network, Training, Windows
+from sliplab.storage.schema.evaluation import Classification
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -93,7 +94,7 @@ def test_permuted_outputs_change_no_figure(fitted: Fitted) -> None:
 def test_an_argmax_that_favours_class_0_is_found_out() -> None:
     """What the first version of many evaluations does with a silent network."""
 
-    def naive(counts: np.ndarray, labels: np.ndarray) -> Scores:
+    def naive(counts: np.ndarray, labels: np.ndarray) -> Classification:
         votes = np.eye(3, dtype=int)[counts.argmax(axis=1)]
         return score(votes, labels)
 

@@ -63,7 +63,7 @@ def test_the_papers_network_is_judged_by_its_own_rule(store: Store) -> None:
     assert (fitted.network.outputs_per_class, fitted.network.biases) == (1, False)
     test = load_samples(Labels(store), campaigns, "test")
     counts = spike_counts(restore(fitted), test.x)
-    expected = metrics.score(counts, test.y, 2.0).as_dict()
+    expected = metrics.score(counts, test.y, 2.0).to_json()
     assert {name: found["windows"][name] for name in expected} == json.loads(json.dumps(expected))
     assert len(found["trials"]) == 4
     assert (
@@ -88,7 +88,7 @@ def test_the_preset_by_itself_is_the_network_that_stood_beside(
     models = alone.folder / "models"
     assert (models / "seed0.pt").read_bytes() == (models / "paper-seed0.pt").read_bytes()
     assert evaluate(alone, campaigns)["done"] == 1
-    _, found = evaluation_of(alone)
+    found = evaluation_of(alone).to_json()
     assert found["windows"]["accuracy"] == comparison["windows"]["accuracy"]
     assert found["trials"] == comparison["trials"]
     report(alone, campaigns)
@@ -107,7 +107,7 @@ def test_a_labs_weights_of_tenths_are_counted_by_sinabs_itself(
     net = papers(0.1, cells=20, steps=30)
     test = load_samples(Labels(store), campaigns, "test")
     expected = by_hand(net, test.x, 16)
-    assert said["accuracy"] == vars(metrics.accuracy(expected, test.y, 2.0))
+    assert said["accuracy"] == metrics.accuracy(expected, test.y, 2.0).to_json()
     assert len(np.unique(expected, axis=0)) > 3
     for item in campaigns:
         kept = Derived.of(store, "counts-model-lab", item.name)

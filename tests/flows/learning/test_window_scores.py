@@ -55,12 +55,12 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
         t.index for t, _ in campaigns[1].of_split("test")
     ]
     assert evaluate(two, campaigns, reviewed=True)["done"] == 1
-    key, found = evaluation_of(two)
+    found = evaluation_of(two)
     first, second = ([t.id for t, _ in item.of_split("test")] for item in campaigns)
-    rows = {(row["campaign"], row["trial"]): row["n"] for row in found["windows"]["by_trial"]}
+    rows = {(row.campaign, row.trial): row.n for row in found.windows.by_trial}
     expected = {("first", first[0]), *(("second", name) for name in second)}
     assert rows.keys() == expected
-    kept = kept_counts(two, key)
+    kept = kept_counts(two, found.key)
     assert kept is not None
     labels = Labels(two, reviewed=True)
     trials = [tuple(names) for names in kept["trials"].tolist()]
@@ -75,14 +75,14 @@ def test_a_trial_without_samples_gets_none_of_another_campaign(two: Store) -> No
 def test_windows_and_trials_are_judged_by_one_margin(two: Store, margin: float) -> None:
     """Another margin once changed the detections, and not the margin accuracy beside them."""
     assert evaluate(two, collected(two), margin=margin, reviewed=True)["done"] == 1
-    key, found = evaluation_of(two)
-    assert {rule["margin"] for rule in found["detection"].values()} == {margin}
-    kept = kept_counts(two, key)
+    found = evaluation_of(two)
+    assert {rule.margin for rule in found.detection.values()} == {margin}
+    kept = kept_counts(two, found.key)
     assert kept is not None
     expected = metrics.accuracy(kept["counts"], kept["y"], margin).margin
-    assert found["windows"]["accuracy"]["margin"] == expected
-    (seed,) = found["windows"]["seeds"]["each"]
-    assert seed["margin"] == expected
+    assert found.windows.accuracy.margin == expected
+    (seed,) = found.windows.seeds.each
+    assert seed.margin == expected
     assert expected != metrics.accuracy(kept["counts"], kept["y"], 8.0).margin
 
 

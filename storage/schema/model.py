@@ -1,0 +1,32 @@
+"""The document beside a model file: what the network was trained on, and how it did."""
+
+from __future__ import annotations
+
+from sliplab.storage.schema.document import Document, Int, Number, Part
+
+
+class ModelSamples(Part):
+    """Windows of each part of the split."""
+
+    train: Int
+    validation: Int
+
+
+class ValidationAccuracy(Part):
+    """Accuracies on validation windows at the chosen epoch; null where there are none."""
+
+    argmax: Number | None
+    strict: Number | None
+    margin: Number | None
+
+
+class TrainedModel(Document):
+    """What `train` keeps of one seed."""
+
+    key: str
+    """Of what the network was trained on, and by which settings."""
+    seed: Int
+    samples: ModelSamples
+    chosen_epoch: Int
+    validation: ValidationAccuracy
+    warnings: tuple[str, ...] = ()
