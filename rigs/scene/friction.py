@@ -234,5 +234,8 @@ def slip_direction(fx, fy, to_x, to_y, ux, uy, after):  # type: ignore[no-untype
     length = np.sqrt(x * x + y * y)
     between = x * mean_x + y * mean_y > length * (ux * mean_x + uy * mean_y) * _BETWEEN
     x, y = (x, y) if between else (mean_x, mean_y)
-    scale = 1.0 / np.sqrt(x * x + y * y)
+    square = x * x + y * y
+    # a cone that vanishes lets the force turn right round at once: then there is no half-way
+    x, y, square = (x, y, square) if square > 0.0 else (ux, uy, 1.0)
+    scale = 1.0 / np.sqrt(square)
     return x * scale, y * scale

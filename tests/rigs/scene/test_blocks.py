@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numba import njit
 
@@ -96,6 +96,15 @@ def both(
     ),
     steps=st.sampled_from([1, 7, 60, 400]),
     h=st.sampled_from([1e-4, 2e-3, 0.1]),
+)  # fmt: skip
+@example(
+    # a tip is pushed straight back while its normal force vanishes
+    seed=0, level=2, off=None, exact_turns=True, variation=0.0,
+    waypoints=[
+        (0.0, 1.0, 1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.25, 0.03125, 0.0, 0.0),
+        (0.0, 4.0, 2.0, 0.03125, 0.0, 0.0),
+    ],
+    steps=1, h=0.1,
 )  # fmt: skip
 def test_tips_that_share_a_block_are_as_alone(
     seed: int,
