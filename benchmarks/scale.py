@@ -19,11 +19,11 @@ import numpy.typing as npt
 
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
 from benchmarks.trials import run_session
+from sliplab.analysis.clocks.refit import fit_again
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.network import build, weights
 from sliplab.analysis.windows import dataset
-from sliplab.flows.syncing.sync_fit import fit_again
 from sliplab.protocols import load_plan
 from sliplab.storage.remote.manifest import trial_manifest
 from sliplab.storage.remote.objects import Remote

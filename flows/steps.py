@@ -9,7 +9,7 @@ from typing import Any
 from sliplab.flows.running import console
 
 STEPS = {
-    "sync": "sliplab.flows.syncing.sync",
+    "sync": "sliplab.flows.sync",
     "label": "sliplab.flows.labelling.label",
     "train": "sliplab.flows.learning.train",
     "evaluate": "sliplab.flows.learning.evaluate",

@@ -34,7 +34,7 @@ from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.searching.tradeoff import tradeoff
 from sliplab.flows.study_ledger import Ledger, Row
-from sliplab.flows.syncing.sync import sync
+from sliplab.flows.sync import sync
 from sliplab.flows.tradeoff import tradeoff_detector
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.derived import Derived, make_key

@@ -132,7 +132,7 @@ def _environment() -> Environment:
 
 
 def render_page(
-    template: str, sections: Sequence[Content], *, simulated: bool, **values: object
+    template: str, sections: Sequence[Content] = (), *, simulated: bool, **values: object
 ) -> str:
     """Render a page of sections under the top that `template` and its `values` give it.
 

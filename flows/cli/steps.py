@@ -48,7 +48,7 @@ def sync(
     if as_json:
         console.print_json(result)
         return
-    from sliplab.flows.syncing.sync import COLUMNS, tables
+    from sliplab.flows.sync import COLUMNS, tables
 
     for title, rows in tables(result):
         console.print_table(title, COLUMNS, rows)

@@ -97,7 +97,7 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class Gate:
+class GateLine:
     """A limit over the trials from `first` to `last`."""
 
     first: float
@@ -118,7 +118,7 @@ class OverTrials:
 
     label: str
     series: Mapping[str, tuple[str, Sequence[float], Sequence[float]]]
-    gates: Sequence[Gate] = ()
+    gates: Sequence[GateLine] = ()
     logarithmic: bool = False
     whole: bool = False
 

@@ -1,6 +1,7 @@
 """One trial's clocks fitted again, and held against its record.
 
-Runs in processes of its own, so nothing here loads what only the command line needs.
+A trial's clocks are fitted when it is taken, by the program of that day. Where fitting has improved
+since, the new clocks stand among the derived results; the record stays as it was committed.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import numpy as np
 
 from sliplab.analysis.clocks import synchronise
 from sliplab.storage.schema.trial import SyncResult
+from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import SYNC
 
 POINTS = 200
 """So many residuals are kept of a device in a trial, evenly spread over it."""
@@ -22,14 +25,22 @@ _SAME_DRIFT = 10**6
 """Parts in 10**18: a nanosecond over a quarter of an hour."""
 
 
+def sync_key(recording: Recording) -> str:
+    """Return the key of a trial's clocks, fitted again."""
+    return make_key(SYNC, synchronise.VERSION, recording.raw_checksum, None)
+
+
 def fit_again(recording: Recording, _: None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What is kept of a trial: JSON, with other clocks than the record's if there are, and
-    residuals.
+    """Fit the clocks of a trial.
+
+    Returns:
+        a `SyncResult` as JSON, with clocks where they differ from the record's; and residuals over
+        the trial's time by device, ``NAME_s`` and ``NAME_us``.
     """
     found = synchronise.synchronise_recording(recording)
     clocks, known = found.record(), recording.record.clocks
     data: dict[str, Any] = {"raw": recording.raw_checksum, "refused": found.refused}
-    # a clock that is refused now is told to people; it is no better one
+    # a clock that is refused now is reported; the record's is no worse
     if known.devices().keys() <= found.devices.keys() and not same_clocks(
         clocks.to_json(), known.to_json()
     ):
@@ -38,7 +49,6 @@ def fit_again(recording: Recording, _: None) -> tuple[dict[str, Any], dict[str, 
 
 
 def _residuals(found: synchronise.TrialSync) -> dict[str, Any]:
-    """Residuals over the trial's time by device: ``NAME_s`` and ``NAME_us``."""
     fits = {name: device.fit for name, device in found.devices.items() if device.fit is not None}
     begin = min((int(fit.pulse_ns[0]) for fit in fits.values()), default=0)
     arrays: dict[str, Any] = {}
@@ -50,7 +60,7 @@ def _residuals(found: synchronise.TrialSync) -> dict[str, Any]:
 
 
 def same_clocks(one: Any, other: Any, name: str = "") -> bool:
-    """Whether two trials' clocks, as JSON, agree in every map and figure.
+    """Check that two trials' clocks, as JSON, agree in every map and figure.
 
     Processors differ in the last digit of a float, which is no other fit.
     """

@@ -12,13 +12,13 @@ import pytest
 
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.clocks import synchronise
+from sliplab.analysis.clocks.refit import fit_again, same_clocks
 from sliplab.analysis.report.summary import sync_part
 from sliplab.flows.__main__ import main
 from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import make_request
-from sliplab.flows.syncing.sync import sync
-from sliplab.flows.syncing.sync_fit import fit_again, same_clocks
+from sliplab.flows.sync import sync
 from sliplab.storage.files import read_json, sha256, write_json
 from sliplab.storage.trials.catalogue import catalogue
 from sliplab.storage.trials.checksums import CHECKSUMS, RECORD

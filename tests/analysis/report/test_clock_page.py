@@ -12,9 +12,9 @@ import pytest
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report import clocks
+from sliplab.analysis.report.clock_page import render
+from sliplab.analysis.report.clock_trials import DeviceClocks, TrialClocks
 from sliplab.analysis.report.figures.clocks import pooled
-from sliplab.flows.syncing.sync_page import render
-from sliplab.flows.syncing.sync_trials import DeviceClocks, TrialClocks
 from sliplab.storage.files import write_json
 from sliplab.storage.schema.summary import Sync
 from sliplab.storage.trials.checksums import RECORD

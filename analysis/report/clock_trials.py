@@ -1,22 +1,25 @@
-"""What is known of every trial's clocks, in one row a trial: for the page and for the tables."""
+"""Clocks of every trial, one row a trial and device, and a campaign's in a few numbers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.storage.schema.trial import Clocks, Gate, SyncResult
+from sliplab.storage.schema.trial import DEVICES, Clocks, Gate, SyncResult
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import SYNC, Store
 
 F64 = npt.NDArray[np.float64]
+
+PULSES = ("missed", "late", "spurious")
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ class TrialClocks:
 
 
 def read_trials(store: Store, item: Collected) -> list[TrialClocks]:
-    """The trials of a campaign, in the order in which they were taken."""
+    """Read the trials of a campaign, in the order in which they were taken."""
     results = Derived.of(store, SYNC, item.name)
     taken = sorted(
         (recording for _, recording in item.trials),
@@ -124,14 +127,80 @@ def _device(clocks: Clocks, gates: Mapping[str, Gate], name: str) -> DeviceClock
     both = clocks.against_events_ns(name)
     gate = gates.get(f"sync_uncertainty_{name}_s")
     limit = None if gate is None else gate.limit
-    kinds = ("seen", "missed", "late", "spurious")
     # through the host, the recorded drift is of one step of the way
     drift_ppm = known.drift_ppm if known.wired else None
+    pulses = {kind: getattr(known, f"pulses_{kind}") for kind in ("seen", *PULSES)}
     return DeviceClocks(
         known.grade,
         known.kind or "",
         math.nan if both is None else both / 1e3,
         None if limit is None else 1e6 * limit,
         known.map.drift_ppm() if drift_ppm is None else drift_ppm,
-        {kind: getattr(known, f"pulses_{kind}") for kind in kinds} if known.wired else None,
+        pulses if known.wired else None,
+    )
+
+
+@dataclass(frozen=True)
+class DeviceNumbers:
+    """One device in all trials of a campaign that have it.
+
+    Attributes:
+        uncertainty_us: ``median`` and ``worst``, of events against it.
+        drift_ppm: least and most.
+        pulses: by `PULSES`; None without a wire.
+    """
+
+    grade: str
+    kind: str
+    trials: int
+    uncertainty_us: Mapping[str, float]
+    gates_us: Sequence[float]
+    drift_ppm: Sequence[float]
+    pulses: Mapping[str, int] | None
+
+
+@dataclass(frozen=True)
+class CampaignClocks:
+    """A campaign's clocks: how many trials were fitted again now, and what came of it."""
+
+    refitted: int
+    trials: int
+    changed: int
+    refused: int
+    devices: Mapping[str, DeviceNumbers]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return asdict(self)
+
+
+def campaign_clocks(trials: Sequence[TrialClocks], refitted: int = 0) -> CampaignClocks:
+    """Summarise a campaign's clocks by device."""
+    devices = {}
+    for name in DEVICES:
+        there = [trial.devices[name] for trial in trials if name in trial.devices]
+        if there:
+            devices[name] = _numbers(there)
+    return CampaignClocks(
+        refitted=refitted,
+        trials=len(trials),
+        changed=sum(trial.changed for trial in trials),
+        refused=sum(bool(trial.refused) for trial in trials),
+        devices=devices,
+    )
+
+
+def _numbers(there: Sequence[DeviceClocks]) -> DeviceNumbers:
+    uncertainty = [device.against_events_us for device in there]
+    drift = [device.drift_ppm for device in there]
+    wired = [device.pulses for device in there if device.pulses is not None]
+    counts = {kind: sum(pulses[kind] for pulses in wired) for kind in PULSES}
+    return DeviceNumbers(
+        grade=" or ".join(sorted({device.grade for device in there})),
+        kind=" or ".join(sorted({device.kind for device in there})),
+        trials=len(there),
+        uncertainty_us={"median": float(np.median(uncertainty)), "worst": max(uncertainty)},
+        gates_us=sorted({device.gate_us for device in there if device.gate_us is not None}),
+        drift_ppm=[min(drift), max(drift)],
+        pulses=counts if wired else None,
     )

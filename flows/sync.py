@@ -1,4 +1,4 @@
-"""Fitting the clocks of every committed trial again, and showing what they are worth.
+"""`sliplab sync`: fit the clocks of every committed trial again, and show how good they are.
 
 A trial's clocks are fitted when it is taken, by the program of that day. When fitting has improved
 since, this step makes them again from the raw streams. The record stays as it was committed; where
@@ -8,32 +8,30 @@ its results become stale exactly then.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.clocks import synchronise
+from sliplab.analysis.clocks.refit import fit_again, sync_key
+from sliplab.analysis.report.clock_page import render
+from sliplab.analysis.report.clock_trials import TrialClocks, campaign_clocks, read_trials
 from sliplab.analysis.report.clocks import PAGE
 from sliplab.flows.running import console
 from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
-from sliplab.flows.syncing.sync_fit import fit_again
-from sliplab.flows.syncing.sync_numbers import campaign_numbers
-from sliplab.flows.syncing.sync_page import render
-from sliplab.flows.syncing.sync_trials import TrialClocks, read_trials
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
-from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import SYNC, Store
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
 
 PAGE_VERSION = 1
-
-
-def sync_key(recording: Recording) -> str:
-    """The key of a trial's clocks, fitted again."""
-    return make_key(SYNC, synchronise.VERSION, recording.raw_checksum, None)
+COLUMNS = (
+    "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
+)  # fmt: skip
+"""Of the tables for a terminal; uncertainties are of events against the device, both clocks
+together; of events, their own."""
 
 
 def sync(
@@ -51,31 +49,30 @@ def sync(
         work.recording.forget_clocks()
     trials = {item.name: read_trials(store, item) for item in campaigns}
     page = _write_page(store, campaigns, wanted, trials)
-    fitted = {item.name: sum(work.campaign == item.name for work in stale) for item in campaigns}
-    numbers = {
-        name: {"refitted": fitted[name], **campaign_numbers(found)}
-        for name, found in trials.items()
+    found = {
+        name: campaign_clocks(of, sum(work.campaign == name for work in stale))
+        for name, of in trials.items()
     }
-    for name, found in trials.items():
-        for trial in found:
+    for name, of in trials.items():
+        for trial in of:
             if trial.refused:
                 console.say(f"warning: {name}: {trial.name}: {trial.doubt}")
     return {
         "step": SYNC,
         "done": len(stale),
         "fresh": len(wanted) - len(stale),
-        "changed": sum(known["changed"] for known in numbers.values()),
+        "changed": sum(known.changed for known in found.values()),
         "simulated": store.simulated,
         "page": str(page),
-        "campaigns": numbers,
+        "campaigns": {name: known.to_json() for name, known in found.items()},
     }
 
 
 def _write_page(
     store: Store,
-    campaigns: list[Collected],
-    wanted: list[TrialWork],
-    trials: dict[str, list[TrialClocks]],
+    campaigns: Sequence[Collected],
+    wanted: Sequence[TrialWork],
+    trials: Mapping[str, Sequence[TrialClocks]],
 ) -> Path:
     path = store.folder / "report" / PAGE
     quarantined = [[item.name, item.campaign.quarantined()] for item in campaigns]
@@ -90,30 +87,19 @@ def _write_page(
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """What `sliplab sync` prints of every campaign: a title, and rows under `COLUMNS`."""
+    """Return for each campaign a title, and rows under `COLUMNS`, of a result of `sync`."""
     found = []
     simulated = " (simulated)" if result["simulated"] else ""
     for campaign, known in result["campaigns"].items():
         rows = []
         for device, numbers in known["devices"].items():
             drift, pulses = numbers["drift_ppm"], numbers["pulses"]
-            rows.append(
-                [
-                    device,
-                    numbers["grade"],
-                    f"{numbers['uncertainty_us']['median']:.1f}",
-                    f"{numbers['uncertainty_us']['worst']:.1f}",
-                    f"{drift[0]:.1f} to {drift[1]:.1f}",
-                    "-" if pulses is None else " / ".join(map(str, pulses.values())),
-                ]
-            )
+            rows.append([
+                device, numbers["grade"], f"{numbers['uncertainty_us']['median']:.1f}",
+                f"{numbers['uncertainty_us']['worst']:.1f}", f"{drift[0]:.1f} to {drift[1]:.1f}",
+                "-" if pulses is None else " / ".join(map(str, pulses.values())),
+            ])  # fmt: skip
         trials = f"{known['trials']} trials, {known['refitted']} refitted"
         title = f"Clocks of {campaign}{simulated}: {trials}, {known['changed']} changed"
         found.append((title, rows))
     return found
-
-
-COLUMNS = (
-    "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
-)  # fmt: skip
-"""Uncertainties are of events against the device, both clocks together; of events, their own."""

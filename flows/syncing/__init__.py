@@ -1,1 +1,0 @@
-"""Clocks of stored trials fitted again, and the page that shows what they are worth."""
