@@ -1,7 +1,7 @@
-"""What `import sliplab` offers: stores, trials as arrays, and every step of the work as a call.
+"""The public interface of `import sliplab`: stores, trials as arrays, and each step as a call.
 
 A trial's arrays share one time line: int64 nanoseconds of the trial's sync box. Raw device times
-stay in the store (`storage.trials.recording.Recording`), for whoever needs them.
+stay in the store (`storage.trials.recording.Recording`), for those who need them.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Trial:
 
     @property
     def simulated(self) -> bool:
-        """Whether a simulated rig made this trial."""
+        """True if a simulated rig made this trial."""
         return self.recording.simulated
 
     def events(self, start_ns: int | None = None, end_ns: int | None = None) -> Events:

@@ -52,7 +52,7 @@ from sliplab.storage.files import sha256
 from sliplab.storage.streams import EventChunk, PulseChunk, Unheeded
 
 POLL_S = 0.005
-"""How often the streams are read."""
+"""Period of reading the streams, s."""
 SHOWN = 6
 """Conditions that a message names."""
 

@@ -18,7 +18,7 @@ STEPS = {
     "window_checks": "sliplab.flows.learning.window_checks",
     "report": "sliplab.flows.report",
 }
-"""Where each step stands: the module whose function has the step's name."""
+"""The module of each step; its function has the step's name."""
 
 
 def prepare_store(folder: Path) -> None:

@@ -58,7 +58,7 @@ def check(
     enable: EnableOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Look at everything that can be known before anything moves."""
+    """Check everything that can be known before anything moves."""
     from sliplab.flows.planning import preflight
 
     found = preflight.check(protocol, rig, store, tuple(enable or ()))
@@ -84,17 +84,20 @@ def collect(
         ),
     ] = None,
     campaign: Annotated[
-        str | None, typer.Option("--campaign", help="Its name; the protocol's by default.")
+        str | None,
+        typer.Option("--campaign", help="Name of the campaign; the protocol's by default."),
     ] = None,
-    operator: Annotated[str, typer.Option("--operator", help="Who stands at the rig.")] = "",
+    operator: Annotated[
+        str, typer.Option("--operator", help="Name of the operator at the rig.")
+    ] = "",
     temperature: Annotated[
         float | None,
-        typer.Option("--temperature", min=-50, max=100, help="Of the room, degrees Celsius."),
+        typer.Option("--temperature", min=-50, max=100, help="Room temperature, degrees Celsius."),
     ] = None,
     humidity: Annotated[
-        float | None, typer.Option("--humidity", min=0, max=100, help="Relative, percent.")
+        float | None, typer.Option("--humidity", min=0, max=100, help="Relative humidity, percent.")
     ] = None,
-    note: Annotated[str, typer.Option("--note", help="Anything worth keeping.")] = "",
+    note: Annotated[str, typer.Option("--note", help="A note to store with the session.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """Take the trials that the store lacks. Ctrl-C stops the arm; run it again to go on."""
@@ -116,7 +119,7 @@ def collect(
     check_disk([run_request])
     prepare_store(store)
     if run_request.wanted(Store(store).campaign(run_request.campaign)):
-        orchestration.begin()  # starts beside all that is imported below
+        orchestration.begin()  # starts while the imports below load
     from sliplab.flows.collect import collect as run
 
     result = run(run_request)

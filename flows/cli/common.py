@@ -1,4 +1,4 @@
-"""What the commands share: their options, and how they run a step and print what came of it."""
+"""Options that commands share, and functions to run a step and print its result."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ EnableOption = Annotated[
     list[str] | None, typer.Option("--enable", help="Switch an optional level on: factor=level.")
 ]
 CampaignOption = Annotated[
-    list[str] | None, typer.Option("--campaign", help="Only this campaign; may be given again.")
+    list[str] | None, typer.Option("--campaign", help="Only this campaign. Repeatable.")
 ]
 
 
 def located(place: str) -> Path:
-    """The folder of a store: itself, or the mirror of a URL, brought up to date.
+    """Return a store's folder: the folder itself, or the updated mirror of a URL.
 
     Raises:
         StoreError: there is none.
@@ -59,12 +59,12 @@ def located(place: str) -> Path:
 
 
 def step(place: str, names: list[str] | None, as_json: bool, step: str, **options: Any) -> None:
-    """Run one analysis step on a store and print what it did."""
+    """Run one analysis step on a store and print its result."""
     finish(run_step(located(place), names, step, **options), f"{step} {place}", as_json)
 
 
 def finish(result: dict[str, Any], title: str, as_json: bool) -> None:
-    """Print what a command did, as one JSON object or for a person."""
+    """Print a command's result, as one JSON object or for a person."""
     if as_json:
         console.print_json(result)
         return

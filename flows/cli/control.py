@@ -26,12 +26,13 @@ WhyOption = Annotated[str, typer.Option("--why", help="The reason, kept with the
 NeededWhyOption = Annotated[
     str, typer.Option("--why", help="The reason, kept with the trial.", show_default=False)
 ]
-WhoOption = Annotated[str, typer.Option("--who", help="Who asks; the user's name by default.")]
+WhoOption = Annotated[str, typer.Option("--who", help="Your name; the user's name by default.")]
 WaitOption = Annotated[
-    float, typer.Option("--wait", min=0, max=86400, help="How long to wait for it, s.")
+    float,
+    typer.Option("--wait", min=0, max=86400, help="How long to wait until it is carried out, s."),
 ]
 CampaignOption = Annotated[
-    str | None, typer.Option("--campaign", help="Whose trials, where several have them.")
+    str | None, typer.Option("--campaign", help="The campaign, if several have the trials.")
 ]
 
 
@@ -40,7 +41,7 @@ def pause(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Let the trial that runs come to its end, then stand still; returns when it stands still."""
+    """Pause after the trial that runs; returns when the collection is paused."""
     outcome = _request(store, "pause", who, why, wait)
     _finish([outcome], as_json, _pause_words(store, outcome))
 
@@ -50,7 +51,7 @@ def resume(
     store: StoreArgument, why: WhyOption = "", who: WhoOption = "", wait: WaitOption = 60.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Go on after a pause."""
+    """Resume after a pause."""
     outcome = _request(store, "resume", who, why, wait)
     running = outcome.answer is not None and outcome.answer["did"].get("running")
     words = f"{store} is not paused any more" + ("; the collection goes on" if running else "")
@@ -81,7 +82,7 @@ def skip(
     campaign: CampaignOption = None, who: WhoOption = "", wait: WaitOption = 600.0,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Set trials aside: no collection takes them until `sliplab again` asks for them."""
+    """Skip trials: no collection takes them until `sliplab again` asks for them."""
     _decide(store, "skip", trials, campaign, who, why, wait, as_json)
 
 
@@ -135,7 +136,7 @@ def _pause_words(store: Path, outcome: Outcome) -> str:
 
 
 def _finish(outcomes: list[Outcome], as_json: bool, words: str) -> None:
-    """Print what came of it; exit 1 while it is not done."""
+    """Print the outcomes; exit 1 while a request is open."""
     done = all(outcome.answer is not None for outcome in outcomes)
     if as_json:
         found = [outcome.as_json() for outcome in outcomes]
@@ -159,16 +160,16 @@ def serve(
         Path | None, typer.Argument(help="A file of schedules (YAML): nights, weekends.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Of the deployments; the rig's by default.")
+        str | None, typer.Option("--name", help="Name of the deployments; the rig's by default.")
     ] = None,
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="Of the embedded server's page; 0: any.")
     ] = 4200,
     poll: Annotated[
-        float, typer.Option("--poll", min=0.2, max=60, help="Look for new runs so often, s.")
+        float, typer.Option("--poll", min=0.2, max=60, help="Period of looking for new runs, s.")
     ] = 3.0,
     check: Annotated[
-        bool, typer.Option("--check", help="Read the file, say what would run when, and end.")
+        bool, typer.Option("--check", help="Read the file, print what would run when, and end.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

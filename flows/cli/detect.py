@@ -46,14 +46,14 @@ def detect(
         int | None, typer.Option("--smoothing", min=1, max=1000, help="Windows to average over.")
     ] = None,
     poll: Annotated[
-        float, typer.Option("--poll", min=1, max=200, help="Read the streams so often, ms.")
+        float, typer.Option("--poll", min=1, max=200, help="Period of reading the streams, ms.")
     ] = 5.0,
     out: Annotated[
         Path | None, typer.Option("--out", help="Decisions as JSON lines, while it runs.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
+    """Print what happens at the sensor while it happens. Ctrl-C stops the arm at once."""
     from sliplab.flows.detect import detect as run
     from sliplab.flows.detect import make_detect_request
 
@@ -82,7 +82,7 @@ def detect(
 
 
 def _shown(result: dict[str, Any]) -> dict[str, Any]:
-    """The summary in a few lines."""
+    """Format the summary in a few lines."""
     latency, compute, losses = result["latency_ms"], result["compute_ms"], result["losses"]
     clock = "virtual" if result["virtual_time"] else "real"
     found = {

@@ -29,14 +29,14 @@ _EXPECTED = {
     "RigError", "ArmFault", "Locked", "CampaignStopped", "ClusterError", "ServerError",
     "OutputLost", "WorkerKilled",
 }  # fmt: skip
-"""Errors whose message says all there is to say, by name: their modules take long to load."""
+"""Errors that need no traceback, by name: their modules take long to load."""
 _OPTION = re.compile(r"--[a-z-]+|FOLDER|KIND|TRIAL|URL")
 """An `InputError` about an option or an argument has its name where others have a file."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """What ended a command.
+    """The error that ended a command.
 
     Attributes:
         file: the file, folder or URL that is wrong; None where there is none.
@@ -65,22 +65,22 @@ class Failure:
 
     @property
     def interrupted(self) -> bool:
-        """Whether nothing went wrong: somebody stopped the program."""
+        """True if nothing failed: somebody stopped the program."""
         return self.exit_code == console.INTERRUPTED
 
 
 def interruption() -> Failure:
-    """Somebody stopped the program."""
+    """Return the failure of a program that somebody stopped."""
     return Failure(INTERRUPTED, console.INTERRUPTED)
 
 
 def is_arm_fault(error: Exception) -> bool:
-    """Whether an arm failed, or could not be stopped: Ctrl-C must not hide that."""
+    """Return whether an arm failed, or could not be stopped: Ctrl-C must not hide that."""
     return type(error).__name__ == "ArmFault"  # its module takes long to load
 
 
 def failure(error: Exception) -> Failure:
-    """Name what `error` is about, and choose the exit code."""
+    """Return message, subject and exit code of an error."""
     if isinstance(error, typer.Exit):
         return Failure("", error.exit_code)
     if isinstance(error, typer.Abort):
@@ -106,7 +106,7 @@ def failure(error: Exception) -> Failure:
 
 
 def _command() -> str:
-    """Return what was called, as far as it names the command."""
+    """Return the command that was called."""
     named = [word for word in sys.argv[1:] if not word.startswith("-")]
     return " ".join(["sliplab", *named[:1]])
 
@@ -125,7 +125,7 @@ def _wrong_input(error: InputError) -> Failure:
 
 
 def _wrong_usage(error: TyperException) -> Failure:
-    """Of the command line: an unknown option, a missing argument, a value that is none."""
+    """Describe a wrong command line: an unknown option, a missing argument, a bad value."""
     message = error.format_message()  # empty without a command: its help has been printed
     key = getattr(error, "option_name", None)
     value = None

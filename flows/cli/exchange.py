@@ -22,15 +22,15 @@ def import_(
     ],
     path: Annotated[Path | None, typer.Argument(metavar="", show_default=False)] = None,
     store: StoreOption = ...,  # type: ignore[assignment]  # typer's word for: must be given
-    name: Annotated[str, typer.Option("--name", help="Of the campaign that is made.")] = ...,  # type: ignore[assignment]  # as above
+    name: Annotated[str, typer.Option("--name", help="Name of the new campaign.")] = ...,  # type: ignore[assignment]  # as above
     simulated: Annotated[
         bool, typer.Option("--simulated", help="The files are of a simulation.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take trials of other programs into a campaign of their own, what is unknown marked so.
+    """Import trials of other programs into a campaign of their own; unknown values are marked.
 
-    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; without it, the files' content tells.
+    KIND is aedat4, dsec, lab-hdf5, lab-pickles, raw or es; by default the files' content decides.
     """
     from dataclasses import replace
 

@@ -30,7 +30,7 @@ OutOption = Annotated[
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before the arm moves.")]
 DryOption = Annotated[
-    bool, typer.Option("--dry-run", help="Say what would move where, and move nothing.")
+    bool, typer.Option("--dry-run", help="Print what would move where, and move nothing.")
 ]
 SpeedOption = Annotated[
     float, typer.Option("--speed", min=0.01, max=1.0, help="Creeping speed, mm/s.")
@@ -141,14 +141,14 @@ def _cameras(file: RigFile) -> str:
 
 
 class By(StrEnum):
-    """How a touch is noticed."""
+    """Method to detect a touch."""
 
     EVENTS = "events"
     HAND = "hand"
 
 
 class ZeroBy(StrEnum):
-    """What depth zero is found by."""
+    """Methods to find depth zero."""
 
     BOTH = "both"
     EVENTS = "events"
@@ -171,7 +171,7 @@ def teach_plane(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """The contact plane: touches at the centre, to the right, above, and one that checks them."""
+    """Find the contact plane: touch at the centre, to the right, above, and check by a fourth."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -203,7 +203,7 @@ def teach_zero(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Depth zero: touches at the centre, seen by both cameras."""
+    """Find depth zero: touch at the centre, seen by both cameras."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -233,7 +233,7 @@ def teach_tool(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """The tool centre point: a person brings the tip onto one point, leaning in many ways."""
+    """Find the tool centre point: a person brings the tip onto one point, leaning differently."""
     from sliplab.flows.calibrating import teach as steps
     from sliplab.flows.calibrating.measurement import Measurement
     from sliplab.rigs.build import tool_of
@@ -262,7 +262,7 @@ def calibrate_lens(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Lens and scale of the outside camera, from a printed ChArUco board. Nothing moves."""
+    """Calibrate lens and scale of the outside camera by a ChArUco board. Nothing moves."""
     from sliplab.flows.calibrating import calibrate as steps
     from sliplab.flows.calibrating.measurement import Measurement
 
@@ -291,7 +291,7 @@ def calibrate_crop(
     dry_run: DryOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Where the skin is in the event camera's picture: press, and move in a circle."""
+    """Find the skin in the event camera's image: press, and move in a circle."""
     from sliplab.flows.calibrating import calibrate as steps
     from sliplab.flows.calibrating.measurement import Measurement, PlannedMove
 

@@ -132,7 +132,7 @@ def evaluate(
             console.print_json(result)
         else:
             simulated = " (simulated)" if result["simulated"] else ""
-            console.print_pairs(f"{result['model']} on {store}{simulated}", _judged(result))
+            console.print_pairs(f"{result['model']} on {store}{simulated}", _model_scores(result))
         return
     result = run_step(folder, campaign, "evaluate", dask, **options)
     more = {"window_baselines": baselines, "window_checks": checks}
@@ -142,8 +142,8 @@ def evaluate(
     finish(result, f"evaluate {store}", as_json)
 
 
-def _judged(result: dict[str, Any]) -> dict[str, Any]:
-    """A judged model in a few lines."""
+def _model_scores(result: dict[str, Any]) -> dict[str, Any]:
+    """Format the scores of a model in a few lines."""
     accuracy, interval = result["accuracy"], result["interval"]
     sure = ""
     if interval["low"] is not None:
@@ -187,7 +187,7 @@ def report(
     if against is not None:
         from sliplab.analysis.report.against import load_other
 
-        load_other(against)  # wrong input is told before anything is made
+        load_other(against)  # wrong input fails before anything is made
     result = run_step(folder, campaign, "report")
     if against is not None:
         from sliplab.analysis.report.against import short_table

@@ -39,7 +39,7 @@ def trials(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The catalogue of committed trials as a table, and what was set aside, with causes."""
+    """Print the catalogue of committed trials, and the trials that were set aside, with causes."""
     from sliplab.flows.planning.campaign_trials import all_excluded, print_excluded
     from sliplab.storage.remote.mirror import open_store
     from sliplab.storage.trials.catalogue import catalogue, query
@@ -50,7 +50,7 @@ def trials(
     whole = None
     if not unreadable and len(table):  # else what is whole may be more than what can be read
         whole = {name: set(part) for name, part in table.groupby("campaign")["trial"]}
-    aside = all_excluded(opened, unreadable, whole)
+    excluded = all_excluded(opened, unreadable, whole)
     for problem in unreadable:
         console.say(f"left out: {problem}")
     if where is not None:
@@ -70,7 +70,7 @@ def trials(
             {
                 "count": len(table),
                 "trials": json.loads(table.to_json(orient="records")),
-                "set_aside": aside,
+                "set_aside": excluded,
                 "unreadable": unreadable,
             }
         )
@@ -80,7 +80,7 @@ def trials(
         simulated = " (simulated)" if len(table) and table["simulated"].all() else ""
         spare = len(shown) - 2  # a row is its campaign and its trial
         console.print_table(f"trials of {store}{simulated}", shown, rows, limit=40, spare=spare)
-        print_excluded(aside)
+        print_excluded(excluded)
         console.say(f"{len(table)} trials; --json and --output have all {table.shape[1]} columns")
 
 
@@ -89,11 +89,11 @@ def verify(
     store: PlaceArgument,
     quarantine: Annotated[
         bool,
-        typer.Option("--quarantine", help="Set damaged trials aside, to be taken again."),
+        typer.Option("--quarantine", help="Move damaged trials to quarantine, to be taken again."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check every checksum, count and clock of a store; changes nothing unless told to."""
+    """Check every checksum, count and clock of a store; changes nothing without --quarantine."""
     from sliplab.storage.remote.objects import is_url
     from sliplab.storage.trials.store import Store
     from sliplab.storage.trials.verify import quarantine_damaged, trial_folders
@@ -166,10 +166,10 @@ UrlArgument = Annotated[
     str, typer.Argument(help="Where pushed stores are: s3://bucket/folder, file:///shared/folder.")
 ]
 QuarantineOption = Annotated[
-    bool, typer.Option("--quarantine", help="Also what was set aside, with its causes.")
+    bool, typer.Option("--quarantine", help="Also the quarantine, with its causes.")
 ]
 FOLLOW_S = 30.0
-"""How long `push --follow` waits before it looks again, s."""
+"""Period of `push --follow`, s."""
 
 
 @app.command()
@@ -182,7 +182,7 @@ def push(
         bool, typer.Option("--follow", help="Go on until the collection that runs has ended.")
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Read what is there, and send anew what is damaged.")
+        bool, typer.Option("--check", help="Read what is there, and send damaged files again.")
     ] = False,
     sizes_only: Annotated[
         bool, typer.Option("--sizes-only", help="Do not read back what was sent.")
@@ -234,7 +234,7 @@ def pull(
     quarantine: QuarantineOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring pushed trials into a store, each checked; run it again to bring what is new."""
+    """Download pushed trials into a store, each checked; run it again to get new ones."""
     from sliplab.storage.remote.objects import Remote
     from sliplab.storage.remote.pull import pull as pull_trials
 
@@ -255,7 +255,7 @@ def _verify_pushed(url: str, quarantine: bool, as_json: bool) -> None:
     """Verify what was pushed to a URL; everything there is read.
 
     Raises:
-        InputError: something was to be set aside there.
+        InputError: `quarantine` was given; a URL has none.
     """
     from sliplab.flows.running import stopping
     from sliplab.storage.remote.objects import Remote
@@ -308,7 +308,7 @@ def _collects(holder: dict[str, Any] | None) -> bool:
 
 
 def _finish(result: dict[str, Any], what: str, as_json: bool) -> None:
-    """Print what was done; problems end the program with exit 1."""
+    """Print the result; problems end the program with exit 1."""
     problems = result["problems"]
     for problem in problems:
         console.say(f"left out: {problem}")

@@ -53,7 +53,7 @@ def study(
         ),
     ] = False,
     status: Annotated[
-        bool, typer.Option("--status", help="Only say how far it is, from any terminal.")
+        bool, typer.Option("--status", help="Only print its progress, from any terminal.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -68,7 +68,7 @@ def study(
 
 
 def _status(folder: Path, as_json: bool) -> None:
-    """How far a study is."""
+    """Print the progress of a study."""
     from sliplab.flows.study_ledger import FILE, print_rows, read
     from sliplab.protocols.errors import InputError
 
@@ -105,7 +105,7 @@ def _chain(
     more: bool = False,
     holdout: int = 0,
 ) -> None:
-    """Run the whole chain and print what came out."""
+    """Run the whole chain and print its results."""
     from sliplab.flows.planning.run_request import check_disk, make_request
 
     run_requests = [make_request(file, rig, folder, enable=on) for file, on in protocols.items()]

@@ -195,7 +195,11 @@ def note_stop(
         console.say(f"{process.named(holder)}: collects nothing and was left alone")
         holder = None
     if holder is not None:
-        how = "was told to stop" if reached else "no signal reaches it; it stops at its next trial"
+        how = (
+            "was signalled to stop"
+            if reached
+            else "no signal reaches it; it stops at its next trial"
+        )
         console.say(f"{process.named(holder)}: {how}")
     made = control.ask(store, "stop", who=who, why=why)
     if holder is not None and limit_s > 0:

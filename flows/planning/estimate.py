@@ -1,4 +1,4 @@
-"""What a plan will take on a rig: bytes on disk, from what its streams were measured to need."""
+"""Bytes that a plan takes on a rig's disk, estimated from measured needs of its streams."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from sliplab.protocols import InputError, Move, Plan, Trial
 from sliplab.rigs.rig_file import RigFile
 
 RESERVE = 200_000_000
-"""Bytes that must stay free besides the plan's own: the disk is the user's, too."""
+"""Bytes that must stay free: other programs use the disk, too."""
 
 
 def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
-    """Bytes one committed trial is expected to take."""
+    """Estimate the bytes of one committed trial."""
     known = rig.estimates
     seconds = plan.seconds(trial, recorded_only=True)
     moved, at = 0.0, plan.program(trial).home
@@ -31,12 +31,12 @@ def trial_bytes(rig: RigFile, plan: Plan, trial: Trial) -> float:
 
 
 def plan_bytes(rig: RigFile, plan: Plan, skip: set[str] | None = None) -> float:
-    """Bytes of all trials but those in `skip`."""
+    """Estimate the bytes of all trials except those in `skip`."""
     return sum(trial_bytes(rig, plan, t) for t in plan if not skip or t.id not in skip)
 
 
 def check_space(folder: Path, needed: float) -> int:
-    """Free bytes where `folder` is or will be.
+    """Return the free bytes where `folder` is or will be.
 
     Raises:
         InputError: `needed` and a reserve do not fit.

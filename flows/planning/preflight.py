@@ -218,8 +218,8 @@ def _check_clocks(run_request: RunRequest, rig: Rig) -> list[Check]:
 
     rate = run_request.plan.protocol.collection.recording.sync_rate
     with TemporaryDirectory() as folder:
-        aside = Path(folder) / "check"
-        writer = TrialWriter(aside, aside.with_name("none"), None, rate)
+        check = Path(folder) / "check"
+        writer = TrialWriter(check, check.with_name("none"), None, rate)
         rig.listen(LISTEN_S, writer, rate)
         with StreamReader(writer.seal() / DATA) as reader:
             streams = streams_of(reader, None)

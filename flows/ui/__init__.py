@@ -1,1 +1,1 @@
-"""What people look at while they work: the review page, a trial in Rerun, live detection."""
+"""Displays for people: the review page, a trial in Rerun, live detection."""

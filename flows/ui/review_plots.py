@@ -279,7 +279,7 @@ def _crossings(shown: ShownTrial) -> dict[str, Any]:
 
 
 _TAIL_FRAMES = 60
-"""How many earlier frames a track is drawn through."""
+"""Number of earlier frames through which a track is drawn."""
 _RING = 0.2
 """Radius of a ring around a marker, as a share of the skin's spacing."""
 _DARK = "#20262c"

@@ -1,8 +1,8 @@
 """Serves the review page on this computer only, until somebody ends it.
 
-Whoever can reach the page can decide, so: it listens on the loopback address, stands under a path
-that nobody can guess, is listed nowhere, and answers neither another page's scripts nor a foreign
-host name (`flows.running.same_origin`, for pages and for the connection that carries everything).
+Anybody who reaches the page can decide. So it listens on the loopback address, has a path that
+cannot be guessed, is listed nowhere, and answers neither another page's scripts nor a foreign host
+name (`flows.running.same_origin`, for pages and for the connection that carries everything).
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ MOST_POINTS = 5_000_000
 MOST_IMAGES = 1000
 POOL = 2
 MOST_FRAMES = 2000
-"""Of more frames than this, every second, third, ... is taken."""
+"""Of more frames, every second, third, ... is taken."""
 _QUALITY = 90
 COUNTS = "counts"
 
