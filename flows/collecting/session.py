@@ -169,7 +169,7 @@ class Session:
     gate: TrialGate | None = None
     taken: int = 0
     retaken: int = 0
-    _before: Trial | None = None
+    _previous: Trial | None = None
     _warm: bool = False
     _zero_slot: int | None = None
 
@@ -188,11 +188,11 @@ class Session:
                     continue
                 self._prepare(trial)
                 self._take(trial)
-            self._before = trial
+            self._previous = trial
 
     def fresh_start(self) -> None:
         """Forget what was prepared: after a pause, plate, skin and depth zero may have changed."""
-        self._before, self._warm, self._zero_slot = None, False, None
+        self._previous, self._warm, self._zero_slot = None, False, None
 
     def _may_take(self, trial: Trial) -> bool:
         if self.gate is None or self.gate.may_take(trial):
@@ -200,7 +200,7 @@ class Session:
         self.on_trial(trial, "skipped")
         return False
 
-    def _over(self, trial: Trial, outcome: str) -> None:
+    def _finish(self, trial: Trial, outcome: str) -> None:
         self.on_trial(trial, outcome)
         if self.gate is not None:
             self.gate.after(trial, outcome)
@@ -214,7 +214,7 @@ class Session:
         self._warm_and_zero(trial)
 
     def _change_over(self, trial: Trial) -> None:
-        for task in self.plan.changeovers(self._before, trial):
+        for task in self.plan.changeovers(self._previous, trial):
             if not self._mounted(trial):
                 self._ask(task)
                 if not self._mounted(trial):
@@ -257,14 +257,14 @@ class Session:
             number += 1
             failed += 1
             if failed > retakes:
-                self._over(trial, "set aside")
+                self._finish(trial, "set aside")
                 return
             if not self._may_take(trial):
                 return
             self._change_over(trial)  # needed only after a pause
             self._warm_and_zero(trial)
             self.retaken += 1
-        self._over(trial, "committed")
+        self._finish(trial, "committed")
 
     def _attempt(self, trial: Trial, number: int) -> bool:
         """Record one attempt at a trial; commit it, or quarantine it if it fails a gate."""

@@ -1,8 +1,9 @@
-"""Between two trials: what people ask for from another terminal; on the mock rig, no waiting."""
+"""Between two trials: requests from another terminal, and the time window; without waiting."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,18 @@ import pytest
 
 from sliplab.flows.collecting import session as session_module
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
-from sliplab.flows.collecting.session import Session, TrialGate, run_session
+from sliplab.flows.collecting.session import Session, TrialGate, WindowOver, run_session
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
-from sliplab.flows.planning.run_request import make_request
+from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.flows.running import stopping
 from sliplab.protocols import Trial
+from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.trials import control
 from sliplab.storage.trials.control import skipped
 from sliplab.storage.trials.store import Campaign, Store
 from sliplab.storage.trials.verify import verify
+from tests.conftest import ROOT
+from tests.crash import campaign as crash
 from tests.flows.collecting.test_session import checksums, session, short
 
 
@@ -216,3 +220,55 @@ def test_a_request_is_done_once_even_after_a_crash(tmp_path: Path) -> None:
     assert control.answered(store, request) == answer
     assert carry_out(store) == []
     assert len(campaign.quarantined()) == 1
+
+
+def after(calls: int, before: float = 0.0, then: float = 1000.0) -> Callable[[], float]:
+    """A clock that shows `before` so many times."""
+    times = iter([before] * calls)
+    return lambda: next(times, then)
+
+
+def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> None:
+    wanted = crash.run_request(tmp_path, 4)
+
+    def night() -> None:
+        with run_session(replace(wanted, until=500.0)) as work:
+            work.gate.clock = after(3)
+            work.session.rig.connect()
+            work.session.take(work.trials)
+
+    with pytest.raises(WindowOver, match="the next collection goes on"):
+        night()
+    store = Store.open(wanted.store).campaign(crash.NAME)
+    assert 1 <= len(store.committed()) <= 3  # retakes ask as well
+    assert not list((store.folder / "incoming").iterdir())
+    crash.collect(wanted)
+    whole = crash.run_request(tmp_path / "undisturbed", 4)
+    crash.collect(whole)
+    assert crash.hashes(wanted.store) == crash.hashes(whole.store)
+
+
+def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:
+    wanted = replace(crash.run_request(tmp_path, 2), until=500.0)
+    with run_session(wanted) as work:
+        control.ask(Store.open(wanted.store), "pause")
+        work.gate.clock, work.gate.wait = after(3), lambda seconds: None
+        with pytest.raises(WindowOver):
+            work.session.take(work.trials)
+    assert control.paused(Store.open(wanted.store)) is not None
+
+
+def test_in_real_time_no_trial_is_begun_that_would_not_be_over(tmp_path: Path) -> None:
+    mock = crash.run_request(tmp_path, 2)
+    loopback, text = load_rig_file(ROOT / "rigs" / "loopback.yaml")
+    store = Store.create(tmp_path / "store")
+    for rig, needed in ((mock.rig, 0.0), (loopback, None)):
+        wanted = RunRequest(mock.plan, rig, text, store.folder, "c", (), until=500.0)
+        gate = TrialGate(wanted, store, describe_campaign(store, wanted))
+        trial = wanted.plan.trials[0]
+        seconds = wanted.plan.seconds(trial) if needed is None else needed
+        gate.clock = lambda seconds=seconds: 499.9 - seconds
+        assert gate.may_take(trial)
+        gate.clock = lambda seconds=seconds: 500.1 - seconds
+        with pytest.raises(WindowOver, match=trial.id):
+            gate.may_take(trial)
