@@ -27,7 +27,8 @@ from sliplab.analysis.labels.labelling import Label, label_places
 from sliplab.analysis.labels.markers import MarkerTracker, Measured, stack_tracks
 from sliplab.analysis.labels.places import from_tracks
 from sliplab.analysis.labels.plate import PlatePose, PlateTracker, bridge
-from sliplab.flows.searching.scene_runs import MOTION, changed, sample_trials, with_true_times
+from sliplab.analysis.sweeps.runner import sample_trials
+from sliplab.flows.scene_runs import MOTION, changed, with_true_times
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.plan import load_plan

@@ -19,6 +19,7 @@ from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.programs import read_programs, shape_checked
 from sliplab.analysis.report.summary import Sources, make_summary
+from sliplab.analysis.report.tradeoff_scene import make_sections
 from sliplab.analysis.report.trial import choose_example
 from sliplab.flows.labelling import label_errors
 from sliplab.flows.learning import evaluate, other_networks, window_baselines, window_scores
@@ -26,7 +27,6 @@ from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
-from sliplab.flows.searching import tradeoff_page
 from sliplab.protocols.settings import Detection
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import write_json, write_text
@@ -147,7 +147,7 @@ def _shown(sources: Sources) -> content.Shown:
     scene = None
     if "scene" in sources.programs:
         with shape_checked("scene"):
-            scene = tradeoff_page.make_sections(sources.programs["scene"])[0]
+            scene = make_sections(sources.programs["scene"])[0]
     return content.Shown(
         model_file.load(model.path),
         None if example is None else (example, counts),

@@ -32,10 +32,10 @@ from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_baselines import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
-from sliplab.flows.searching.tradeoff import tradeoff
 from sliplab.flows.study_ledger import Ledger, Row
 from sliplab.flows.sync import sync
-from sliplab.flows.tradeoff import tradeoff_detector
+from sliplab.flows.tradeoff_detector import tradeoff_detector
+from sliplab.flows.tradeoff_scene import tradeoff_scene
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
@@ -243,7 +243,7 @@ def _scene(store: Store, campaigns: list[Collected]) -> Json:
     done = 0
     if not (path.exists() and kept.fresh("scene", key)):
         rig = item.campaign.folder / "rig.yaml"
-        tradeoff(item.campaign.protocol_file, rig, path.parent, SCENE_TRIALS)
+        tradeoff_scene(item.campaign.protocol_file, rig, path.parent, SCENE_TRIALS)
         kept.write("scene", key, {"file": FILES["scene"]})
         done = 1
     return {"step": "scene search", "done": done}

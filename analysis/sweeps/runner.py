@@ -66,7 +66,7 @@ class ResultFile:
     head: Mapping[str, Any]
 
     def all(self) -> dict[str, Json]:
-        """Return the results by name, in the order in which they were first made."""
+        """Return the results by name."""
         try:
             found: dict[str, Json] = read_json(self.path)[self.field]
         except FileNotFoundError:

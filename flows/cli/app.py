@@ -6,12 +6,19 @@ from typing import Annotated
 
 import typer
 
-from sliplab.flows.cli import collect, control, detect, exchange, review, rigs, steps, store, study
-from sliplab.flows.cli.generalise import register as register_generalise
-from sliplab.flows.cli.guesses import register as register_guesses
-from sliplab.flows.cli.holdout import register as register_holdout
+from sliplab.flows.cli import (
+    collect,
+    control,
+    detect,
+    exchange,
+    review,
+    rigs,
+    steps,
+    store,
+    study,
+    sweeps,
+)
 from sliplab.flows.cli.schema import register as register_schema
-from sliplab.flows.cli.tradeoff import register as register_tradeoff
 from sliplab.flows.running import console
 
 app = typer.Typer(
@@ -42,16 +49,12 @@ def options(
     """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
 
 
-sweeps, schemas = typer.Typer(), typer.Typer()
-register_tradeoff(sweeps)
-register_generalise(sweeps)
-register_guesses(sweeps)
-register_holdout(sweeps)
+schemas = typer.Typer()
 register_schema(schemas)
 for part in (
     collect.app,
     steps.app,
-    sweeps,
+    sweeps.app,
     study.app,
     store.app,
     rigs.app,

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.labels_summary import summary, tables, verdicts
 from benchmarks.labels_truth import GLARE, NUISANCES, ROOT, check
-from sliplab.flows.searching.scene_runs import sample_trials
+from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.protocols.plan import load_plan
 from sliplab.rigs.rig_file import load_rig_file
 

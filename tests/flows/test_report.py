@@ -28,12 +28,12 @@ from sliplab.analysis.report.outcomes import (
 )
 from sliplab.analysis.report.page import render_section, write_figures
 from sliplab.analysis.report.programs import FILES
+from sliplab.analysis.report.tradeoff_scene import ERRORS
 from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report
-from sliplab.flows.searching.tradeoff_page import ERRORS
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import json_text, read_json, write_json
 from sliplab.storage.schema.summary import ReferenceTrial, Seed, Seeds, Summary, TrialOutcome

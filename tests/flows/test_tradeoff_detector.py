@@ -19,24 +19,15 @@ from sliplab.analysis.sweeps.detector_grid import (
     PAPER,
     Axes,
     Setting,
-    counted_stride,
-    make_grid,
     strides,
 )
-from sliplab.analysis.sweeps.detector_rows import OBJECTIVES, RULES, Row, mean, short_list
+from sliplab.analysis.sweeps.detector_rows import OBJECTIVES, RULES, Row, mean
 from sliplab.analysis.sweeps.detector_search import PRECISIONS, SearchSize, trial_counts
 from sliplab.analysis.windows import dataset
 from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import console, stopping
-from sliplab.flows.tradeoff import (
-    DETECTOR_NUMBERS,
-    DETECTOR_PAGE,
-    DETECTOR_TABLE,
-    detector_search,
-    tradeoff_detector,
-)
-from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import Detection, Network, Windows
+from sliplab.flows.tradeoff_detector import NUMBERS, PAGE, TABLE, detector_search, tradeoff_detector
+from sliplab.protocols.settings import Detection
 from sliplab.storage.errors import StoreError
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
@@ -74,47 +65,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 def result(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("out") / "new"
     return tradeoff_detector(store, collected(store), folder, SIZE, AXES), folder
-
-
-def test_lines_and_the_small_cross_are_tried_once_each() -> None:
-    grid = make_grid(Axes(), Windows(), Network())
-    assert grid.settings[0] == PAPER
-    assert len(grid.settings) == len(set(grid.settings)) == 16
-    assert Setting(length_ms=5, pool_px=10) in grid.settings
-    assert Setting(length_ms=10, pool_px=10) not in grid.settings
-    assert grid.left_out == {}
-    whole = make_grid(Axes(), Windows(), Network(), full=True)
-    # 6 x 3 x 3 x 3, without steps of 2 ms in windows of 5 ms
-    assert len(whole.settings) == 162 - 9
-    assert len(whole.left_out) == 9
-    assert all("do not divide a window of 5 ms" in why for why in whole.left_out.values())
-    assert set(grid.settings) <= set(whole.settings)
-
-
-def test_what_no_network_can_have_is_refused_by_name() -> None:
-    for axes, words in (
-        (Axes(pool_px=(30,)), "--pool = 30: must divide the crop of 400 px"),
-        (Axes(width=(0.01,)), "--width = 0.01: must leave each layer"),
-        (Axes(width=(100.0,)), "--width"),
-        (Axes(length_ms=(0,)), "--length = 0: must lie between 1 and 1000"),
-    ):
-        with pytest.raises(InputError, match=words):
-            make_grid(axes, Windows(), Network())
-
-
-def test_widths_and_windows_are_those_asked_for() -> None:
-    setting = Setting(length_ms=10, step_ms=5, pool_px=40, width=0.5)
-    assert setting.windows(Windows()).steps == 2
-    assert setting.windows(Windows()).cells == 10
-    network = setting.network(Network())
-    assert (network.conv1_channels, network.conv2_channels, network.hidden) == (4, 8, 16)
-
-
-def test_strides_are_multiples_of_the_finest_and_the_length() -> None:
-    assert strides(30, 10) == [10, 20, 30]
-    assert strides(5, 10) == [5]
-    assert strides(25, 10) == [10, 20, 25]
-    assert [counted_stride(length, 10) for length in (30, 5, 25)] == [10, 5, 5]
 
 
 def test_rows_are_of_every_setting_precision_stride_and_rule(result: Any) -> None:
@@ -185,39 +135,16 @@ def test_the_front_is_the_definitions(result: Any) -> None:
     assert 0 < sum(row.front for row in rows) < len(rows)
 
 
-def test_the_short_list_is_picked_by_validation_trials_alone() -> None:
-    def row(late: float, early: float, missed: float, work: float, test: float) -> Row:
-        figures = {"mean_ms": [late], "false_early_either": [early], "lost_either": [missed]}
-        operations = {"synaptic_operations_per_s": [work]}
-        return Row(
-            PAPER, "trained", 30, "chosen", 4, 8.0, False, [0],
-            figures, {"mean_ms": [test]}, None, operations,
-        )  # fmt: skip
-
-    rows = [
-        row(100, 0.02, 0.0, 5, 1),
-        row(90, 0.03, 0.0, 5, 900),
-        row(90, 0.05, 0.05, 4, 900),
-        row(10, 0.0, 0.06, 1, 1),
-        row(5, 0.21, 0.0, 1, 1),
-    ]
-    found = [(budget, rows.index(one)) for budget, one in short_list(rows)]
-    assert found == [(0.02, 0), (0.05, 2), (0.1, 2), (0.2, 2)]
-    assert short_list(rows[3:]) == []
-
-
 def test_page_numbers_and_table_say_the_same(result: Any) -> None:
     found, folder = result
-    assert sorted(item.name for item in folder.iterdir()) == sorted(
-        [DETECTOR_PAGE, DETECTOR_NUMBERS, DETECTOR_TABLE]
-    )
-    written = json.loads((folder / DETECTOR_NUMBERS).read_text())
+    assert sorted(item.name for item in folder.iterdir()) == sorted([PAGE, NUMBERS, TABLE])
+    written = json.loads((folder / NUMBERS).read_text())
     assert {**written, "made": 6} == json.loads(json.dumps(found))
-    page = (folder / DETECTOR_PAGE).read_text()
+    page = (folder / PAGE).read_text()
     assert page.count("<svg") == 2
     assert page.count("<h2>") == page.count("<small>simulated</small></h2>") == 7
     assert "★" in page
-    table = list(csv.DictReader(io.StringIO((folder / DETECTOR_TABLE).read_text())))
+    table = list(csv.DictReader(io.StringIO((folder / TABLE).read_text())))
     assert len(table) == len(found["rows"])
     for line, row in zip(table, found["rows"], strict=True):
         assert line["simulated"] == "True"
@@ -251,7 +178,7 @@ def test_a_kept_search_is_not_made_again_and_grows(
         store, collected(store), tmp_path / "o", other, AXES, minutes=0
     )  # fmt: skip
     assert (found["kept"], found["rows"]) == (0, [])
-    assert (tmp_path / "o" / DETECTOR_PAGE).exists()
+    assert (tmp_path / "o" / PAGE).exists()
 
 
 def test_it_goes_on_in_the_middle_of_a_training(tmp_path: Path) -> None:

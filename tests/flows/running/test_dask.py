@@ -25,7 +25,7 @@ from sliplab.flows.learning.train import train
 from sliplab.flows.running import cluster as clusters
 from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
-from sliplab.flows.searching.tradeoff_runs import everywhere
+from sliplab.flows.tradeoff_scene import everywhere
 from sliplab.protocols.errors import InputError
 from sliplab.storage.remote.mirror import open_mirror
 from sliplab.storage.remote.objects import Remote

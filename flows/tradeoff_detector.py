@@ -1,7 +1,6 @@
-"""`sliplab tradeoff`: what accuracy costs, of a simulated scene or of the detector.
+"""`sliplab tradeoff --detector`: what a detector's speed costs in errors, over a store's trials.
 
-The detector's search is kept run by run, so it may be stopped and gone on with, and made larger
-later.
+A search is kept run by run, so it may be stopped and gone on with, and made larger later.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.report import tradeoff_detector as detector_page
+from sliplab.analysis.report import tradeoff_detector as page
 from sliplab.analysis.sweeps.detector_grid import Axes, make_grid
 from sliplab.analysis.sweeps.detector_rows import Row, plan, search_result, table
 from sliplab.analysis.sweeps.detector_search import STEP, DetectorSearch, SearchSize, search_trials
@@ -22,9 +21,7 @@ from sliplab.storage.files import write_json, write_text
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
-DETECTOR_PAGE, DETECTOR_NUMBERS, DETECTOR_TABLE = (
-    f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv")
-)
+PAGE, NUMBERS, TABLE = (f"detector_tradeoff.{kind}" for kind in ("html", "json", "csv"))
 
 
 def detector_search(
@@ -109,8 +106,8 @@ def tradeoff_detector(
         result = search_result(search, full, store.simulated, bar.advance)
     rows = [Row.of_json(row) for row in result["rows"]]
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / DETECTOR_NUMBERS, result)
+    write_json(folder / NUMBERS, result)
     text = table(rows, store.simulated).to_csv(index=False, lineterminator="\n")
-    write_text(folder / DETECTOR_TABLE, text)
-    write_text(folder / DETECTOR_PAGE, detector_page.render(result))
+    write_text(folder / TABLE, text)
+    write_text(folder / PAGE, page.render(result))
     return {**result, "made": made}

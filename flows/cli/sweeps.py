@@ -1,0 +1,336 @@
+"""Sweeps: `tradeoff`, `generalise`, `guesses`, `holdout`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sliplab.flows.cli.common import (
+    CampaignOption,
+    DaskOption,
+    JsonOption,
+    StoreArgument,
+    located,
+)
+from sliplab.flows.cli.steps import ReviewedOption
+from sliplab.flows.running import console
+from sliplab.flows.steps import prepare_store
+from sliplab.flows.study_defaults import HELD_OUT
+from sliplab.protocols.errors import InputError
+
+if TYPE_CHECKING:
+    from sliplab.analysis.campaigns import Collected
+    from sliplab.storage.trials.store import Store
+
+SCENE_OUT = Path("sliplab-tradeoff")
+
+app = typer.Typer()
+
+
+@app.command()
+def tradeoff(
+    scene: Annotated[
+        Path | None, typer.Option("--scene", help="The protocol whose scene is simulated (YAML).")
+    ] = None,
+    detector: Annotated[
+        str | None, typer.Option("--detector", help="A labelled store whose detector is varied.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help=f"Folder for page and numbers; {SCENE_OUT} or the store's report/ by default.",
+        ),
+    ] = None,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            "--trials",
+            min=1,
+            max=1_000_000,
+            help="Trials to simulate (4); or validation and test trials to judge by (60 each).",
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Scene: a rig file or name; mock by default.")
+    ] = None,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Scene: also what each guessed number changes.")
+    ] = False,
+    dask: DaskOption = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            "--samples",
+            min=3,
+            max=1_000_000_000,
+            help="Detector: windows of each training (12000).",
+        ),
+    ] = None,
+    epochs: Annotated[
+        int | None,
+        typer.Option("--epochs", min=1, max=10_000, help="Detector: of each training (4)."),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", min=1, max=1000, help="Detector: of each setting (3).")
+    ] = None,
+    stride: Annotated[
+        int | None,
+        typer.Option("--stride", min=1, max=1000, help="Detector: the finest stride, ms (10)."),
+    ] = None,
+    length: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--length",
+            min=0,
+            max=10_000,
+            help="Detector: a window length in milliseconds. Repeatable.",
+        ),
+    ] = None,
+    step: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--step", min=0, max=10_000, help="Detector: a step in milliseconds. Repeatable."
+        ),
+    ] = None,
+    pool: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--pool", min=0, max=10_000, help="Detector: a cell's side in pixels. Repeatable."
+        ),
+    ] = None,
+    width: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--width", min=0, max=1000, help="Detector: a factor on channels. Repeatable."
+        ),
+    ] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Detector: every value with every other.")
+    ] = False,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--minutes",
+            min=0,
+            max=100_000,
+            help="Detector: begin no training after so many; 0: only the page.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Detector: only say what is to do and how long.")
+    ] = False,
+    campaign: CampaignOption = None,
+    reviewed: ReviewedOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure what accuracy costs: of simulating a scene, or of the detector on a store."""
+    if (scene is None) == (detector is None):
+        raise InputError(
+            "--scene", "", None, "give exactly one of --scene PROTOCOL and --detector STORE"
+        )
+    of_detector = {
+        "--samples": samples, "--epochs": epochs, "--seeds": seeds, "--stride": stride,
+        "--length": length, "--step": step, "--pool": pool, "--width": width, "--full": full,
+        "--minutes": minutes, "--dry-run": dry_run, "--campaign": campaign,
+        "--reviewed": reviewed,
+    }  # fmt: skip
+    of_scene = {"--rig": rig, "--sensitivity": sensitivity, "--dask": dask}
+    if scene is not None:
+        _refuse(of_detector, "--detector")
+        _scene(
+            scene, rig or Path("mock"), out or SCENE_OUT, trials or 4, sensitivity, dask, as_json
+        )
+        return
+    _refuse(of_scene, "--scene")
+    assert detector is not None
+    how = {"samples": samples, "epochs": epochs, "trials": trials, "seeds": seeds}
+    axes = {"length_ms": length, "step_ms": step, "pool_px": pool, "width": width}
+    options = {"full": full, "reviewed": reviewed, "minutes": minutes, "dry_run": dry_run}
+    _detector(detector, out, {**how, "stride_ms": stride}, axes, campaign, options, as_json)
+
+
+def _refuse(options: dict[str, Any], other: str) -> None:
+    for name, value in options.items():
+        if value not in (None, False):
+            raise InputError(name, "", None, f"belongs to {other}")
+
+
+def _scene(
+    scene: Path,
+    rig: Path,
+    out: Path,
+    trials: int,
+    sensitivity: bool,
+    dask: str | None,
+    as_json: bool,
+) -> None:
+    from sliplab.analysis.report.tradeoff_scene import choice_pairs, short_table
+    from sliplab.flows.tradeoff_scene import PAGE, tradeoff_scene
+
+    result = tradeoff_scene(scene, rig, out, trials, sensitivity, dask=dask)
+    if as_json:
+        console.print_json(result)
+        return
+    title = f"Cost and error of the scene of {result['protocol']} (simulated)"
+    console.print_table(title, *short_table(result))
+    console.print_pairs("The level that the protocol needs", choice_pairs(result))
+    console.show(f"Page (simulated): {(out / PAGE).resolve()}")
+
+
+def _detector(
+    place: str,
+    out: Path | None,
+    how: dict[str, Any],
+    axes: dict[str, Any],
+    campaign: list[str] | None,
+    options: dict[str, Any],
+    as_json: bool,
+) -> None:
+    folder = located(place)
+    store, campaigns = _opened(folder, campaign)
+    from sliplab.analysis.report.tradeoff_detector import short_table
+    from sliplab.analysis.sweeps.detector_grid import Axes
+    from sliplab.analysis.sweeps.detector_search import SearchSize
+    from sliplab.flows.tradeoff_detector import PAGE, tradeoff_detector
+
+    asked = SearchSize(**{name: value for name, value in how.items() if value is not None})
+    given = Axes(**{name: tuple(sorted(set(each))) for name, each in axes.items() if each})
+    target = folder / "report" if out is None else out
+    result = tradeoff_detector(store, campaigns, target, asked, given, **options)
+    if as_json:
+        console.print_json(result)
+        return
+    simulated = " (simulated)" if result["simulated"] else ""
+    if "rows" not in result:
+        shown = {key: result[key] for key in ("runs", "kept", "pending", "estimated_s")}
+        console.print_pairs(f"tradeoff --detector {place}{simulated}", shown)
+        return
+    console.print_table(
+        f"The quickest detectors by false early trials{simulated}", *short_table(result)
+    )
+    console.show("Network: window ms/step ms/cell px/width; rule: windows, spikes.")
+    console.show(f"Page{simulated}: {(target / PAGE).resolve()}")
+
+
+@app.command()
+def generalise(
+    folder: StoreArgument,
+    factor: Annotated[
+        list[str] | None, typer.Option("--factor", help="Only this factor. Repeatable.")
+    ] = None,
+    level: Annotated[
+        list[str] | None,
+        typer.Option("--level", help="Leave out this level, such as '0 deg'. Repeatable."),
+    ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Leave out each level in turn; else each factor's lowest.")
+    ] = False,
+    skins: Annotated[
+        int | None,
+        typer.Option("--skins", min=0, max=1000, help="Other skins of a simulated rig (5)."),
+    ] = None,
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, max=1_000_000, help="On each other skin.")
+    ] = 36,
+    epochs: Annotated[
+        int | None,
+        typer.Option("--epochs", min=1, max=10_000, help="Of each training; the protocol's."),
+    ] = None,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Train without a level and test on it; test the network on other simulated skins."""
+    store, campaigns = _opened(folder, campaign)
+    from sliplab.analysis.sweeps.generalisation import COLUMNS, row_cells
+    from sliplab.flows.generalise import measure_generalisation
+
+    result = measure_generalisation(
+        store, campaigns, factor or (), level or (), every, skins, trials, epochs
+    )
+    if as_json:
+        console.print_json(result)
+        return
+    simulated = ", simulated" if result["simulated"] else ""
+    rows = [row_cells(name, row) for name, row in result["results"].items()]
+    console.print_table(f"generalise{simulated}", COLUMNS, rows)
+    console.say(f"kept in {result['file']}; the next report shows it")
+
+
+@app.command()
+def guesses(
+    folder: StoreArgument,
+    guess: Annotated[
+        list[str] | None,
+        typer.Option("--guess", help="Only this number of the scene. Repeatable."),
+    ] = None,
+    trials: Annotated[
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials of each campaign.")
+    ] = 20,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Take some test trials again with each guess 20 % down and up, and judge them anew."""
+    store, campaigns = _opened(folder, campaign)
+    from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS
+    from sliplab.flows.guesses import GUESSES, measure_guesses
+
+    result = measure_guesses(store, campaigns, tuple(guess or GUESSES), trials)
+    if as_json:
+        console.print_json(result)
+        return
+    columns = [f"{FIGURES[name]} ({UNITS[name]})" for name in FIGURES]
+    rows = []
+    for name, found in result["settings"].items():
+        shown = [
+            "-"
+            if value is None
+            else f"{100 * value:.1f}"
+            if key == "strict"
+            else f"{value:.3f}"
+            if UNITS[key] == "mm"
+            else f"{value:.0f}"
+            for key, value in found.items()
+        ]
+        rows.append([name.removeprefix("scene.").removeprefix("event_camera."), *shown])
+    console.print_table("guesses, simulated", ["setting", *columns], rows)
+    console.say(f"kept in {result['file']}; the next report shows them")
+
+
+@app.command()
+def holdout(
+    folder: StoreArgument,
+    trials: Annotated[
+        int, typer.Option("--trials", min=2, max=1_000_000, help="Spread over the conditions.")
+    ] = HELD_OUT,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Also where this version of SlipLab judged it already."),
+    ] = False,
+    campaign: CampaignOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Judge the network once on another simulated skin and seed, which choose nothing."""
+    store, campaigns = _opened(folder, campaign)
+    from sliplab.analysis.report.holdout import COLUMNS, holdout_part, holdout_rows
+    from sliplab.flows.holdout import measure_holdout
+
+    done = measure_holdout(store, campaigns, trials, again)
+    if as_json:
+        console.print_json(done)
+        return
+    result = done["result"]
+    console.print_table("hold-out, simulated", COLUMNS, holdout_rows(holdout_part(result)))
+    console.say(f"kept in {done['file']}, with its ledger; the next report shows it")
+
+
+def _opened(folder: Path, names: list[str] | None) -> tuple[Store, list[Collected]]:
+    """Return a store and its campaigns; what imports Prefect comes after."""
+    from sliplab.analysis.campaigns import collected
+    from sliplab.storage.remote.mirror import open_store
+
+    store = open_store(folder)
+    prepare_store(folder)
+    return store, collected(store, names)

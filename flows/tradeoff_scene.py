@@ -1,0 +1,181 @@
+"""`sliplab tradeoff --scene`: what each way of simulating a trial costs, and how far off it is.
+
+Every variant runs the same trials with the same seeds. It is timed as the rig file has it, on this
+machine with nothing of ours beside, and compared with the dearest variant without noise and
+read-out, here or on a Dask cluster, so that the scene alone differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sliplab.analysis.report import tradeoff_scene as page
+from sliplab.analysis.sweeps import sensitivity as assumed
+from sliplab.analysis.sweeps.runner import sample_trials
+from sliplab.analysis.sweeps.scene_tradeoff import (
+    REFERENCE,
+    make_families,
+    scene_numbers,
+    variants,
+)
+from sliplab.flows import scene_runs
+from sliplab.flows.running import console, orchestration
+from sliplab.flows.running.cluster import connected
+from sliplab.flows.scene_runs import OutcomeJob, VariantJob, changed, closed_form, outcome
+from sliplab.protocols import Plan
+from sliplab.protocols.errors import InputError
+from sliplab.protocols.plan import load_plan
+from sliplab.rigs.levels import at_level, choose_level, with_level
+from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.storage.files import make_folder, write_json, write_text
+
+if TYPE_CHECKING:
+    from sliplab.flows.running.cluster import Cluster
+
+ROUNDS = 2
+STEPS = (1, 2, 4, 8, 16, 32)
+CONTACT_TRIALS = 12
+"""Trials of a sensitivity analysis that onsets are of."""
+PAGE, NUMBERS, TABLE = "tradeoff.html", "tradeoff.json", "sensitivity.md"
+Each = Callable[..., list[Any]]
+"""Of a function, jobs and ``done=``, which is called after each: all results, in order."""
+
+
+def tradeoff_scene(
+    protocol: Path,
+    rig_path: Path,
+    folder: Path,
+    trials: int = 4,
+    sensitivity: bool = False,
+    steps: Sequence[int] = STEPS,
+    dask: str | None = None,
+) -> dict[str, Any]:
+    """Measure, and write page and numbers into `folder`; return the numbers.
+
+    Args:
+        steps: of the contact, ms; the first is the reference's.
+        dask: the scheduler whose workers run what is compared; seconds are measured here.
+
+    Raises:
+        InputError: anything wrong with the protocol or the rig file, a rig that is real, or a
+            `folder` that is no folder.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError("--out", "", str(folder), "must be a folder")
+    plan = load_plan(protocol)
+    rig, _ = load_rig_file(rig_path)
+    if not rig.simulated:
+        raise InputError("--rig", "", str(rig_path), "must be a simulated rig: it has the scene")
+    check_plan(rig, plan, str(rig_path))
+    # while a plate may fall the contact steps by a millisecond whatever the rig file says
+    falls, stated = plan.protocol.collection.plate is not None, rig.scene.scene.step_ms
+    families = make_families(stated, (stated,) if falls else steps)
+    jobs = [VariantJob(rig, plan, trial, families) for trial in sample_trials(plan, trials)]
+    count = len(variants(families))
+    compared = len({*variants(families), REFERENCE}) + 1  # and another seed
+    total = len(jobs) * (compared + ROUNDS * count)
+    if sensitivity:
+        total += scene_runs.EVENT_TRIALS * (2 + 2 * len(assumed.CONTACT + assumed.CAMERA))
+    if dask is not None:
+        make_folder(folder)
+        orchestration.prepare(folder)
+    with connected(dask) as cluster, console.bar("trade-off (runs)", total) as bar:
+        scene_runs.timed(changed(rig, REFERENCE.change), plan, jobs[0].trial, 0)  # compiles
+        wall_s = [scene_runs.wall_seconds(job, ROUNDS, bar.advance) for job in jobs]
+        closed = [closed_form(rig, plan, job.trial) for job in jobs]
+        each = None if cluster is None else partial(everywhere, cluster=cluster)
+        if each is None:
+            done = [scene_runs.compare_trial(job, bar.advance) for job in jobs]
+        else:
+            done = each(scene_runs.compare_trial, jobs, done=lambda: bar.advance(compared))
+        planned = choose_level(at_level(rig, "auto"), plan)
+        assert planned is not None
+        result = {
+            "simulated": True,
+            "protocol": plan.protocol.name,
+            "rig": rig.name,
+            "rig_step_ms": stated,
+            "trials": [job.trial.id for job in jobs],
+            **scene_numbers(
+                families, wall_s, done, closed, plan.protocol.analysis.windows,
+                {"level": planned.name, "reason": planned.reason},
+            ),
+            "left_out": _left_out(falls, sum(form is not None for form in closed), len(jobs)),
+        }  # fmt: skip
+        if sensitivity:
+            result["sensitivity"] = measure_sensitivity(rig, plan, bar.advance, each)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / NUMBERS, result)
+    if sensitivity:
+        text = page.sensitivity_markdown(result["sensitivity"])
+        write_text(folder / TABLE, text)
+    write_text(folder / PAGE, page.render(result))
+    return result
+
+
+def _left_out(falls: bool, closed: int, trials: int) -> list[str]:
+    stated = []
+    if falls:
+        stated.append(
+            "Longer steps are left out: while a plate may fall the scene steps by a millisecond."
+        )
+    if closed < trials:
+        stated.append(
+            f"L0 is told for {closed} of {trials} trials: a retraction that also goes sideways "
+            "has no closed form."
+        )
+    return stated
+
+
+def measure_sensitivity(
+    rig: RigFile, plan: Plan, advance: Callable[[], None], each: Each | None = None
+) -> dict[str, Any]:
+    """Return the change of onsets and event rates by each assumed number, as `sensitivity_table`.
+
+    Args:
+        advance: called after each whole run, or, with `each`, after a setting's runs.
+        each: makes the settings elsewhere.
+    """
+    rig = with_level(rig, plan)
+    trials = sample_trials(plan, CONTACT_TRIALS)
+    base = outcome(OutcomeJob(rig, plan, trials), advance)
+    names = assumed.CONTACT + assumed.CAMERA
+    values = {name: assumed.value_of(rig.scene, name) for name in names}
+    other_seed = assumed.Setting()
+    jobs = {other_seed: OutcomeJob(rig, plan, trials, other_seed=True)}
+    # without a rigid base, or something else that is switched off
+    for setting in assumed.lower_and_higher([name for name, value in values.items() if value]):
+        known = base if setting.parameter in assumed.CAMERA else None
+        other = changed(rig, setting.change(rig.scene))
+        jobs[setting] = OutcomeJob(other, plan, trials, known=known)
+    if each is None:
+        made = [outcome(job, advance) for job in jobs.values()]
+    else:
+        made = each(outcome, list(jobs.values()), done=advance)
+    outcomes = dict(zip(jobs, made, strict=True))
+    event_trials = min(scene_runs.EVENT_TRIALS, len(trials))
+    return assumed.sensitivity_table(values, base, outcomes, outcomes.pop(other_seed), event_trials)
+
+
+def everywhere(
+    work: Callable[[Any], Any], jobs: Sequence[Any], cluster: Cluster, done: Callable[[], None]
+) -> list[Any]:
+    """Return `work` of every job, by a cluster's workers; results in the jobs' order.
+
+    Args:
+        done: called in this thread after each.
+    """
+    from sliplab.flows.running.parallel_map import parallel_map_flow
+
+    found: dict[int, Any] = {}
+
+    def keep(number: int, result: Any) -> None:
+        found[number] = result
+        done()
+
+    task = orchestration.Opaque(("trade-off", work, jobs, keep, cluster))
+    orchestration.run(parallel_map_flow, task, cluster)
+    return [found[number] for number in range(len(jobs))]
