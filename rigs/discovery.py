@@ -35,7 +35,7 @@ def need_libraries(devices: DeviceSettings) -> None:
             raise ModuleNotFoundError(f"No module named '{name}'", name=name)
 
 
-def reach(devices: DeviceSettings) -> dict[str, str | None]:
+def ping_devices(devices: DeviceSettings) -> dict[str, str | None]:
     """By device: None if it can be reached, else why not, and what to look at.
 
     Nothing is opened for longer than it takes to see that somebody answers; takes some seconds.

@@ -105,14 +105,14 @@ def _about(path: Path, ask: bool) -> dict[str, Any]:
 def _ask(file: RigFile) -> dict[str, str | None]:
     """Return by device why it does not answer, None if it does; a rig in use is not disturbed."""
     from sliplab.rigs.core.capabilities import RigError
-    from sliplab.rigs.discovery import reach
+    from sliplab.rigs.discovery import ping_devices
     from sliplab.rigs.rig_lock import held
     from sliplab.storage.trials.lock import Locked
 
     assert file.devices is not None
     try:
         with held(file):
-            return reach(file.devices)
+            return ping_devices(file.devices)
     except (Locked, RigError) as error:
         return {"rig": str(error)}
 

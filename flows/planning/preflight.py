@@ -200,11 +200,11 @@ def _check_reach(run_request: RunRequest) -> list[Check]:
     """Return the devices of a real rig that cannot be reached at all, each by name."""
     if run_request.rig.simulated or run_request.rig.devices is None:
         return []
-    from sliplab.rigs.discovery import reach
+    from sliplab.rigs.discovery import ping_devices
 
     return [
         Check(name, False, why)
-        for name, why in reach(run_request.rig.devices).items()
+        for name, why in ping_devices(run_request.rig.devices).items()
         if why is not None
     ]
 

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.rigs.devices.dvxplorer.fake_stream import LiveDvxplorer
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.discovery import reach
+from sliplab.rigs.discovery import ping_devices
 from tests.rigs.waiting import own_address
 
 LIMITS = {"low_mm": (300, -100, 200), "high_mm": (500, 100, 400)}
@@ -35,7 +35,7 @@ def devices(**more: Any) -> DeviceSettings:
 
 
 def test_what_is_not_there_is_named_with_what_to_look_at() -> None:
-    found = reach(devices())
+    found = ping_devices(devices())
     assert set(found) == {"arm", "event camera", "frame camera", "sync box"}
     assert "look at its power, its cable and the address" in (found["arm"] or "")
     assert (
@@ -54,7 +54,7 @@ def test_an_arm_and_streams_that_answer_are_reached(listening: tuple[str, int]) 
     host, port = listening
     camera = LiveDvxplorer((640, 480))
     try:
-        found = reach(
+        found = ping_devices(
             devices(
                 arm={"driver": "abb_socket", "host": host, "port": port, "limits": LIMITS},
                 event_camera=stream(*camera.ports),
@@ -71,8 +71,10 @@ def test_a_stream_without_its_other_or_a_silent_port_is_not_reached() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         number = silent.getsockname()[1]
         try:
-            half = reach(devices(event_camera=stream(camera.ports[0], 1)))["event camera"]
-            mute = reach(devices(event_camera=stream(camera.ports[0], number)))["event camera"]
+            half = ping_devices(devices(event_camera=stream(camera.ports[0], 1)))["event camera"]
+            mute = ping_devices(devices(event_camera=stream(camera.ports[0], number)))[
+                "event camera"
+            ]
         finally:
             camera.close()
     assert half is not None
@@ -84,8 +86,8 @@ def test_a_stream_without_its_other_or_a_silent_port_is_not_reached() -> None:
 def test_a_port_is_reached_and_a_rig_without_one_is_told() -> None:
     master, slave = os.openpty()
     try:
-        assert reach(devices(sync_box={"port": os.ttyname(slave)}))["sync box"] is None
-        assert reach(devices(sync_box=None))["sync box"] == "no port is named"
+        assert ping_devices(devices(sync_box={"port": os.ttyname(slave)}))["sync box"] is None
+        assert ping_devices(devices(sync_box=None))["sync box"] == "no port is named"
     finally:
         os.close(master)
         os.close(slave)

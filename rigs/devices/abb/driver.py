@@ -3,7 +3,7 @@
 A path is one motion program (abb-motion-program-exec 0.7.4): the controller plans each straight
 move at a constant speed of the tool centre point, from rest to rest. Poses come by EGM, the state
 and the commands go through Robot Web Services. That this host or the network has gone is noticed
-by a task on the controller, which stops the arm then (`abb_watchdog`, `docs/arms.md`).
+by a task on the controller, which stops the arm then (`watchdog`, `docs/arms.md`).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class AbbArm(ArmDriver):
     def connect(self) -> None:
         """Reach the web services, start the pose stream, see that both tell the same place.
 
-        Takes at most (14 + `abb_rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `LOOK_S`.
+        Takes at most (14 + `rws.START_REQUESTS`) `REQUEST_S` + `FIRST_POSE_S` + `LOOK_S`.
 
         Raises:
             ArmFault: no connection, no poses, no watchdog, or the arm may not move now.
@@ -176,7 +176,7 @@ class AbbArm(ArmDriver):
     def start(self, path: Sequence[Segment]) -> None:
         """Begin to follow `path`: checked against the limits, uploaded, started.
 
-        Takes at most (13 + `abb_rws.START_REQUESTS`) `REQUEST_S` + `STOPPED_S`.
+        Takes at most (13 + `rws.START_REQUESTS`) `REQUEST_S` + `STOPPED_S`.
 
         Raises:
             GuardError: a limit forbids the path; nothing was sent.

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.rigs.core.capabilities import DeviceHealth, RigError
+from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth, RigError
 from sliplab.rigs.devices.basler.frame_time import Abilities, choose
 from sliplab.rigs.devices.basler.grabbing import Grab, GrabCounts, GrabSettings
-from sliplab.rigs.devices.basler.health import basler_health
 from sliplab.rigs.devices.basler.nodes import (
     DEVICE,
     Nodes,
@@ -199,10 +198,44 @@ class BaslerCamera:
     def health(self) -> DeviceHealth:
         """Return the camera's own report now, grabbing or not.
 
+        None of it was read from a real camera yet: what a camera does not have is left out or
+        `unknown`.
+
         Raises:
             RigError: the camera is gone.
         """
-        return basler_health(self._device, self._nodes, self.stamping, self._shape, self._buffers)
+        device, nodes, stamping = self._device, self._nodes, self.stamping
+        if device.IsCameraDeviceRemoved():
+            raise RigError(DEVICE, "the camera was unplugged; plug it in and open it again")
+        info = device.GetDeviceInfo()
+        height, width = self._shape
+        notes = [f"region {width} x {height} px"]
+        rate = nodes.peek(
+            "ResultingFrameRate", "BslResultingAcquisitionFrameRate", "ResultingFrameRateAbs"
+        )
+        if rate is not None:
+            notes.append(f"at most {rate:.0f} frames/s")
+        if device.IsGrabbing():
+            free = device.NumQueuedBuffers.Value + device.NumEmptyBuffers.Value
+            notes.append(f"{free} of {self._buffers} buffers free")
+        else:
+            notes.append(f"{self._buffers} buffers")
+        if (speed := nodes.peek("BslUSBSpeedMode")) is not None:
+            notes.append(f"link {speed}")
+        if (limit := nodes.peek("DeviceLinkThroughputLimit")) is not None:
+            notes.append(f"link limited to {limit / 1e6:.0f} MB/s")
+        celsius = nodes.peek("DeviceTemperature", "TemperatureAbs")
+        return DeviceHealth(
+            device=DEVICE,
+            model=info.GetModelName() or UNKNOWN,
+            serial=info.GetSerialNumber() or UNKNOWN,
+            firmware=str(nodes.peek("DeviceFirmwareVersion", "DeviceVersion") or UNKNOWN),
+            temperature_c=None if celsius is None else float(celsius),
+            clock=stamping.means
+            if stamping.means == stamping.grade
+            else f"{stamping.means}, grade {stamping.grade}",
+            notes=tuple(notes),
+        )
 
     @property
     def _buffers(self) -> int:

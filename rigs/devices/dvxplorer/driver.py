@@ -28,7 +28,7 @@ POLL_S = 0.001
 SETTLE_S = 1.0
 """The longest that `start` and `stop` wait until all is taken that came before, s."""
 HANG_S = 10.0
-"""The thread must have come back from a look by then, s; longer than `event_process.ANSWER_S`."""
+"""The thread must have come back from a look by then, s; longer than `process.ANSWER_S`."""
 CLOSE_S = 3.0
 """The longest that `close` waits for the thread, s."""
 RISING_EDGE, TIMESTAMP_RESET = 1, 0

@@ -30,9 +30,8 @@ from sliplab.rigs.core.capabilities import (
 )
 from sliplab.rigs.core.pose import MM_PER_M, distance_mm, to_ur
 from sliplab.rigs.core.pose_stream import Sample
-from sliplab.rigs.devices.ur import ports as ur_ports
+from sliplab.rigs.devices.ur import ports
 from sliplab.rigs.devices.ur.control import WATCHDOG_HZ, ControlError, ControlProcess
-from sliplab.rigs.devices.ur.ports import ur_health
 from sliplab.rigs.devices.ur.rtde import OUTPUTS, Packet, RtdeError, RtdeReader, UrStatus, status_of
 from sliplab.rigs.devices.ur.settings import UrSettings
 from sliplab.storage.streams import Json
@@ -92,7 +91,7 @@ class UrArm(ArmDriver):
         """Open the pose stream, take control, set tool, payload and watchdog.
 
         Takes at most `ANSWER_S` + 3 `SILENCE_S` + 3 `PORT_S` + 2 `STILL_S` +
-        `ur_control.START_S` + 3 `COMMAND_S`.
+        `control.START_S` + 3 `COMMAND_S`.
 
         Raises:
             ArmFault: no connection, somebody else has control, or the arm may not move now.
@@ -124,8 +123,8 @@ class UrArm(ArmDriver):
         }:
             raise self._fault(self.state(), "cannot recover")
         self.close()
-        with contextlib.suppress(ur_ports.PortError):
-            ur_ports.dashboard(self._settings.host, "stop", PORT_S)
+        with contextlib.suppress(ports.PortError):
+            ports.dashboard(self._settings.host, "stop", PORT_S)
         self.connect()
 
     def state(self) -> ArmState:
@@ -156,8 +155,8 @@ class UrArm(ArmDriver):
         """
         notes = (f"sync line on digital input {self._settings.sync_input}",)
         try:
-            return ur_health(self._settings.host, notes)
-        except ur_ports.PortError as error:
+            return ports.read_health(self._settings.host, notes)
+        except ports.PortError as error:
             raise ArmFault("arm", f"{error}; check its power and network") from None
 
     def describe(self) -> Json:
@@ -199,7 +198,7 @@ class UrArm(ArmDriver):
         Raises:
             ArmFault: a move was handed over, and the arm could not be seen to stand still since,
                 neither in its stream nor on a new connection. Its own watchdog ends the move after
-                1 / `ur_control.WATCHDOG_HZ` s if the network is gone.
+                1 / `control.WATCHDOG_HZ` s if the network is gone.
         """
         run = self._run
         run.cancelled = True
@@ -477,7 +476,7 @@ class UrArm(ArmDriver):
     def _end_program(self) -> bool:
         """End the controller's program by the text ports; whether it said that it did."""
         deceleration = STOP_DECELERATION_MM_S2 / MM_PER_M
-        return ur_ports.end_program(self._settings.host, deceleration, PORT_S)
+        return ports.end_program(self._settings.host, deceleration, PORT_S)
 
     def _wait_still(self) -> bool:
         """Return whether a packet that was read from now on shows the arm at rest, in time."""
@@ -515,8 +514,8 @@ class UrArm(ArmDriver):
 
     def _check_remote(self) -> None:
         try:
-            answer = ur_ports.dashboard(self._settings.host, "is in remote control", PORT_S)
-        except ur_ports.PortError as error:
+            answer = ports.dashboard(self._settings.host, "is in remote control", PORT_S)
+        except ports.PortError as error:
             raise ArmFault("arm", f"does not answer: {error}") from None
         self._remote = answer.strip().lower() == "true"
 

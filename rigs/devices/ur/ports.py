@@ -89,7 +89,7 @@ def _line(link: socket.socket, deadline: float) -> str:
     return data.decode(errors="replace").strip()
 
 
-def ur_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
+def read_health(host: str, notes: tuple[str, ...]) -> DeviceHealth:
     """Return the report of a UR controller, by its dashboard (e-Series guide, PolyScope 5).
 
     Raises:

@@ -35,7 +35,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for place in (
         "flows.collecting.session.build_rig",
         "rigs.build.build_rig",
-        "rigs.discovery.reach",
+        "rigs.discovery.ping_devices",
     ):
         monkeypatch.setattr(f"sliplab.{place}", opened)
     name = next(iter(lock_names(load_rig_file(UR5)[0])))
