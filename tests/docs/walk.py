@@ -80,6 +80,7 @@ def walk(page: Path, folder: Path) -> int:
 
 def _write(path: Path, block: Block) -> None:
     if block.language != "diff":
+        path.parent.mkdir(exist_ok=True)  # a device begins with a folder of its own
         path.write_text(block.text)
         return
     lines = block.text.splitlines(keepends=True)
