@@ -72,13 +72,9 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trials as files that other programs read, or their labels as a table."""
-    from sliplab.storage.formats.export_trials import (
-        SUFFIXES,
-        export_trials,
-        label_table,
-        write_table,
-    )
+    from sliplab.storage.formats.export_trials import SUFFIXES, export_trials, label_table
     from sliplab.storage.remote.mirror import open_store
+    from sliplab.storage.trials.catalogue import write_table
 
     opened = open_store(store)
     campaigns = {campaign.name: campaign for campaign in opened.campaigns()}

@@ -59,7 +59,7 @@ def trials(
         except ValueError as error:
             raise InputError("--where", "", where, str(error)) from None
     if output is not None:
-        from sliplab.storage.formats.export_trials import write_table
+        from sliplab.storage.trials.catalogue import write_table
 
         write_table(table, output)
         console.say(f"{len(table)} trials: {output}")

@@ -41,6 +41,8 @@ from sliplab.storage.streams import U8, EventChunk, FrameChunk
 
 LINE = b"#!AER-DAT4.0\r\n"
 EVENTS, FRAMES, TRIGGERS = "EVTS", "FRME", "TRIG"
+SIMULATED = "simulated"
+"""Part of the source's name in a file that was written from simulated data."""
 _CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 _MOST_HEADER, _MOST_PACKET = 1 << 20, 1 << 28
 _PACKET_EVENTS = 1 << 16
@@ -379,10 +381,6 @@ def _described(streams: dict[int, Stream]) -> str:
                 item.text = str(value)
         ElementTree.SubElement(info, "attr", key="source", type="string").text = stream.source
     return ElementTree.tostring(root, encoding="unicode")
-
-
-SIMULATED = "simulated"
-"""Part of the source's name in a file that was written from simulated data."""
 
 
 def read_aedat4(path: Path, name: str) -> ForeignTrial:

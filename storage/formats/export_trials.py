@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import make_folder, sync_file, sync_folder, write_bytes, write_json
+from sliplab.storage.files import make_folder, sync_file, sync_folder, write_json
 from sliplab.storage.formats.aedat4 import EVENTS, FRAMES, SIMULATED, TRIGGERS, Aedat4Writer, Stream
 from sliplab.storage.formats.dsec import write_dsec
 from sliplab.storage.formats.foreign import EXPORT_FORMAT, EXPORT_MANIFEST, RISING, Triggers
@@ -157,22 +156,6 @@ def _size(recording: Recording) -> tuple[int, int]:
     )
 
 
-def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table atomically in the format that its name ends in.
-
-    Raises:
-        InputError: it ends in something else than .csv, .parquet or .json.
-    """
-    kinds: dict[str, Callable[[], bytes]] = {
-        ".csv": lambda: table.to_csv(index=False).encode(),
-        ".parquet": lambda: _parquet(table),
-        ".json": lambda: table.to_json(orient="records").encode(),
-    }
-    if path.suffix not in kinds:
-        raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
-    write_bytes(path, kinds[path.suffix]())
-
-
 def label_table(store: Store, campaign: str, trials: list[str]) -> pd.DataFrame:
     """Return one row a labelled trial: the single values of its label, times in integer ns.
 
@@ -198,9 +181,3 @@ def _flat(data: dict[str, Any], before: str) -> dict[str, Any]:
         elif not isinstance(value, list):
             flat[f"{before}{key}"] = value
     return flat
-
-
-def _parquet(table: pd.DataFrame) -> bytes:
-    made = io.BytesIO()
-    table.to_parquet(made, index=False, engine="pyarrow")
-    return made.getvalue()

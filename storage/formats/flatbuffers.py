@@ -20,6 +20,24 @@ import numpy.typing as npt
 from sliplab.storage.formats.foreign import FormatError
 from sliplab.storage.streams import I64, U8, EventChunk
 
+EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "p"],
+        "formats": ["<i8", "<i2", "<i2", "u1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+"""One event: time in us, column, row, whether it became brighter."""
+GREY = 0
+"""OpenCV's number of an 8-bit picture with one channel."""
+_VECTOR = bytes.fromhex("0000 0600 0800 0400 06000000 04000000")
+"""A table with one field, a vector, whose length follows: padding, vtable, table."""
+_TRIGGER_VTABLE = struct.pack("<4H", 8, 16, 8, 7)
+"""Vtable of a trigger's table of 16 bytes: time at 8, kind at 7."""
+_FRAME_VTABLE = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 44, 46, 48, 50, 52, 56)
+"""Five times, kind, width, height, place, and where the pixels are."""
+
 
 class Table:
     """A table at a place in some bytes."""
@@ -78,25 +96,6 @@ def _number(data: memoryview, form: str, at: int) -> int:
         raise FormatError("is damaged: a packet leads out of its own bytes")
     found: Any = struct.unpack_from(form, data, at)[0]
     return int(found)
-
-
-EVENT = np.dtype(
-    {
-        "names": ["t", "x", "y", "p"],
-        "formats": ["<i8", "<i2", "<i2", "u1"],
-        "offsets": [0, 8, 10, 12],
-        "itemsize": 16,
-    }
-)
-"""One event: time in us, column, row, whether it became brighter."""
-GREY = 0
-"""OpenCV's number of an 8-bit picture with one channel."""
-_VECTOR = bytes.fromhex("0000 0600 0800 0400 06000000 04000000")
-"""A table with one field, a vector, whose length follows: padding, vtable, table."""
-_TRIGGER_VTABLE = struct.pack("<4H", 8, 16, 8, 7)
-"""Vtable of a trigger's table of 16 bytes: time at 8, kind at 7."""
-_FRAME_VTABLE = struct.pack("<13H", 26, 60, 4, 12, 20, 28, 36, 44, 46, 48, 50, 52, 56)
-"""Five times, kind, width, height, place, and where the pixels are."""
 
 
 def events_buffer(chunk: EventChunk) -> bytes:

@@ -68,159 +68,6 @@ _FRAME_RATE = 100
 """Time base of the video only; frames keep their own times."""
 
 
-def kind_of(path: Path) -> str:
-    """Return the format of a file, or of the files in a folder.
-
-    Raises:
-        InputError: none of them is known, or they are of several.
-    """
-    files = _files(path)
-    found = {_kind(file) for file in files} - {None}
-    if pairs(files):
-        found.add(LAB_PICKLES)
-    if len(found) == 1:
-        return str(found.pop())
-    what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
-    raise InputError(
-        path, "", None,
-        f"{what if found else 'holds no file of a known format'}; name one of {', '.join(KINDS)}",
-    )  # fmt: skip
-
-
-def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
-    """Yield the trials of a file or folder, in the order of their names.
-
-    Raises:
-        InputError: there is none, or a file is damaged.
-    """
-    files = _files(path)
-    if kind == LAB_PICKLES:
-        found = pairs(files)
-        if not found:
-            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
-        for pair in found:
-            yield read_pair(pair, name_of(pair.stem))
-        return
-    suffixes, reader = READERS[kind]
-    told = _read_manifest(path) if path.is_dir() else None
-    if told is not None:
-        for item in told["trials"]:
-            file = path / item["file"]
-            if file.is_symlink() or not file.is_file():
-                raise InputError(file, "", None, "is missing, or no plain file")
-            yield _as_exported(_read(reader, file, item["trial"]), item, told["simulated"])
-        return
-    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
-    if not wanted:
-        raise InputError(
-            path, "", None, f"holds no {kind} file; such files end in {' or '.join(suffixes)}"
-        )
-    for file in wanted:
-        yield _read(reader, file, name_of(_stem(file)))
-
-
-def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
-    try:
-        return reader(file, name)
-    except FormatError as error:
-        raise InputError(file, "", None, str(error)) from None
-
-
-def _stem(file: Path) -> str:
-    """Return a file's name without its ending; a name without one may have dots in it."""
-    known = {ending for endings, _ in READERS.values() for ending in endings}
-    return file.stem if file.suffix.lower() in known else file.name
-
-
-def name_of(stem: str) -> str:
-    """Make the name of a trial from a file's name: other characters become ``_``."""
-    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
-    return plain or "trial"
-
-
-def _files(path: Path) -> list[Path]:
-    """List plain files; links are left out, for they may lead anywhere."""
-    if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
-    elif path.is_file():
-        found = [path]
-    else:
-        raise InputError(path, "", None, "no such file or folder")
-    return found
-
-
-def _possible(file: Path) -> tuple[str, ...]:
-    """Return the formats that a file may have: by its first bytes, else by its name's ending."""
-    head = read_head(file)
-    if head.startswith(LINE):
-        return ("aedat4",)
-    if head.startswith(_HDF5):
-        return ("dsec", "lab-hdf5")
-    if form := faery_type(head):
-        return ("es",) if form == "es" else ("raw",)
-    suffix = file.suffix.lower()
-    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
-
-
-def _kind(file: Path) -> str | None:
-    kinds = _possible(file)
-    if "dsec" in kinds:
-        try:
-            return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
-        except FormatError as error:
-            raise InputError(file, "", None, str(error)) from None
-    return kinds[0] if kinds else None
-
-
-def _read_manifest(folder: Path) -> Json | None:
-    """Read and check the manifest of an exported campaign; None where there is none.
-
-    Raises:
-        InputError: it is damaged, or names a file outside of its folder.
-    """
-    path = folder / EXPORT_MANIFEST
-    if not path.is_file() or path.is_symlink():
-        return None
-    try:
-        found = read_json(path)
-        if found.get("sliplab_export") != EXPORT_FORMAT:
-            raise ValueError(f"{path}: sliplab_export must be {EXPORT_FORMAT}")
-        if not isinstance(found.get("simulated"), bool):
-            raise ValueError(f"{path}: simulated must be true or false")
-        for item in found["trials"]:
-            safe_name(item["trial"])
-            safe_name(item["file"])
-            _check_exported(item, path)
-    except OSError as error:
-        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, StoreError) as error:
-        text = str(error).removeprefix(f"{path}: ")
-        raise InputError(path, "", None, f"is damaged: {text}") from None
-    return found
-
-
-def _check_exported(item: Json, path: Path) -> None:
-    texts = item["condition"]
-    if not isinstance(texts, dict) or not all(isinstance(t, str) for t in texts.values()):
-        raise ValueError(f"{path}: a condition that is no text")
-    for name in ("events", "frames", "triggers", "repetition"):
-        if type(item[name]) is not int:
-            raise ValueError(f"{path}: {name} must be an integer")
-
-
-def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
-    """Return a trial with what the manifest states of it."""
-    about: dict[str, Any] = {**trial.about, "exported": item.get("record", {})}
-    return replace(
-        trial,
-        condition=dict(item["condition"]),
-        repetition=item["repetition"],
-        simulated=simulated or trial.simulated,
-        about=about,
-        unknown=tuple(what for what in trial.unknown if what != "condition"),
-    )
-
-
 def import_trials(
     store: Store,
     name: str,
@@ -407,3 +254,156 @@ def _record(
     except ValidationError as error:
         key, value, expected = first_fault(error)
         raise FormatError(f"holds {key} = {value!r:.60}, which {expected}") from None
+
+
+def kind_of(path: Path) -> str:
+    """Return the format of a file, or of the files in a folder.
+
+    Raises:
+        InputError: none of them is known, or they are of several.
+    """
+    files = _files(path)
+    found = {_kind(file) for file in files} - {None}
+    if pairs(files):
+        found.add(LAB_PICKLES)
+    if len(found) == 1:
+        return str(found.pop())
+    what = f"holds files of several formats ({', '.join(sorted(map(str, found)))})"
+    raise InputError(
+        path, "", None,
+        f"{what if found else 'holds no file of a known format'}; name one of {', '.join(KINDS)}",
+    )  # fmt: skip
+
+
+def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
+    """Yield the trials of a file or folder, in the order of their names.
+
+    Raises:
+        InputError: there is none, or a file is damaged.
+    """
+    files = _files(path)
+    if kind == LAB_PICKLES:
+        found = pairs(files)
+        if not found:
+            raise InputError(path, "", None, "holds no NAME_events_on or NAME_events_off")
+        for pair in found:
+            yield read_pair(pair, name_of(pair.stem))
+        return
+    suffixes, reader = READERS[kind]
+    told = _read_manifest(path) if path.is_dir() else None
+    if told is not None:
+        for item in told["trials"]:
+            file = path / item["file"]
+            if file.is_symlink() or not file.is_file():
+                raise InputError(file, "", None, "is missing, or no plain file")
+            yield _as_exported(_read(reader, file, item["trial"]), item, told["simulated"])
+        return
+    wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
+    if not wanted:
+        raise InputError(
+            path, "", None, f"holds no {kind} file; such files end in {' or '.join(suffixes)}"
+        )
+    for file in wanted:
+        yield _read(reader, file, name_of(_stem(file)))
+
+
+def name_of(stem: str) -> str:
+    """Make the name of a trial from a file's name: other characters become ``_``."""
+    plain = re.sub(r"\.{2,}", "_", _UNSAFE.sub("_", stem)).lstrip("=,._+-")[:200]
+    return plain or "trial"
+
+
+def _read(reader: Reader, file: Path, name: str) -> ForeignTrial:
+    try:
+        return reader(file, name)
+    except FormatError as error:
+        raise InputError(file, "", None, str(error)) from None
+
+
+def _stem(file: Path) -> str:
+    """Return a file's name without its ending; a name without one may have dots in it."""
+    known = {ending for endings, _ in READERS.values() for ending in endings}
+    return file.stem if file.suffix.lower() in known else file.name
+
+
+def _files(path: Path) -> list[Path]:
+    """List plain files; links are left out, for they may lead anywhere."""
+    if path.is_dir():
+        found = sorted(file for file in path.iterdir() if file.is_file() and not file.is_symlink())
+    elif path.is_file():
+        found = [path]
+    else:
+        raise InputError(path, "", None, "no such file or folder")
+    return found
+
+
+def _possible(file: Path) -> tuple[str, ...]:
+    """Return the formats that a file may have: by its first bytes, else by its name's ending."""
+    head = read_head(file)
+    if head.startswith(LINE):
+        return ("aedat4",)
+    if head.startswith(_HDF5):
+        return ("dsec", "lab-hdf5")
+    if form := faery_type(head):
+        return ("es",) if form == "es" else ("raw",)
+    suffix = file.suffix.lower()
+    return tuple(kind for kind, (endings, _) in READERS.items() if suffix in endings)
+
+
+def _kind(file: Path) -> str | None:
+    kinds = _possible(file)
+    if "dsec" in kinds:
+        try:
+            return "lab-hdf5" if is_lab_hdf5(file) else "dsec"
+        except FormatError as error:
+            raise InputError(file, "", None, str(error)) from None
+    return kinds[0] if kinds else None
+
+
+def _read_manifest(folder: Path) -> Json | None:
+    """Read and check the manifest of an exported campaign; None where there is none.
+
+    Raises:
+        InputError: it is damaged, or names a file outside of its folder.
+    """
+    path = folder / EXPORT_MANIFEST
+    if not path.is_file() or path.is_symlink():
+        return None
+    try:
+        found = read_json(path)
+        if found.get("sliplab_export") != EXPORT_FORMAT:
+            raise ValueError(f"{path}: sliplab_export must be {EXPORT_FORMAT}")
+        if not isinstance(found.get("simulated"), bool):
+            raise ValueError(f"{path}: simulated must be true or false")
+        for item in found["trials"]:
+            safe_name(item["trial"])
+            safe_name(item["file"])
+            _check_exported(item, path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, StoreError) as error:
+        text = str(error).removeprefix(f"{path}: ")
+        raise InputError(path, "", None, f"is damaged: {text}") from None
+    return found
+
+
+def _check_exported(item: Json, path: Path) -> None:
+    texts = item["condition"]
+    if not isinstance(texts, dict) or not all(isinstance(t, str) for t in texts.values()):
+        raise ValueError(f"{path}: a condition that is no text")
+    for name in ("events", "frames", "triggers", "repetition"):
+        if type(item[name]) is not int:
+            raise ValueError(f"{path}: {name} must be an integer")
+
+
+def _as_exported(trial: ForeignTrial, item: Json, simulated: bool) -> ForeignTrial:
+    """Return a trial with what the manifest states of it."""
+    about: dict[str, Any] = {**trial.about, "exported": item.get("record", {})}
+    return replace(
+        trial,
+        condition=dict(item["condition"]),
+        repetition=item["repetition"],
+        simulated=simulated or trial.simulated,
+        about=about,
+        unknown=tuple(what for what in trial.unknown if what != "condition"),
+    )

@@ -16,6 +16,7 @@ import io
 import json
 import os
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import condition_columns
 from sliplab.storage.files import make_folder, write_bytes
 from sliplab.storage.streams import I64, Json
@@ -70,6 +72,46 @@ def catalogue(store: Store, unreadable: list[str] | None = None) -> pd.DataFrame
     if names == list(known.bounds) and not any(part.changed for part in parts):
         return known.table
     return _rebuilt(store, parts, known, began_ns)
+
+
+def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
+    """Return the rows for which a pandas expression holds.
+
+    Args:
+        expression: such as ``depth_mm > 2.8 and events > 1000``.
+
+    Raises:
+        ValueError: the expression cannot be read, or names something besides columns.
+    """
+    if "@" in expression or "__" in expression:
+        raise ValueError("must use columns, numbers, text and operators only")
+    try:
+        return table.query(expression, engine="python", local_dict={}, global_dict={})
+    except Exception as error:
+        columns = ", ".join(map(str, table.columns))
+        raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table atomically in the format that its name ends in.
+
+    Raises:
+        InputError: it ends in something else than .csv, .parquet or .json.
+    """
+    kinds: dict[str, Callable[[], bytes]] = {
+        ".csv": lambda: table.to_csv(index=False).encode(),
+        ".parquet": lambda: _parquet(table),
+        ".json": lambda: table.to_json(orient="records").encode(),
+    }
+    if path.suffix not in kinds:
+        raise InputError("--output", "", str(path), "must end in .csv, .parquet or .json")
+    write_bytes(path, kinds[path.suffix]())
+
+
+def _parquet(table: pd.DataFrame) -> bytes:
+    made = io.BytesIO()
+    table.to_parquet(made, index=False, engine="pyarrow")
+    return made.getvalue()
 
 
 class _Part:
@@ -171,24 +213,6 @@ def _row(campaign: str, recording: Recording) -> dict[str, Any]:
     }
 
 
-def query(table: pd.DataFrame, expression: str) -> pd.DataFrame:
-    """Return the rows for which a pandas expression holds.
-
-    Args:
-        expression: such as ``depth_mm > 2.8 and events > 1000``.
-
-    Raises:
-        ValueError: the expression cannot be read, or names something besides columns.
-    """
-    if "@" in expression or "__" in expression:
-        raise ValueError("must use columns, numbers, text and operators only")
-    try:
-        return table.query(expression, engine="python", local_dict={}, global_dict={})
-    except Exception as error:
-        columns = ", ".join(map(str, table.columns))
-        raise ValueError(f"cannot be read ({error}); the columns are {columns}") from None
-
-
 @dataclass
 class _Listing:
     """The folders among a campaign's committed trials as they are now, by name."""
@@ -269,10 +293,6 @@ def _stamp(path: Path, settled: bool = False) -> str:
     return f"{told.st_ino} {told.st_mtime_ns} {told.st_size}"
 
 
-def _path(store: Store) -> Path:
-    return store.folder / "derived" / "catalogue" / "index"
-
-
 def _read_index(store: Store) -> _Known | None:
     """Read the index; None where there is none that can be used."""
     try:
@@ -326,3 +346,7 @@ def _write_index(
         path = _path(store)
         make_folder(path.parent)
         write_bytes(path, hashlib.sha256(data).digest() + data)
+
+
+def _path(store: Store) -> Path:
+    return store.folder / "derived" / "catalogue" / "index"

@@ -76,12 +76,10 @@ def ask(
     raise OSError(f"{journal.folder}: no number is free")
 
 
-def requests(store: Store, after: int = 0) -> list[Request]:
-    """Return the requests with a number above `after`, in order; unreadable ones are left out."""
+def requests(store: Store) -> list[Request]:
+    """Return all requests in order; unreadable ones are left out."""
     journal, found = _journal(store), []
     for number in journal.numbers():
-        if number <= after:
-            continue
         try:
             data = read_json(journal.path(number))
             made = Request(
@@ -118,9 +116,9 @@ def answered(store: Store, request: Request) -> Json | None:
     return found if isinstance(found.get("did"), dict) else {"did": {}}
 
 
-def open_requests(store: Store, after: int = 0) -> list[Request]:
+def open_requests(store: Store) -> list[Request]:
     """Return the requests that nobody has carried out yet, in order."""
-    return [item for item in requests(store, after) if answered(store, item) is None]
+    return [item for item in requests(store) if answered(store, item) is None]
 
 
 def paused(store: Store) -> Request | None:

@@ -22,12 +22,12 @@ from sliplab.protocols.errors import InputError
 from sliplab.storage.files import read_json
 from sliplab.storage.formats import lab_pickles as lab
 from sliplab.storage.formats.aedat4 import Aedat4File, Aedat4Writer, Stream
-from sliplab.storage.formats.export_trials import export_trials, label_table, write_table
+from sliplab.storage.formats.export_trials import export_trials, label_table
 from sliplab.storage.formats.flatbuffers import events_buffer, frame_buffer
 from sliplab.storage.formats.foreign import EXPORT_MANIFEST, FormatError, Triggers
 from sliplab.storage.formats.import_trials import import_trials, kind_of, name_of, trials_in
 from sliplab.storage.streams import EventChunk
-from sliplab.storage.trials.catalogue import catalogue
+from sliplab.storage.trials.catalogue import catalogue, write_table
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
