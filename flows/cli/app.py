@@ -13,12 +13,12 @@ from sliplab.flows.cli import (
     exchange,
     review,
     rigs,
+    schema,
     steps,
     store,
     study,
     sweeps,
 )
-from sliplab.flows.cli.schema import register as register_schema
 from sliplab.flows.running import console
 
 app = typer.Typer(
@@ -49,8 +49,6 @@ def options(
     """Run tactile slip experiments: plan, collect, sync, label, train, evaluate, report."""
 
 
-schemas = typer.Typer()
-register_schema(schemas)
 for part in (
     collect.app,
     steps.app,
@@ -62,6 +60,6 @@ for part in (
     exchange.app,
     review.app,
     detect.app,
-    schemas,
+    schema.app,
 ):
     app.add_typer(part)

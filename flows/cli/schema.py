@@ -11,9 +11,12 @@ from sliplab.flows.cli.common import JsonOption, finish
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
+app = typer.Typer()
+
 KINDS = ("protocol", "rig")
 
 
+@app.command()
 def schema(
     kind: Annotated[str, typer.Argument(help="Of which file: protocol or rig.")],
     out: Annotated[
@@ -33,8 +36,3 @@ def schema(
         return
     write_json(out, made)
     finish({"kind": kind, "file": str(out)}, f"schema {kind}", as_json)
-
-
-def register(app: typer.Typer) -> None:
-    """Put the command on the command line."""
-    app.command()(schema)
