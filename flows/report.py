@@ -19,7 +19,7 @@ from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.programs import read_programs, shape_checked
 from sliplab.analysis.report.summary import Sources, make_summary
-from sliplab.analysis.report.tradeoff_scene import make_sections
+from sliplab.analysis.report.tradeoff_scene import scene_cost
 from sliplab.analysis.report.trial import choose_example
 from sliplab.flows.labelling import label_errors
 from sliplab.flows.learning import evaluate, other_networks, window_baselines, window_scores
@@ -147,7 +147,7 @@ def _shown(sources: Sources) -> content.Shown:
     scene = None
     if "scene" in sources.programs:
         with shape_checked("scene"):
-            scene = make_sections(sources.programs["scene"])[0]
+            scene = scene_cost(sources.programs["scene"])
     return content.Shown(
         model_file.load(model.path),
         None if example is None else (example, counts),

@@ -17,7 +17,8 @@ import numpy as np
 
 from sliplab.analysis.report.figures.intervals import Share, shares
 from sliplab.analysis.report.figures.tradeoffs import Panel, Point, cost_and_error
-from sliplab.analysis.report.page import Content, Figure, Link, Section, Table, number, percent
+from sliplab.analysis.report.page import Content, Figure, Link, Table, number, percent
+from sliplab.analysis.report.tradeoff_scene import SceneCost
 from sliplab.analysis.report.windows import share_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
@@ -147,7 +148,7 @@ class TradeoffSection(Content):
     template: ClassVar[str] = "tradeoff.html"
     missing: Sequence[tuple[str, str]]
     protocol: str | None
-    scene: Section | None
+    scene: SceneCost | None
     scene_figure: Figure | None
     labels: Sequence[Table]
     search: Figure | None
@@ -159,13 +160,13 @@ class TradeoffSection(Content):
 
 
 def tradeoff_section(
-    store: Store, found: Mapping[str, Json], scene: Section | None
+    store: Store, found: Mapping[str, Json], scene: SceneCost | None
 ) -> TradeoffSection:
     """Show the searches for speed and error.
 
     Args:
         found: by name in `FILES`.
-        scene: the section on cost and error of the scene's own page.
+        scene: cost and error of the scene.
 
     Raises:
         StoreError: a file is of another shape.
@@ -175,7 +176,7 @@ def tradeoff_section(
     scene_figure, search, table, front, tried = None, None, None, 0, 0
     if scene is not None:
         with shape_checked("scene"):
-            scene_figure = replace(scene.figures[0], name="tradeoff-scene",
+            scene_figure = replace(scene.figure, name="tradeoff-scene",
                                    data=_scene_data(found["scene"]["variants"]))  # fmt: skip
     tables = []
     for name, make in (("labels", label_speed), ("labels_truth", label_truth)):

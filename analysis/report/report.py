@@ -17,7 +17,6 @@ from sliplab.analysis.report.outcomes import failure_section
 from sliplab.analysis.report.page import (
     Content,
     Number,
-    Section,
     Table,
     number,
     percent,
@@ -32,6 +31,7 @@ from sliplab.analysis.report.programs import (
 )
 from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.summary import Sources
+from sliplab.analysis.report.tradeoff_scene import SceneCost
 from sliplab.analysis.report.trial import Example, output_section, trial_section
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.summary import SeedsUsed, Summary
@@ -50,7 +50,7 @@ class Shown:
     fitted: Fitted
     example: tuple[Example, Mapping[str, Any]] | None
     distances: Mapping[str, Mapping[str, Sequence[float]]]
-    scene: Section | None
+    scene: SceneCost | None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 from sliplab.analysis.report.figures.tradeoffs import (
@@ -13,8 +12,7 @@ from sliplab.analysis.report.figures.tradeoffs import (
     factor_lines,
     front_panels,
 )
-from sliplab.analysis.report.page import Figure, Section, Table, number, percent, render_page
-from sliplab.analysis.report.prose import paragraph, paragraphs
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
 from sliplab.analysis.sweeps.detector_rows import (
     FACTORS,
     LOOSE,
@@ -50,28 +48,40 @@ DRAWN = {
 }
 """Factors on figures in the plots."""
 
-_prose = partial(paragraphs, "tradeoff_detector.txt")
-_caption = partial(paragraph, "tradeoff_detector.txt")
 Result = Mapping[str, Any]
 
 
 def render(result: Result) -> str:
     """Return the page as text; everything in it is escaped but the figures' SVG."""
-    return render_page(
-        "tradeoff_detector.html", make_sections(result), simulated=result["simulated"],
-        kept=result["kept"], runs=result["runs"],
-    )  # fmt: skip
-
-
-def make_sections(result: Result) -> list[Section]:
-    """Return the sections of the page, in order."""
-    rows, simulated = rows_of(result), result["simulated"]
-    sections = [_tried(result)]
+    rows, simulated, trials = rows_of(result), result["simulated"], result["trials"]
+    values = {
+        **result,
+        "loose": LOOSE,
+        "most_missed": MOST_MISSED,
+        "not_tried": Table(("left out", "why"), [[*each] for each in result["left_out"].items()]),
+        "warned": Table(
+            ("network", "warning"), [[run, "; ".join(of)] for run, of in result["warnings"].items()]
+        ),
+        "detectors": distinct(rows),
+    }
     if rows:
-        sections += [_short_list(rows), _front(rows, bool(result["trials"]["falling"]))]
-        sections += [_plots(rows, simulated), _factors(rows, result["comparisons"], simulated)]
-        sections += [_cross(rows), _pairs(result["pairs"])]
-    return [section for section in sections if section.tables or section.figures or section.text]
+        budgets = [[percent(budget, 0), *cells(row)] for budget, row in short_list(rows)]
+        front = [row for row in values["detectors"] if row.front]
+        comparisons = [(rows[item["row"]], item) for item in result["comparisons"]]
+        values |= {
+            "short_list": Table(("budget", *COLUMNS), budgets),
+            "front": _front(rows, leads=bool(trials["falling"])),
+            "on_front": len(front),
+            "on_both": sum(row.front_validation for row in front),
+            "most": MOST_ROWS,
+            "points": _points(rows, simulated),
+            "seeds": max(len(row.seeds) for row in rows),
+            "lines": _lines(comparisons, simulated),
+            "factors": _factors(comparisons),
+            "cross": _cross(rows),
+            "pairs": _pairs(result["pairs"]),
+        }
+    return render_page("tradeoff_detector.html", **values)
 
 
 def rows_of(result: Result) -> list[Row]:
@@ -79,78 +89,64 @@ def rows_of(result: Result) -> list[Row]:
     return [Row.of_json(row) for row in result["rows"]]
 
 
-def _tried(result: Result) -> Section:
-    left_out = [[name, why] for name, why in result["left_out"].items()]
-    warned = [[name, "; ".join(each)] for name, each in result["warnings"].items()]
-    tables = [Table(("left out", "why"), left_out)] if left_out else []
-    tables += [Table(("network", "warning"), warned)] if warned else []
-    return Section("What was tried", _prose("tried", loose=LOOSE, **result), (), tables)
-
-
-def _short_list(rows: Sequence[Row]) -> Section:
-    found = [[percent(budget, 0), *cells(row)] for budget, row in short_list(rows)]
-    text = _prose("short_list", most_missed=MOST_MISSED, found=found)
-    tables = [Table(("budget", *COLUMNS), found)] if found else []
-    return Section("A short list", text, (), tables)
-
-
-def _front(rows: Sequence[Row], falling: bool) -> Section:
-    once = distinct(rows)
-    on = sum(row.front for row in once)
-    both = sum(row.front and row.front_validation for row in once)
-    paper = next((row for row in once if row.paper), None)
+def _front(rows: Sequence[Row], *, leads: bool) -> Table:
     shown, columns = ordered_front(rows, MOST_ROWS), list(COLUMNS)
     table = [cells(row) for row in shown]
-    if falling:
+    if leads:
         columns.append("shortest lead (ms)")
-        leads = [number(mean((row.falling or {})["lead_min_ms"]), 0) for row in shown]
-        table = [[*each, lead] for each, lead in zip(table, leads, strict=True)]
-    text = _prose("front", on=on, rows=len(once), both=both, paper=paper, falling=falling)
-    caption = _caption("front_caption", on=on, most=MOST_ROWS, falling=falling)
-    return Section("The Pareto front", text, (), [Table(columns, table, caption)])
+        found = [number(mean((row.falling or {})["lead_min_ms"]), 0) for row in shown]
+        table = [[*each, lead] for each, lead in zip(table, found, strict=True)]
+    return Table(columns, table)
 
 
-def _plots(rows: Sequence[Row], simulated: bool) -> Section:
+def _points(rows: Sequence[Row], simulated: bool) -> Figure:
     def values(row: Row) -> dict[str, float | None]:
         found = {name: row.objective(name) for name in OBJECTIVES}
         return {k: None if v is None else DRAWN.get(k, 1.0) * v for k, v in found.items()}
 
     points = [Point(values(row), row.front, row.paper) for row in rows]
-    svg = front_panels(points, PANELS, simulated=simulated)
-    return Section("Speed, work and error", [], [Figure(svg, _caption("plots_caption"))])
+    return Figure(front_panels(points, PANELS, simulated=simulated))
 
 
-def _factors(
-    rows: Sequence[Row], comparisons: Sequence[Mapping[str, Any]], simulated: bool
-) -> Section:
-    bars: dict[str, list[Bar]] = {title: [] for title in FACTORS.values()}
-    table = []
-    for item in comparisons:
-        row, title, found = rows[item["row"]], FACTORS[item["factor"]], item["difference"]
-        strict, late = row.test["strict"], row.test["mean_ms"]
-        ranges = {"strict": seed_range(strict, 100), "mean_ms": seed_range(late, 1)}
-        value = item["value"] if isinstance(item["value"], str) else f"{item['value']:g}"
-        bars[title].append(Bar(value, item["paper"], ranges))
-        if item["paper"] or found is None:
-            shown = ["paper's" if item["paper"] else "–"] * 3
-        else:
-            shown = [
-                format_difference(found["strict"], 100, "points"),
-                format_difference(found["mean_ms"], 1, "ms"),
-                format_difference(found["false_early_either"], 100, "points"),
-            ]
-        table.append([f"{title}: {value}", spread(strict, 100, 1), spread(late, 1, 0), *shown])
-    drawn = {title: each for title, each in bars.items() if each}
+Comparisons = Sequence[tuple[Row, Mapping[str, Any]]]
+"""Rows on the lines through the paper's setting, as `comparisons` of `detector_rows` has them."""
+
+
+def _level(item: Mapping[str, Any]) -> str:
+    value = item["value"]
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _lines(comparisons: Comparisons, simulated: bool) -> Figure:
+    bars: dict[str, list[Bar]] = {}
+    for row, item in comparisons:
+        ranges = {
+            "strict": seed_range(row.test["strict"], 100),
+            "mean_ms": seed_range(row.test["mean_ms"], 1),
+        }
+        bar = Bar(_level(item), item["paper"], ranges)
+        bars.setdefault(FACTORS[item["factor"]], []).append(bar)
     figures = {"strict": "strict accuracy (%)", "mean_ms": "mean latency (ms)"}
-    svg = factor_lines(drawn, figures, simulated=simulated)
+    return Figure(factor_lines(bars, figures, simulated=simulated))
+
+
+def _factors(comparisons: Comparisons) -> Table:
+    points = (100, "points")
+    compared = {"strict": points, "mean_ms": (1, "ms"), "false_early_either": points}
+    table = []
+    for row, item in comparisons:
+        found = item["difference"]
+        shown = ["paper's" if item["paper"] else "–"] * 3
+        if found is not None and not item["paper"]:
+            shown = [format_difference(found[name], *how) for name, how in compared.items()]
+        means = [spread(row.test["strict"], 100, 1), spread(row.test["mean_ms"], 1, 0)]
+        table.append([f"{FACTORS[item['factor']]}: {_level(item)}", *means, *shown])
     columns = ("factor", "strict (%)", "mean latency (ms)", "strict, difference",
                "latency, difference", "false early, difference")  # fmt: skip
-    text = _prose("factors", seeds=max((len(row.seeds) for row in rows), default=0))
-    figure = Figure(svg, _caption("factors_caption"))
-    return Section("One factor at a time", text, [figure], [Table(columns, table)])
+    return Table(columns, table)
 
 
-def _cross(rows: Sequence[Row]) -> Section:
+def _cross(rows: Sequence[Row]) -> Table:
     """Window length by pooling."""
     there = {
         (row.setting.length_ms, row.setting.pool_px): [
@@ -168,12 +164,10 @@ def _cross(rows: Sequence[Row]) -> Section:
         [f"{length} ms", *(", ".join(there.get((length, pool), ["–"])) for pool in pools)]
         for length in lengths
     ]
-    columns = ["window", *(f"cells of {pool} px" for pool in pools)]
-    tables = [Table(columns, table, _caption("cross_caption"))]
-    return Section("Window length and pooling", (), (), tables)
+    return Table(["window", *(f"cells of {pool} px" for pool in pools)], table)
 
 
-def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Section:
+def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Table:
     found = {
         (pair["smoothing"], pair["margin"]): f"{number(pair['mean_ms'], 0)} ms, "
         f"{hundred(pair['false_early_either'], 0)} / {hundred(pair['lost_either'], 0)} %"
@@ -181,10 +175,7 @@ def _pairs(pairs: Sequence[Mapping[str, Any]]) -> Section:
     }
     smoothings, margins = (sorted({key[k] for key in found}) for k in (0, 1))
     table = [[f"{s}", *(found[s, margin] for margin in margins)] for s in smoothings]
-    columns = ["windows", *(f"margin {margin:g}" for margin in margins)]
-    tables = [Table(columns, table, _caption("pairs_caption"))] if table else []
-    title = "Smoothing and margin with the paper's windows"
-    return Section(title, _prose("pairs"), (), tables)
+    return Table(["windows", *(f"margin {margin:g}" for margin in margins)], table)
 
 
 def distinct(rows: Sequence[Row]) -> list[Row]:

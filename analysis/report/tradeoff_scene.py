@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.report.figures.tradeoffs import cost_against_error
-from sliplab.analysis.report.page import Figure, Section, Table, number, percent, render_page
-from sliplab.analysis.report.prose import paragraph, paragraphs
+from sliplab.analysis.report.page import Figure, Table, number, percent, render_page
 from sliplab.analysis.sweeps.scene_tradeoff import table_rows
 from sliplab.analysis.sweeps.scene_windows import PHASES
 
@@ -39,29 +38,66 @@ SENSITIVITY_COLUMNS = (
     "hold (%)", "loading (%)", "incipient (%)", "gross (%)",
 )  # fmt: skip
 
-_prose = partial(paragraphs, "tradeoff_scene.txt")
-_caption = partial(paragraph, "tradeoff_scene.txt")
 Result = Mapping[str, Any]
 Error = Mapping[str, float | None]
 
 
+@dataclass(frozen=True)
+class SceneCost:
+    """Cost and error of a scene's variants; `templates/scene_cost.html` has the words.
+
+    Attributes:
+        trials: ids of the trials that were simulated.
+    """
+
+    trials: Sequence[str]
+    figure: Figure
+    table: Table
+
+
 def render(result: Result) -> str:
     """Return the page as text; everything in it is escaped but the figures' SVG."""
-    return render_page(
-        "tradeoff_scene.html", make_sections(result), simulated=True,
-        protocol=result["protocol"], rig=result["rig"],
-    )  # fmt: skip
+    found, sensitivity = result["windows"], result.get("sensitivity")
+    samples = [
+        [name.replace("_", " "), str(found["samples"][name]), percent(found["silent_share"][name])]
+        for name in CLASSES
+    ]
+    rates = [[phase, number(found["events_per_s"][phase], 0)] for phase in PHASES]
+    values = {
+        **result,
+        "cost": scene_cost(result),
+        "samples": Table(("class", "samples", "without a signal event"), samples),
+        "rates": Table(("phase", "signal events/s"), rates),
+        "sensitivity": None,
+    }
+    if sensitivity is not None:
+        values["sensitivity"] = Table(SENSITIVITY_COLUMNS, sensitivity_rows(sensitivity))
+        values["sensitivity_text"] = _sensitivity_text(sensitivity)
+    return render_page("tradeoff_scene.html", **values)
 
 
-def make_sections(result: Result) -> list[Section]:
-    """Return the sections of the page, in order."""
-    choice = Section("The level that the protocol needs", _prose("choice", **result["choice"]))
-    sections = [_cost(result), choice, _windows(result["windows"])]
-    if "sensitivity" in result:
-        table = Table(SENSITIVITY_COLUMNS, sensitivity_rows(result["sensitivity"]))
-        text = _sensitivity_text(result["sensitivity"])
-        sections.append(Section("What the guesses decide", text, tables=[table]))
-    return sections
+def scene_cost(result: Result) -> SceneCost:
+    """Return figure and table of cost and error."""
+    series = {
+        title: [
+            (row["name"], 1e3 * row["wall_s"], _drawn(family, row["error"]))
+            for row in result["variants"]
+            if row["family"] == family and row["step_ms"] is not None
+        ]
+        for family, title in FAMILIES.items()
+    }
+    lines = {"two seeds of one scene": result["seeds"]} | {
+        f"{row['level']}, closed forms ({1e3 * row['wall_s']:.2g} ms)": row["error"]
+        for row in result["variants"]
+        if row["step_ms"] is None
+    }
+    svg = cost_against_error(series, ERRORS, lines, "wall time of a trial (ms)", simulated=True)
+    return SceneCost(result["trials"], Figure(svg), Table(COLUMNS, tradeoff_rows(result)))
+
+
+def _drawn(family: str, error: Error) -> Error:
+    """Leave out of chords what a camera's path does not move: onsets and labels."""
+    return {**error, **dict.fromkeys(CONTACT_ONLY)} if family == "chord" else error
 
 
 def tradeoff_rows(result: Result) -> list[list[str]]:
@@ -91,45 +127,6 @@ def choice_pairs(result: Result) -> dict[str, str]:
     return {name: f"{choice[key]['level']}: {choice[key]['reason']}" for name, key in names.items()}
 
 
-def _cost(result: Result) -> Section:
-    series = {
-        title: [
-            (row["name"], 1e3 * row["wall_s"], _drawn(family, row["error"]))
-            for row in result["variants"]
-            if row["family"] == family and row["step_ms"] is not None
-        ]
-        for family, title in FAMILIES.items()
-    }
-    lines = {"two seeds of one scene": result["seeds"]} | {
-        f"{row['level']}, closed forms ({1e3 * row['wall_s']:.2g} ms)": row["error"]
-        for row in result["variants"]
-        if row["step_ms"] is None
-    }
-    svg = cost_against_error(series, ERRORS, lines, "wall time of a trial (ms)", simulated=True)
-    text = _prose("cost", trials=result["trials"], left_out=result["left_out"])
-    table = Table(COLUMNS, tradeoff_rows(result), _caption("cost_table"))
-    return Section("Cost and error", text, [Figure(svg, _caption("cost_figure"))], [table])
-
-
-def _drawn(family: str, error: Error) -> Error:
-    """The path between rows is the camera's: it moves no onset and no label."""
-    return {**error, **dict.fromkeys(CONTACT_ONLY)} if family == "chord" else error
-
-
-def _windows(found: Mapping[str, Any]) -> Section:
-    samples = [
-        [name.replace("_", " "), str(found["samples"][name]), percent(found["silent_share"][name])]
-        for name in CLASSES
-    ]
-    rates = [[phase, number(found["events_per_s"][phase], 0)] for phase in PHASES]
-    text = _prose("windows", hold_share=found["hold_share"], ceiling=found["ceiling"])
-    tables = [
-        Table(("class", "samples", "without a signal event"), samples),
-        Table(("phase", "signal events/s"), rates, _caption("windows_table")),
-    ]
-    return Section("What the samples hold", text, tables=tables)
-
-
 def sensitivity_rows(data: Result) -> list[list[str]]:
     """Return rows of text under `SENSITIVITY_COLUMNS`: change at 20 % less / 20 % more."""
     rows = []
@@ -151,7 +148,8 @@ def sensitivity_rows(data: Result) -> list[list[str]]:
 
 
 def _sensitivity_text(data: Result) -> list[str]:
-    return _prose("sensitivity", phases=PHASES, **data)
+    text = render_page("sensitivity.md", **{**data, "phases": PHASES})
+    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
 
 
 def sensitivity_markdown(data: Result) -> str:
