@@ -23,7 +23,7 @@ from sliplab.protocols.model import Protocol
 from sliplab.protocols.plan import make_plan
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.rig_file import RigFile, load_rig_file
-from sliplab.storage.streams import Json, Unheeded
+from sliplab.storage.streams import Json, NullSink
 
 ROOT = Path(__file__).parents[1]
 
@@ -87,7 +87,7 @@ def run(rig: RigFile, plan: Plan, trial: Trial) -> Json:
         for task in plan.changeovers(None, trial):
             built.operator.ask(task.kind, task.prompt, task.expected)
         seed = hash_integer(trial.seed, 0)
-        truth = built.run_trial(plan.program(trial), Unheeded(), seed, None, 100).truth
+        truth = built.run_trial(plan.program(trial), NullSink(), seed, None, 100).truth
     finally:
         built.close()
     assert truth is not None

@@ -24,7 +24,7 @@ from sliplab.rigs.build import simulated_rig
 from sliplab.rigs.levels import with_level
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.rig_file import load_rig_file
-from sliplab.storage.streams import EventChunk, FrameChunk, Unheeded
+from sliplab.storage.streams import EventChunk, FrameChunk, NullSink
 
 ROOT = Path(__file__).parent.parent
 WINDOW_US = 30_000
@@ -32,7 +32,7 @@ STICKS, SLIDES, CLEAR = "#1f5fa8", "#d1495b", "#b9b9b9"
 
 
 @dataclass
-class Film(Unheeded):
+class Film(NullSink):
     """A sink that keeps what a filmstrip shows."""
 
     events: list[EventChunk] = field(default_factory=list)

@@ -49,7 +49,7 @@ from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
 from sliplab.rigs.rig_lock import held
 from sliplab.storage.errors import translated_disk_errors
 from sliplab.storage.files import sha256
-from sliplab.storage.streams import EventChunk, PulseChunk, Unheeded
+from sliplab.storage.streams import EventChunk, NullSink, PulseChunk
 
 POLL_S = 0.005
 """Period of reading the streams, s."""
@@ -386,7 +386,7 @@ KEPT = 100_000
 """Latencies that are kept for the summary: the last 55 minutes of 30 ms windows."""
 
 
-class DetectSink(Unheeded):
+class DetectSink(NullSink):
     """A `rigs.core.reacting.Watcher` that feeds a detector.
 
     Args:

@@ -38,7 +38,7 @@ from sliplab.rigs.mock.skins import skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
 from sliplab.rigs.scene.slides import run_slide
-from sliplab.storage.streams import EventChunk, Unheeded
+from sliplab.storage.streams import EventChunk, NullSink
 
 MOTION = frozenset({"slide", "retract"})
 PERFECT = Clocks(
@@ -77,7 +77,7 @@ def ideal(rig: RigFile) -> RigFile:
 
 
 @dataclass
-class _Memory(Unheeded):
+class _Memory(NullSink):
     """A sink that keeps the events and lets the rest go."""
 
     events: list[EventChunk] = field(default_factory=list)

@@ -58,8 +58,8 @@ def disk_fault(error: BaseException | None) -> str | None:
     """
     while error is not None:
         number = error.errno if isinstance(error, OSError) else None
-        if number is None and (told := _IN_WORDS.search(str(error))):
-            number = int(told[1])
+        if number is None and (stated := _IN_WORDS.search(str(error))):
+            number = int(stated[1])
         if number in _FAULTS:
             return _FAULTS[number]
         hidden = error.__suppress_context__

@@ -161,14 +161,14 @@ class Sink(Protocol):
         """Append frames."""
 
 
-class Unheeded:
-    """A sink that lets every stream go; what wants some of them takes those."""
+class NullSink:
+    """A sink that drops every stream; a subclass takes some of them."""
 
-    def _let_go(self, chunk: Any) -> None:
-        """Not kept."""
+    def _drop(self, chunk: Any) -> None:
+        """Drop a chunk."""
 
-    add_events = add_event_pulses = add_arm_pulses = add_sync_pulses = _let_go
-    add_exposures = add_box_reads = add_frame_camera_reads = add_poses = add_frames = _let_go
+    add_events = add_event_pulses = add_arm_pulses = add_sync_pulses = _drop
+    add_exposures = add_box_reads = add_frame_camera_reads = add_poses = add_frames = _drop
 
 
 Json = dict[str, Any]

@@ -43,13 +43,13 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
     with _opened(path) as (file, rows):
         columns = {key: rows(f"events/{key}") for key in "xypt"}
         _same_length(columns)
-        offset = int(_whole(file.rows("t_offset").read())) if file.has("t_offset") else 0
+        offset = int(_integers(file.rows("t_offset").read())) if file.has("t_offset") else 0
         if not 0 <= offset < LATEST_US:
             raise FormatError(f"t_offset = {offset}: is no time")
         triggers = None
         if file.has("triggers/t"):
-            kinds = _whole(rows("triggers/kind").read()).astype(np.uint8)
-            triggers = Triggers(_whole(rows("triggers/t").read()), kinds)
+            kinds = _integers(rows("triggers/kind").read()).astype(np.uint8)
+            triggers = Triggers(_integers(rows("triggers/t").read()), kinds)
             _rising(triggers)
         simulated = bool(file.attribute("simulated", 0))
     count = len(columns["t"])
@@ -59,7 +59,7 @@ def read_dsec(path: Path, name: str) -> ForeignTrial:
             x, y, p, t = (again(f"events/{key}") for key in "xypt")
             for low in range(0, count, PIECE):
                 px, py, sign = (column.read(low, low + PIECE) for column in (x, y, p))
-                yield event_chunk(px, py, sign, _whole(t.read(low, low + PIECE)) + offset)
+                yield event_chunk(px, py, sign, _integers(t.read(low, low + PIECE)) + offset)
 
     return ForeignTrial(
         name, path.name, all_events, "the event camera's own clock, us", triggers=triggers,
@@ -208,7 +208,7 @@ class _opened:
         return found
 
 
-def _whole(values: Any) -> I64:
+def _integers(values: Any) -> I64:
     found = np.asarray(values)
     if found.dtype.kind not in "iu" or (found.size and int(found.max()) >= 1 << 62):
         raise FormatError("holds times that are no whole numbers")

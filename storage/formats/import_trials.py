@@ -290,13 +290,13 @@ def trials_in(path: Path, kind: str) -> Iterator[ForeignTrial]:
             yield read_pair(pair, name_of(pair.stem))
         return
     suffixes, reader = READERS[kind]
-    told = _read_manifest(path) if path.is_dir() else None
-    if told is not None:
-        for item in told["trials"]:
+    manifest = _read_manifest(path) if path.is_dir() else None
+    if manifest is not None:
+        for item in manifest["trials"]:
             file = path / item["file"]
             if file.is_symlink() or not file.is_file():
                 raise InputError(file, "", None, "is missing, or no plain file")
-            yield _as_exported(_read(reader, file, item["trial"]), item, told["simulated"])
+            yield _as_exported(_read(reader, file, item["trial"]), item, manifest["simulated"])
         return
     wanted = [file for file in files if kind in _possible(file)] if path.is_dir() else files
     if not wanted:

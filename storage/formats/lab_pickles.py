@@ -115,12 +115,12 @@ def read_pair(pair: Pair, name: str) -> ForeignTrial:
         order = np.lexsort((p, x, y, t))
         yield event_chunk(x[order], y[order], p[order], t[order])
 
-    told = _PART.fullmatch(pair.stem)
-    condition = {k: v for k, v in told.groupdict().items() if k != "repetition"} if told else {}
+    named = _PART.fullmatch(pair.stem)
+    condition = {k: v for k, v in named.groupdict().items() if k != "repetition"} if named else {}
     return ForeignTrial(
         name, names, all_events, "unknown; ms as the files have them, rounded to us",
         lambda: next((shape[::-1] for shape in shapes), None),
-        condition=condition, repetition=int(told["repetition"]) if told else 0,
+        condition=condition, repetition=int(named["repetition"]) if named else 0,
         about={"resolution": "ms as stored; order within one time is lost"},
         unknown=("epoch", "units of the condition", "sync grade", "poses", "motion", "frames",
                  "polarity map", *missing),
@@ -147,7 +147,7 @@ def _events(path: Path, polarity: int) -> tuple[tuple[int, int], Any, Any, Any, 
                 f"holds a {type(cell).__name__} where a list of times belongs; {_RIGHT}"
             )
         counts[index] = len(cell)
-    # lists may be told once and meant many times
+    # a pickle may hold a list once and refer to it many times
     if counts.sum() > len(data):
         raise FormatError(f"holds {counts.sum()} times, more than its bytes can tell")
     times = [time for cell in cells for time in cell]

@@ -24,7 +24,7 @@ _ALIGNED = 64
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write the arrays: whole or not at all, and the same bytes for the same arrays.
+    """Write the arrays: all of them or none, and the same bytes for the same arrays.
 
     Raises:
         TypeError: an array of objects.

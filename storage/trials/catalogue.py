@@ -235,10 +235,10 @@ class _Listing:
                 with os.scandir(handle) as entries:
                     for entry in entries:
                         if entry.is_dir(follow_symlinks=False):
-                            told = entry.stat(follow_symlinks=False)
+                            status = entry.stat(follow_symlinks=False)
                             names.append(entry.name)
-                            inodes.append(told.st_ino)
-                            changed.append(told.st_ctime_ns)
+                            inodes.append(status.st_ino)
+                            changed.append(status.st_ctime_ns)
             finally:
                 os.close(handle)
         order = sorted(range(len(names)), key=names.__getitem__)
@@ -285,21 +285,21 @@ def _sync_key(campaign: Campaign, name: str) -> str:
 
 def _stamp(path: Path, settled: bool = False) -> str:
     try:
-        told = path.stat()
+        status = path.stat()
     except OSError:
         return "none"
-    if not settled and told.st_mtime_ns > time.time_ns() - FRESH_NS:
+    if not settled and status.st_mtime_ns > time.time_ns() - FRESH_NS:
         return ""
-    return f"{told.st_ino} {told.st_mtime_ns} {told.st_size}"
+    return f"{status.st_ino} {status.st_mtime_ns} {status.st_size}"
 
 
 def _read_index(store: Store) -> _Known | None:
     """Read the index; None where there is none that can be used."""
     try:
-        whole = _path(store).read_bytes()
+        content = _path(store).read_bytes()
     except OSError:
         return None
-    digest, data = whole[:32], whole[32:]
+    digest, data = content[:32], content[32:]
     return _parse(data) if hashlib.sha256(data).digest() == digest else None
 
 

@@ -57,7 +57,7 @@ class TrialWriter:
         folder: the trial's folder while it is written; must not exist.
         target: its folder once committed.
         frame_px: (width, height) of the frames, or None without a frame camera. Whether there will
-            be a video shows with the first frame: a camera may hand over tracks instead.
+            be a video shows with the first frame: a camera may return tracks instead.
         spool: keep raw frames on disk and encode them when the trial ends; for rigs that cannot
             encode as fast as their camera delivers.
     """
