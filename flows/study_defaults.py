@@ -1,4 +1,4 @@
-"""What a study takes unless it is told otherwise."""
+"""Defaults of a study: protocols, checked labels, held-out trials."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ FULL = ("kinematic", "gravity", "disturbance")
 PILOT = ("pilot", "pilot_gravity")
 EXTRA = ("disturbance=125",)
 LABELS_CHECKED = 60
-"""Trials whose labels of tracks a study checks with video."""
+"""Trials whose labels by tracks a study checks with video."""
 HELD_OUT = 144
 """Trials that choose nothing: half of the conditions of the kinematic grid, each once."""
 
 
 def study_protocols(pilot: bool, extra: bool) -> dict[Path, tuple[str, ...]]:
-    """A study's protocols, and the optional levels that are switched on in each.
+    """Return a study's protocols, and the optional levels that are switched on in each.
 
     Args:
         pilot: the small ones, which have none.

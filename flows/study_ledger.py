@@ -1,9 +1,9 @@
-"""What a study has done, what each step cost, and how long is left: `study.json` in its store.
+"""Ledger of a study: state and cost of each step, and the time left; `study.json` in its store.
 
-A study runs for half an hour or for weeks, is stopped and gone on with, and is looked at from
-another terminal. So the seconds of a step are added up over all its runs and written as it ends,
-well or not; what is left is reckoned from what steps were expected to take, times how much longer
-than expected those took that are over.
+A study runs for half an hour or for weeks, is stopped and continued, and is watched from another
+terminal. So the seconds of a step are added up over all its runs and written as it ends, well or
+not. The time left is what the other steps are expected to take, times the pace of the steps that
+are over.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from sliplab.storage.files import read_json, write_json
 FILE = "study.json"
 TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"
 LEAST, MOST = 0.2, 5.0
-"""Limits of how much longer or shorter than expected the rest may take by what is over."""
+"""Limits of the pace: the seconds of the steps that are over, by the expected ones."""
 BELIEF_S = 60.0
-"""So much work as expected is taken for seen already: the first step also compiles the kernels,
-once in an installation, and says little about the others if it is short."""
+"""Weight of the expectation, as work already done at its pace: the first step also compiles the
+kernels, once in an installation, and says little about the others if it is short."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Row:
     """One step of a study.
 
     Attributes:
-        state: `TO_DO`, `RUNNING`, `STOPPED` (in the middle, to be gone on with) or `DONE`.
-        seconds: what it took so far, over all runs.
-        expected_s: what it was expected to take from nothing.
-        note: what it did, in a few words.
+        state: `TO_DO`, `RUNNING`, `STOPPED` (in the middle, to be continued) or `DONE`.
+        seconds: taken so far, over all runs.
+        expected_s: expected from nothing.
+        note: its result in a few words.
     """
 
     name: str
@@ -69,12 +69,12 @@ class Ledger:
         self._known = {name for name, row in before.items() if row.state == DONE}
 
     def rows(self) -> list[Row]:
-        """All steps in their order."""
+        """Return all steps in their order."""
         return list(self._rows.values())
 
     @contextmanager
     def step(self, name: str) -> Iterator[Callable[[str, bool], None]]:
-        """Measure a step; yield a callback that reports what it did and if that was anything."""
+        """Time a step; yield a callback that takes its result in words, and whether it did work."""
         before, began = self._rows[name], self._clock()
         self._put(before, state=RUNNING)
         place = list(self._rows).index(name) + 1
@@ -90,7 +90,7 @@ class Ledger:
             self._put(before, state=state, seconds=before.seconds + spent, note=note)
 
     def left_s(self) -> float:
-        """Seconds that the steps to do and to go on with will take, by all that is known."""
+        """Return the seconds that the steps to do and to continue are likely to take."""
         over = [r for r in self._rows.values() if r.state == DONE and r.seconds > 0]
         expected = sum(row.expected_s for row in over)
         pace = (sum(row.seconds for row in over) + BELIEF_S) / (expected + BELIEF_S)
@@ -114,7 +114,7 @@ class Ledger:
 
 
 def read(folder: Path) -> list[Row]:
-    """The steps of a study as they were last written; none where there is no study."""
+    """Return the steps of a study as last written; none where there is no study."""
     path = folder / FILE
     if not path.exists():
         return []
@@ -122,7 +122,7 @@ def read(folder: Path) -> list[Row]:
 
 
 def print_rows(rows: list[Row]) -> None:
-    """The one view of what is done, what it cost and how long is left, as a table."""
+    """Print state, cost and result of each step as a table."""
     total = sum(row.seconds for row in rows)
     shown: list[list[Any]] = [
         [

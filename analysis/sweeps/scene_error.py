@@ -1,8 +1,8 @@
-"""How far one simulated recording of a trial is from another, in what an experiment looks at.
+"""Difference of two simulated recordings of a trial, in quantities that an experiment uses.
 
-A scene can be made dearer at will: more physics, shorter steps, smoother paths. What that buys is
-told here by onsets, times of events, labels of windows and the network's own samples, and what
-counts as little is told by two seeds of the same scene. Pure functions of recordings.
+A scene can be made dearer at will: more physics, shorter steps, smoother paths. The gain is
+measured by onsets, times of events, labels of windows and the network's own samples; two seeds of
+the same scene say which difference is small. Pure functions of recordings.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Onsets = tuple[int | None, int | None]
 
 @dataclass(frozen=True)
 class Seen:
-    """What one run of a trial left, on a time line that begins with its slide or retraction.
+    """Events and onsets of one run, on a time line that begins with its slide or retraction.
 
     Attributes:
         events: times in µs of that line, negative in the hold; None where nothing was simulated.
@@ -46,7 +46,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class SceneError:
-    """How far a run is from the reference; None where one of the two has no such thing."""
+    """Difference of a run from the reference; None where one of the two has no such quantity."""
 
     first_slip_ms: float | None
     """Absolute difference of the first slip of all papillae."""
@@ -57,8 +57,8 @@ class SceneError:
     event_p95_us: float | None
     """Their 95th percentile."""
     early_p95_us: float | None
-    """The same of what the reference saw before its gross onset: a marker that hardly moves
-    crosses a threshold at any time, and steadily sliding ones hardly move."""
+    """The same of events before the reference's gross onset: a marker that hardly moves crosses a
+    threshold at any time, and steadily sliding ones hardly move."""
     unmatched: float | None
     """Share of the events of both runs that have no partner in the other."""
     flipped: float | None
@@ -102,7 +102,7 @@ def _ordinal_keys(events: EventChunk) -> I64:
 
 
 def label_windows(starts_us: I64, length_us: int, onsets: Onsets) -> I64:
-    """Class of each window by its middle: 0 no slip, 1 incipient, 2 gross, (n,).
+    """Return the class of each window by its middle: 0 no slip, 1 incipient, 2 gross, (n,).
 
     Args:
         onsets: incipient and gross; an onset of None never comes.
@@ -116,7 +116,7 @@ def label_windows(starts_us: I64, length_us: int, onsets: Onsets) -> I64:
 
 
 def flipped_share(begin_us: int, end_us: int, windows: Windows, a: Onsets, b: Onsets) -> float:
-    """Share of windows with another label by other onsets; a window begins at every step.
+    """Return the share of windows with another label by other onsets; one begins at every step.
 
     So the share is the onsets' difference over the recording, to a step, wherever a grid of
     consecutive windows would happen to lie. Without a whole window it is 0.
@@ -130,9 +130,9 @@ def flipped_share(begin_us: int, end_us: int, windows: Windows, a: Onsets, b: On
 
 
 def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
-    """L1 distance of all consecutive samples over the sum of the reference's; None without any.
+    """Return the L1 distance of all consecutive samples over the sum of the reference's.
 
-    Both are cut into windows that begin with the reference's recording.
+    Both are cut into windows that begin with the reference's recording. None without samples.
     """
     if reference.events is None or other.events is None:
         return None
@@ -150,7 +150,7 @@ def tensor_l1(reference: Seen, other: Seen, windows: Windows) -> float | None:
 
 
 def compare(reference: Seen, other: Seen, windows: Windows) -> SceneError:
-    """How far `other` is from `reference`: two runs of one program."""
+    """Return the difference of two runs of one program."""
     median = p95 = early = unmatched = None
     if reference.events is not None and other.events is not None:
         pairs = match_events(reference.events, other.events)
@@ -187,7 +187,7 @@ def _apart_ms(a: int | None, b: int | None) -> float | None:
 
 
 def mean_error(errors: Sequence[SceneError]) -> SceneError:
-    """Each figure averaged over the trials that have it; None where none has."""
+    """Return each figure averaged over the trials that have it; None where none has."""
     means: dict[str, float | None] = {}
     for field in fields(SceneError):
         values = [getattr(error, field.name) for error in errors]
@@ -198,21 +198,21 @@ def mean_error(errors: Sequence[SceneError]) -> SceneError:
 
 @dataclass(frozen=True)
 class MeasuredChoice:
-    """The lowest level that will do, and what decided."""
+    """The lowest level that suffices, and the reason."""
 
     level: int
     reason: str
 
 
 def choose_by_windows(steps: Mapping[int, SceneError], seeds: SceneError) -> MeasuredChoice:
-    """The lowest level whose windows differ from the next level's by less than two seeds do.
+    """Return the lowest level whose windows differ from the next one's by less than two seeds do.
 
     Windows differ by their samples (L1) and by their labels (share that flips); both must.
 
     Args:
-        steps: how far each level is from the next one, rising from the lowest; the highest level
-            is the one after the last.
-        seeds: how far two seeds of one scene are from each other.
+        steps: difference of each level from the next one, rising from the lowest; the highest
+            level is the one after the last.
+        seeds: difference of two seeds of one scene.
     """
     reason = ""
     for level, error in steps.items():

@@ -1,4 +1,4 @@
-"""What the samples of a simulated scene hold: how many lie in the hold, how many are silent.
+"""Samples of a simulated scene: the shares that lie in the hold and that are silent.
 
 A sample without a single signal event looks the same whatever its class. In a scene whose steady
 sliding is silent, a network that takes silence for gross slip loses the no-slip samples of the
@@ -34,7 +34,7 @@ class SceneWindows:
     in_hold: int
     """No-slip samples that end before the motion begins."""
     seconds: tuple[float, float, float, float]
-    """How long each phase is recorded; see `PHASES`."""
+    """Recorded seconds of each phase; see `PHASES`."""
     events: tuple[int, int, int, int]
     """Events of the wanted polarity inside the crop, by phase."""
 
@@ -76,7 +76,7 @@ def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWind
 
 
 def _wanted(seen: Seen, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Which events have the wanted polarity and lie in the centred crop, (n,)."""
+    """Mask of events that have the wanted polarity and lie in the centred crop, (n,)."""
     assert seen.events is not None
     kept = np.ones(len(seen.events), np.bool_)
     for place, size in zip((seen.events.x, seen.events.y), seen.size_px, strict=True):
@@ -88,7 +88,7 @@ def _wanted(seen: Seen, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def pooled(trials: Sequence[SceneWindows]) -> dict[str, Any]:
-    """All trials together, as JSON; a share or rate of nothing is None.
+    """Return all trials together, as JSON; a share or rate of nothing is None.
 
     Returns:
         `hold_share` h: of no-slip samples that lie in the hold; `ceiling`: 1 - h/3, the best
