@@ -27,7 +27,6 @@ from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
-from sliplab.protocols.settings import Detection
 from sliplab.rigs.rig_file import load_rig_file
 from sliplab.storage.files import write_json, write_text
 from sliplab.storage.schema.summary import Summary
@@ -106,19 +105,15 @@ def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
 def _sources(store: Store, campaigns: list[Collected]) -> Sources:
     """Read what earlier steps kept."""
     evaluation = evaluate.evaluation_of(store)
-    networks = other_networks.kept(store, campaigns, evaluation.reviewed is not None)
-    baselines = window_baselines.baselines(store)
-    spans = window_scores.window_intervals(store, evaluation.key)
-    check = label_errors.read_check(store)
     return Sources(
         store,
         campaigns,
         settings=training_settings(campaigns),
-        evaluation=evaluation.to_json(),
-        networks={name: found.to_json() for name, found in networks.items()},
-        baselines={name: found.to_json() for name, found in baselines.items()},
-        window_intervals={} if spans is None else spans.to_json(),
-        label_check=None if check is None else check.to_json(),
+        evaluation=evaluation,
+        networks=other_networks.kept(store, campaigns, evaluation.reviewed is not None),
+        baselines=window_baselines.baselines(store),
+        window_intervals=window_scores.window_intervals(store, evaluation.key),
+        label_check=label_errors.read_check(store),
         holds=label_errors.holds_compared(store, campaigns),
         planned_bytes={item.name: _planned_bytes(item) for item in campaigns},
         step_seconds=step_seconds(store),
@@ -136,12 +131,12 @@ def _planned_bytes(item: Collected) -> int:
 def _shown(sources: Sources) -> content.Shown:
     """Read what the page shows beside the summary's numbers."""
     store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
-    reviewed = evaluation.get("reviewed") is not None
-    model = evaluate.choose_model(wanted_models(store, campaigns, reviewed))
-    example = choose_example(campaigns, evaluation["trials"])
+    models = wanted_models(store, campaigns, evaluation.reviewed is not None)
+    model = evaluate.choose_model(models)
+    example = choose_example(campaigns, evaluation.trials)
     counts: dict[str, Any] = {}
     if example is not None:
-        rule = Detection.model_validate(evaluation["detection"][example.item.name])
+        rule = evaluation.detection[example.item.name]
         trial = example.recording.trial_id
         counts = evaluate.trial_counts(store, example.item.name, trial, rule)
     scene = None

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pandas as pd
 
 from sliplab.analysis.report.figures.tradeoffs import latency_over_rate
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
-from sliplab.storage.schema.summary import Detector, DetectorRate, Detectors, Statistics
+from sliplab.storage.schema.evaluation import (
+    DetectorComparison,
+    DetectorRate,
+    DetectorScores,
+    LatencyFigures,
+    PartTrials,
+)
 
 WORDS = {
     "smoothing": "paper's rule",
@@ -50,19 +56,21 @@ class DetectorSection(Content):
     """
 
     template: ClassVar[str] = "detectors.html"
-    trials: Mapping[str, int]
-    smoothing: Any
+    trials: PartTrials
+    smoothing: int
     best: Best | None
     figure: Figure
     tables: Sequence[Table]
 
 
-def detector_section(compared: Detectors | None, *, simulated: bool) -> DetectorSection | None:
+def detector_section(
+    compared: DetectorComparison | None, *, simulated: bool
+) -> DetectorSection | None:
     """Show the comparison; None where there is none."""
     if compared is None:
         return None
     entries = [(WORDS[entry.name], entry) for entry in compared.detectors]
-    entries += [(f"{WORDS[entry.name]}, states carried", entry) for entry in compared.carried]
+    entries += [(f"{WORDS[entry.name]}, states carried", entry) for entry in compared.carried or ()]
     panels = {}
     for stride in sorted(compared.strides_ms, reverse=True):
         ending = "" if stride < max(compared.strides_ms) else ", no overlap"
@@ -93,11 +101,11 @@ def detector_section(compared: Detectors | None, *, simulated: bool) -> Detector
             name="detectors",
             data=points.to_dict("list"),
         ),
-        _tables(entries, compared.trials["validation"]),
+        _tables(entries, compared.trials.validation),
     )
 
 
-def _tables(entries: Sequence[tuple[str, Detector]], trials: int) -> list[Table]:
+def _tables(entries: Sequence[tuple[str, DetectorScores]], trials: int) -> list[Table]:
     """Make one table for each number of trials that may be false early."""
     rates = entries[0][1].rates
     places: dict[int, list[int]] = {}
@@ -118,7 +126,7 @@ def _tables(entries: Sequence[tuple[str, Detector]], trials: int) -> list[Table]
 def _cells(rate: DetectorRate) -> list[str]:
     incipient, gross = rate.test.latency_ms.incipient, rate.test.latency_ms.gross
     share = rate.test.false_early_rate
-    early = f"({100 * (share.low or 0.0):.0f} to {percent(share.high, 0)})"
+    early = f"({100 * share.low:.0f} to {percent(share.high, 0)})"
     return [
         str(rate.validation.latency_ms.incipient.false_early),
         f"{incipient.false_early} {early}",
@@ -129,11 +137,11 @@ def _cells(rate: DetectorRate) -> list[str]:
     ]
 
 
-def _lost(found: Statistics) -> str:
+def _lost(found: LatencyFigures) -> str:
     return f"{found.missed}, {found.late}"
 
 
-def _best(entries: Sequence[tuple[str, Detector]]) -> Best | None:
+def _best(entries: Sequence[tuple[str, DetectorScores]]) -> Best | None:
     """Find the one that validation trials find quickest; None where a median is infinite."""
     rule = entries[0][1].rates[-1]
     there = [

@@ -10,15 +10,8 @@ from sliplab.analysis.metrics.intervals import exact_interval
 from sliplab.analysis.report.outcomes import trial_intervals, trial_outcome
 from sliplab.analysis.report.page import Content, Table, number, percent
 from sliplab.analysis.report.programs import shape_checked
-from sliplab.storage.schema.summary import (
-    ByOnset,
-    Holdout,
-    Kinematic,
-    Share,
-    Span,
-    Statistics,
-    TrialIntervals,
-)
+from sliplab.storage.schema.evaluation import LatencyByOnset, Share, TrialScore
+from sliplab.storage.schema.summary import Holdout, Kinematic, Span, TrialIntervals
 
 Json = dict[str, Any]
 
@@ -41,7 +34,9 @@ def holdout_part(found: Json) -> Holdout:
             **{name: found[name] for name in numbers},
             "versions": [each["version"] for each in found["evaluations"]],
             **found["kinematic"],
-            "intervals": trial_intervals([trial_outcome(row) for row in found["rows"]]),
+            "intervals": trial_intervals(
+                [trial_outcome(TrialScore.model_validate(row)) for row in found["rows"]]
+            ),
         })  # fmt: skip
 
 
@@ -80,7 +75,7 @@ def holdout_section(
 
 
 def _rows(
-    windows: Mapping[str, Share], latencies: ByOnset[Statistics], intervals: TrialIntervals
+    windows: Mapping[str, Share], latencies: LatencyByOnset, intervals: TrialIntervals
 ) -> list[list[str]]:
     rows = []
     titles = {"strict": "windows right, strict", "argmax": "windows right, ties shared"}

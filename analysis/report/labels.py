@@ -11,8 +11,9 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.campaign import source_words
 from sliplab.analysis.report.figures.trials import label_uncertainty
 from sliplab.analysis.report.page import Content, Figure, Table, number
+from sliplab.storage.schema.evaluation import Coverage, LabelCheck, RuleErrors
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel
-from sliplab.storage.schema.summary import Hold, LabelCheck, Papillae, Rules, Summary
+from sliplab.storage.schema.summary import Hold, Summary
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
@@ -33,7 +34,7 @@ class LabelSection(Content):
     template: ClassVar[str] = "labels.html"
     source: str
     ruling: str
-    papillae: Papillae | None
+    papillae: Coverage | None
     check: LabelCheck | None
     figure: Figure
     truth: bool
@@ -85,7 +86,7 @@ def label_section(
     )
 
 
-def _rules(rules: Rules, known: bool) -> Table:
+def _rules(rules: RuleErrors, known: bool) -> Table:
     """List each rule's distances from its truth, where it is known, and between the rules."""
     rows = [
         ("paper's rule less the true crossing", rules.paper),

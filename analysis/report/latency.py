@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import difference, exact_interval, interval
@@ -14,9 +14,8 @@ from sliplab.analysis.report.figures.style import BLUE, GREEN, ORANGE, RED
 from sliplab.analysis.report.outcomes import OUTCOMES, TIMES, WORDS, Conditions, times
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.published import DISTURBANCE_LEAD_STD_MS, PAPER, Published
+from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.summary import Accounts, Experiment, Span, Summary, TrialOutcome
-
-Json = dict[str, Any]
 
 AXES = {
     "duration_ms": ("incipient slip lasts (ms)", GREEN, ""),
@@ -93,7 +92,7 @@ class LatencySection(Content):
 
 
 def latency_section(
-    experiment: str, campaigns: Sequence[Collected], rows: Sequence[Json], summary: Summary
+    experiment: str, campaigns: Sequence[Collected], rows: Sequence[TrialScore], summary: Summary
 ) -> LatencySection | None:
     """Show an experiment's detections by condition; None without trials, unless kinematic.
 

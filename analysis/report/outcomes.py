@@ -19,6 +19,7 @@ from typing import Any, ClassVar, get_args
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.metrics.intervals import interval
 from sliplab.analysis.report.page import Content, Table, number
+from sliplab.storage.schema.evaluation import TrialLatency, TrialScore
 from sliplab.storage.schema.summary import (
     Accounts,
     Outcome,
@@ -26,8 +27,6 @@ from sliplab.storage.schema.summary import (
     TrialIntervals,
     TrialOutcome,
 )
-
-Json = dict[str, Any]
 
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 WORDS = {
@@ -43,34 +42,37 @@ TIMES = ("duration_ms", "latency_incipient_ms", "latency_gross_ms", "lead_ms")
 """Times of a trial."""
 
 
-def trial_outcome(row: Json) -> TrialOutcome:
+def trial_outcome(row: TrialScore) -> TrialOutcome:
     """Summarise one evaluated trial.
 
     Args:
         row: of the evaluation.
     """
-    found = row["latency"]
+    found = row.latency
     times = (*TIMES[1:], "late_incipient_ms", "late_gross_ms")
+    length = None
+    if found is not None and row.gross_ns is not None and row.incipient_ns is not None:
+        length = (row.gross_ns - row.incipient_ns) / 1e6
     return TrialOutcome(
-        campaign=row["campaign"],
-        experiment=row["experiment"],
-        trial=row["trial"],
+        campaign=row.campaign,
+        experiment=row.experiment,
+        trial=row.trial,
         outcome=_verdict(found, "incipient", "detected_first"),
         gross=_verdict(found, "gross", "detected"),
-        duration_ms=None if found is None else (row["gross_ns"] - row["incipient_ns"]) / 1e6,
-        **{name: None if found is None else found.get(name) for name in times},
+        duration_ms=length,
+        **{name: getattr(found, name, None) for name in times},
     )
 
 
-def _verdict(found: Json | None, kind: str, counted: str) -> Any:
+def _verdict(found: TrialLatency | None, kind: str, counted: str) -> Any:
     """Return the outcome of one of a trial's detections."""
     if found is None:
         return "without_onsets"
-    if found[f"missed_{kind}"]:
+    if getattr(found, f"missed_{kind}"):
         return "missed"
-    if found[f"false_early_{kind}"]:
+    if getattr(found, f"false_early_{kind}"):
         return "false_early"
-    return counted if found[f"late_{kind}_ms"] is None else "late"
+    return counted if getattr(found, f"late_{kind}_ms") is None else "late"
 
 
 def account(
@@ -112,7 +114,7 @@ class Conditions:
     """
 
     def __init__(
-        self, campaigns: Sequence[Collected], rows: Sequence[Json], experiment: str
+        self, campaigns: Sequence[Collected], rows: Sequence[TrialScore], experiment: str
     ) -> None:
         self.factors: dict[str, list[str]] = {}
         names = {item.name for item in campaigns if item.experiment == experiment}
@@ -121,9 +123,7 @@ class Conditions:
             for name, levels in item.plan.enabled.items() if item.name in names else ():
                 there = self.factors.setdefault(name, [])
                 there += [t for t in map(factors[name].text, levels) if t not in there]
-        self._rows = [
-            (trial_outcome(row), row["condition"]) for row in rows if row["campaign"] in names
-        ]
+        self._rows = [(trial_outcome(row), row.condition) for row in rows if row.campaign in names]
 
     @property
     def trials(self) -> list[TrialOutcome]:

@@ -13,15 +13,8 @@ from typing import ClassVar
 from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Table, number, percent
 from sliplab.analysis.report.published import PAPER
-from sliplab.storage.schema.summary import (
-    Experiment,
-    Network,
-    NetworkWindows,
-    Paper,
-    Share,
-    Span,
-    Summary,
-)
+from sliplab.storage.schema.evaluation import Share
+from sliplab.storage.schema.summary import Experiment, Network, NetworkWindows, Paper, Span, Summary
 
 _SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "published"]
 """A difference that no setting makes."""
@@ -103,8 +96,8 @@ def _windows(kinematic: NetworkWindows) -> list[Row]:
         Row("the same, won by the margin", "–", percent(right.margin), count=count),
     ]  # fmt: skip
     for name, value in (
-        ("precision", kinematic.precision.incipient),
-        ("recall", kinematic.recall.incipient),
+        ("precision", kinematic.precision["incipient"]),
+        ("recall", kinematic.recall["incipient"]),
     ):
         row = known.get(f"incipient_{name}")
         rows.append(

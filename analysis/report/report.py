@@ -33,7 +33,6 @@ from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.summary import Sources
 from sliplab.analysis.report.tradeoff_scene import SceneCost
 from sliplab.analysis.report.trial import Example, output_section, trial_section
-from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.summary import SeedsUsed, Summary
 
 
@@ -108,12 +107,12 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
     """
     store, campaigns, programs = sources.store, sources.campaigns, sources.programs
     simulated, kinematic = summary.simulated, summary.kinematic
-    rows = sources.evaluation["trials"]
+    rows = sources.evaluation.trials
     trial, outputs = None, None
     if shown.example is not None:
         example, counts = shown.example
         trial = trial_section(store, example, simulated=simulated)
-        rule = Detection.model_validate(sources.evaluation["detection"][example.item.name])
+        rule = sources.evaluation.detection[example.item.name]
         outputs = output_section(example, counts, rule, simulated=simulated)
     holdout, sensitivity = None, None
     if simulated:

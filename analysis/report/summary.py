@@ -14,7 +14,15 @@ from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
-from sliplab.protocols.settings import AnalysisSettings
+from sliplab.protocols.settings import AnalysisSettings, Detection
+from sliplab.storage.schema.evaluation import (
+    Evaluation,
+    Experiments,
+    LabelCheck,
+    OtherEvaluation,
+    TrainedBaseline,
+    WindowIntervals,
+)
 from sliplab.storage.schema.summary import Paper, Planned, Quality, Summary, Sync, TrialOutcome
 from sliplab.storage.trials.store import Store
 
@@ -48,11 +56,11 @@ class Sources:
     store: Store
     campaigns: Sequence[Collected]
     settings: AnalysisSettings
-    evaluation: Json
-    networks: Mapping[str, Json]
-    baselines: Mapping[str, Json]
-    window_intervals: Mapping[str, Json]
-    label_check: Json | None
+    evaluation: Evaluation
+    networks: Mapping[str, OtherEvaluation]
+    baselines: Mapping[str, TrainedBaseline]
+    window_intervals: WindowIntervals | None
+    label_check: LabelCheck | None
     holds: Mapping[str, Json]
     planned_bytes: Mapping[str, int]
     step_seconds: Mapping[str, float]
@@ -66,15 +74,13 @@ def make_summary(sources: Sources) -> Summary:
         StoreError: another program's result is of another shape.
     """
     campaigns, evaluation = sources.campaigns, sources.evaluation
-    windows, experiments = evaluation["windows"], evaluation["experiments"]
-    trials = tuple(trial_outcome(row) for row in evaluation["trials"])
-    judged = {
-        name: {**experiments[name], **_judged(campaigns, trials, name)} for name in experiments
-    }
+    trials = tuple(trial_outcome(row) for row in evaluation.trials)
+    judged = _judged(campaigns, trials, evaluation.experiments)
+    windows, spans = evaluation.windows.to_json(), sources.window_intervals
     kinematic = {
         **{name: windows[name] for name in _WINDOWS},
         "trained_baselines": sources.baselines,
-        "window_intervals": sources.window_intervals,
+        "window_intervals": {} if spans is None else spans.to_json(),
         **judged["kinematic"],
     }
     holdout = sources.programs.get("holdout")
@@ -87,16 +93,16 @@ def make_summary(sources: Sources) -> Summary:
         "trials": trials,
         "references": references_of(sources.store, campaigns),
         "labels": {
-            "error_ms": evaluation["label_error_ms"],
-            "rules_ms": evaluation["label_rules_ms"],
+            "error_ms": evaluation.label_error_ms,
+            "rules_ms": evaluation.label_rules_ms,
             "source": _sources(campaigns),
-            "reviewed": evaluation.get("reviewed"),
+            "reviewed": evaluation.reviewed,
             "check": sources.label_check,
             "holds": sources.holds,
         },
-        "detection": evaluation["detection"],
-        "choices": evaluation["choices"],
-        "detectors": evaluation["detectors"],
+        "detection": _plain(evaluation.detection),
+        "choices": evaluation.choices,
+        "detectors": evaluation.detectors,
         "holdout": None if holdout is None else holdout_part(holdout),
         "sync": sync_part(campaigns),
         "quality": _quality(campaigns),
@@ -113,37 +119,41 @@ def make_summary(sources: Sources) -> Summary:
         },
         "seeds": {
             "network": sources.settings.training.seeds,
-            "chosen": evaluation["seed"],
+            "chosen": evaluation.seed,
             "collection": {item.name: item.plan.protocol.collection.seed for item in campaigns},
         },
     })  # fmt: skip
 
 
 def _judged(
-    campaigns: Sequence[Collected], trials: Sequence[TrialOutcome], experiment: str
-) -> Json:
-    """Return outcomes of an experiment's trials, and how sure its figures are."""
-    ours = [row for row in trials if row.experiment == experiment]
-    return {
-        "accounted": account(campaigns, ours, experiment),
-        "intervals": trial_intervals(ours),
-    }
+    campaigns: Sequence[Collected], trials: Sequence[TrialOutcome], experiments: Experiments
+) -> dict[str, Json]:
+    """Return each experiment's figures with its trials' outcomes, and how sure they are."""
+    found = {}
+    for name, figures in experiments.items():
+        ours = [row for row in trials if row.experiment == name]
+        found[name] = {
+            **figures.to_json(),
+            "accounted": account(campaigns, ours, name),
+            "intervals": trial_intervals(ours),
+        }
+    return found
 
 
-def _network(campaigns: Sequence[Collected], found: Json) -> Json:
+def _network(campaigns: Sequence[Collected], found: OtherEvaluation) -> Json:
     """Return another network's figures, under the keys that the store's own have."""
-    trials = [trial_outcome(row) for row in found["trials"]]
-    experiments = found["experiments"]
-    experiments = {
-        **experiments, "kinematic": {**found["windows"], **experiments["kinematic"]}
-    }  # fmt: skip
+    trials = [trial_outcome(row) for row in found.trials]
+    judged = _judged(campaigns, trials, found.experiments)
     return {
-        **{key: found[key] for key in ("title", "preset", "seed", "engine", "exact", "detection")},
-        **{
-            name: {**figures, **_judged(campaigns, trials, name)}
-            for name, figures in experiments.items()
-        },
+        **{key: getattr(found, key) for key in ("title", "preset", "seed", "engine", "exact")},
+        "detection": _plain(found.detection),
+        **judged,
+        "kinematic": {**found.windows.to_json(), **judged["kinematic"]},
     }
+
+
+def _plain(rules: Mapping[str, Detection]) -> dict[str, Json]:
+    return {name: rule.model_dump(mode="json") for name, rule in rules.items()}
 
 
 def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:

@@ -21,12 +21,12 @@ from sliplab.analysis.report.published import PAPER
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.windows import first_pixel
 from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.evaluation import TrialScore
 from sliplab.storage.schema.label import LABELS
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
-Json = dict[str, Any]
 F64 = npt.NDArray[np.float64]
 
 BIN_S = 0.03
@@ -47,16 +47,16 @@ class Example:
 
     item: Collected
     recording: Recording
-    row: Json
+    row: TrialScore
 
     @property
     def condition(self) -> str:
         """The trial's condition in words."""
-        return ", ".join(f"{name} {text}" for name, text in self.row["condition"].items())
+        return ", ".join(f"{name} {text}" for name, text in self.row.condition.items())
 
     def onsets_s(self) -> list[float | None]:
         """Return both true onsets, seconds since the recording began."""
-        return [self.seconds(self.row[f"{kind}_ns"]) for kind in ("incipient", "gross")]
+        return [self.seconds(self.row.incipient_ns), self.seconds(self.row.gross_ns)]
 
     def seconds(self, time_ns: int | None) -> float | None:
         """Return a time in seconds since the recording began."""
@@ -64,25 +64,22 @@ class Example:
         return None if time_ns is None else (time_ns - start) / 1e9
 
 
-def choose_example(campaigns: Sequence[Collected], rows: Sequence[Json]) -> Example | None:
+def choose_example(campaigns: Sequence[Collected], rows: Sequence[TrialScore]) -> Example | None:
     """Return the kinematic test trial with the median incipient latency: neither best nor worst.
 
     Args:
         rows: of the evaluation.
     """
-    judged = [
-        row for row in rows if row["experiment"] == "kinematic" and row["latency"] is not None
-    ]
+    judged = []
+    for row in rows:
+        if row.experiment == "kinematic" and row.latency is not None:
+            value = row.latency.latency_incipient_ms
+            judged.append((float("inf") if value is None else float(value), row))
     if not judged:
         return None
-
-    def latency(row: Json) -> float:
-        value = row["latency"]["latency_incipient_ms"]
-        return float("inf") if value is None else float(value)
-
-    row = sorted(judged, key=latency)[len(judged) // 2]
-    item = next(item for item in campaigns if item.name == row["campaign"])
-    return Example(item, item.campaign.recording(row["trial"]), row)
+    _, row = sorted(judged, key=lambda each: each[0])[len(judged) // 2]
+    item = next(item for item in campaigns if item.name == row.campaign)
+    return Example(item, item.campaign.recording(row.trial), row)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -18,15 +18,16 @@ from sliplab.analysis.report.figures.style import CLASS_WORDS
 from sliplab.analysis.report.page import Content, Figure, Table, number, percent
 from sliplab.analysis.report.published import PAPER, Published
 from sliplab.protocols.quantity import level_order
-from sliplab.storage.schema.summary import (
+from sliplab.storage.schema.evaluation import (
     Accuracy,
+    Baseline,
     Calibration,
-    Compared,
-    Kinematic,
     Seeds,
     Share,
-    Work,
+    TrainedBaseline,
+    WindowWork,
 )
+from sliplab.storage.schema.summary import Kinematic
 
 METHODS = {
     "majority": "majority class",
@@ -108,8 +109,8 @@ def network_section(kinematic: Kinematic, fitted: Fitted, *, simulated: bool) ->
         ),
         Table(
             ["class", "precision", "recall"],
-            [[word, percent(getattr(kinematic.precision, name)),
-              percent(getattr(kinematic.recall, name))]
+            [[word, percent(kinematic.precision[name]),
+              percent(kinematic.recall[name])]
              for name, word in zip(CLASSES, CLASS_WORDS, strict=True)],
         ),
     )  # fmt: skip
@@ -245,7 +246,7 @@ class Rival:
     """
 
     title: str
-    found: Compared
+    found: Baseline
     multiply_adds: int | None
     shares: Sequence[float]
 
@@ -264,7 +265,7 @@ class WorkSection(Content):
     """
 
     template: ClassVar[str] = "work.html"
-    work: Work
+    work: WindowWork
     seeds: Seeds
     rival: Rival | None
     layers: Table
@@ -295,20 +296,21 @@ def work_section(kinematic: Kinematic) -> WorkSection | None:
 
 def _rival(kinematic: Kinematic) -> Rival | None:
     """Find the best other method, where stronger ones were trained."""
-    every = {**kinematic.beside, **kinematic.trained_baselines}
+    every: dict[str, Baseline] = {**kinematic.beside, **kinematic.trained_baselines}
     known = {name: row for name, row in every.items() if row.argmax is not None}
     if not kinematic.trained_baselines or not known:
         return None
     best = max(known, key=lambda name: known[name].argmax or 0.0)
     found = known[best]
-    return Rival(METHODS[best], found, found.made.get("multiply_adds"), _shares(found))
+    made = found.made if isinstance(found, TrainedBaseline) else {}
+    return Rival(METHODS[best], found, made.get("multiply_adds"), _shares(made))
 
 
-def _others(baselines: Mapping[str, Compared]) -> Table:
+def _others(baselines: Mapping[str, TrainedBaseline]) -> Table:
     """List what the other methods are."""
     rows = []
     for name, found in baselines.items():
-        made, shares = found.made, _shares(found)
+        made, shares = found.made, _shares(found.made)
         ran = made.get("epochs", made.get("rounds", made.get("iterations")))
         most = made.get("most_rounds")
         spread = "–"
@@ -324,9 +326,9 @@ def _others(baselines: Mapping[str, Compared]) -> Table:
     return Table(columns, rows)
 
 
-def _shares(found: Compared) -> list[float]:
+def _shares(made: Mapping[str, Any]) -> list[float]:
     """Return argmax accuracy with each seed; none for what has nothing random."""
-    return [row["argmax"] for row in found.made.get("seeds", ()) if row["argmax"] is not None]
+    return [row["argmax"] for row in made.get("seeds", ()) if row["argmax"] is not None]
 
 
 def share_words(row: Share) -> str:

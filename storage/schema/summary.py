@@ -6,11 +6,35 @@ computed. Keys that an older version did not write have a default.
 
 from __future__ import annotations
 
-from typing import Any, Generic, Literal, TypeVar
+from typing import Literal
 
 from pydantic import Field
 
 from sliplab.storage.schema.document import Bool, Document, Int, Number, Part
+from sliplab.storage.schema.evaluation import (
+    Accuracy,
+    Baseline,
+    ByClass,
+    Calibration,
+    Choice,
+    DetectorComparison,
+    DeviationByOnset,
+    ExperimentScores,
+    LabelCheck,
+    LabelErrors,
+    LatencyByOnset,
+    LeadFigures,
+    LeadShare,
+    NoSlip,
+    RuleErrors,
+    SampleCounts,
+    Seeds,
+    Share,
+    Tenth,
+    TrainedBaseline,
+    TrialWindows,
+    WindowWork,
+)
 
 Outcome = Literal[
     "detected_first", "late", "missed", "false_early", "without_onsets", "not_evaluated",
@@ -21,63 +45,6 @@ GrossOutcome = Literal["detected", "late", "missed", "false_early", "without_ons
 Known = Number | None
 Span = tuple[Number, Number] | None
 """A 95 % interval, low and high; null where so few trials bound nothing."""
-T = TypeVar("T")
-
-
-class ByOnset(Part, Generic[T]):
-    """One value for each onset."""
-
-    incipient: T
-    gross: T
-
-
-class ByClass(Part, Generic[T]):
-    """One value for each class of windows."""
-
-    no_slip: T
-    incipient: T
-    gross: T
-
-
-class Share(Part):
-    """A share of windows, or a difference of shares, with its 95 % interval over trials."""
-
-    share: Known
-    low: Known
-    high: Known
-    n: Int
-    """Windows."""
-    trials: Int
-
-
-class Accuracy(Part):
-    """Accuracy of windows: ties shared, ties wrong, and won by the margin of a detection."""
-
-    argmax: Known
-    strict: Known
-    margin: Known
-    n: Int
-
-
-class Statistics(Part):
-    """A time over the trials that have it, and how many have none, by cause."""
-
-    n: Int
-    mean: Known
-    std: Known
-    median: Known
-    p95: Known
-    min: Known
-    max: Known
-    missed: Int
-    late: Int
-    false_early: Int
-
-
-class Lead(Statistics):
-    """True gross onset less the incipient detection."""
-
-    detected_first: Int
 
 
 class Accounts(Part):
@@ -120,110 +87,11 @@ class TrialIntervals(Part):
         return found
 
 
-class Experiment(Part):
+class Experiment(ExperimentScores):
     """Detections of one experiment's test trials."""
 
-    trials: Int
-    without_onsets: Int
-    latency_ms: ByOnset[Statistics]
-    lead_ms: Lead
     accounted: Accounts
     intervals: TrialIntervals
-
-
-class Calibration(Part):
-    """Softmax of the counts over a temperature, as probabilities."""
-
-    temperature: Known = None
-    """Fitted on validation windows."""
-    ece: Known = None
-    """Expected calibration error on test windows."""
-    uncalibrated: dict[str, Known] = Field(default_factory=dict)
-
-
-class Reliability(Share):
-    """Windows by the winner's lead over the next class."""
-
-    lead: Int
-    """Least, in spikes."""
-    to: Int | None
-    """Most; null where there is no bound."""
-    right: Int = 0
-
-
-class Tenth(Share):
-    """Recall in one tenth of a class's phase."""
-
-    tenth: Int
-
-
-class NoSlip(Part):
-    """No-slip windows before the motion, and in it before the first slip."""
-
-    hold: Share
-    loading: Share
-
-
-class TrialErrors(Part):
-    """Windows of one trial."""
-
-    campaign: str
-    trial: str
-    condition: dict[str, str] = Field(default_factory=dict)
-    n: Int
-    errors: Int
-    strict: Known = None
-    taken: dict[str, Int] = Field(default_factory=dict)
-
-
-class Seed(Part):
-    """One trained seed on the test windows."""
-
-    argmax: Known = None
-    strict: Known = None
-    margin: Known = None
-    seed: Int | None = None
-    chosen: Bool = False
-    validation_strict: Known = None
-
-
-class Range(Part):
-    """Mean, lowest and highest over seeds."""
-
-    mean: Known
-    min: Known
-    max: Known
-
-
-class Seeds(Part):
-    """Every trained seed."""
-
-    each: tuple[Seed, ...]
-    spread: dict[str, Range] = Field(default_factory=dict)
-
-
-class Work(Part):
-    """Computation of a window in the mean, by layer and in `all`."""
-
-    synaptic_operations: dict[str, Number]
-    dense_multiply_adds: dict[str, Number]
-    share: Number
-    spikes: dict[str, Number]
-    rates: dict[str, Number]
-    events: Number
-    n: Int
-
-
-class Compared(Part):
-    """Another method on the same windows."""
-
-    argmax: Known
-    low: Known = None
-    high: Known = None
-    network_ahead: Share
-    """The network's accuracy less the method's."""
-    made: dict[str, Any] = Field(default_factory=dict)
-    """How it was trained: weights, epochs, seeds."""
 
 
 class NetworkWindows(Experiment):
@@ -231,8 +99,8 @@ class NetworkWindows(Experiment):
 
     accuracy: Accuracy
     confusion: tuple[tuple[Int, ...], ...]
-    precision: ByClass[Known]
-    recall: ByClass[Known]
+    precision: ByClass
+    recall: ByClass
     interval: Share
     """Of strict accuracy."""
     window_intervals: dict[str, Share] = Field(default_factory=dict)
@@ -243,17 +111,17 @@ class Kinematic(NetworkWindows):
     """The store's own network, from every side."""
 
     baselines: dict[str, Known]
-    samples: dict[str, Int]
-    trained_baselines: dict[str, Compared] = Field(default_factory=dict)
+    samples: SampleCounts
+    trained_baselines: dict[str, TrainedBaseline] = Field(default_factory=dict)
     seeds: Seeds
-    reliability: tuple[Reliability, ...] = ()
-    calibration: Calibration = Calibration()
+    reliability: tuple[LeadShare, ...] = ()
+    calibration: Calibration
     by_factor: dict[str, dict[str, Share]] = Field(default_factory=dict)
     by_tenth: dict[str, tuple[Tenth, ...]] = Field(default_factory=dict)
     no_slip: NoSlip | None = None
-    by_trial: tuple[TrialErrors, ...] = ()
-    work: Work | None = None
-    beside: dict[str, Compared] = Field(default_factory=dict)
+    by_trial: tuple[TrialWindows, ...] = ()
+    work: WindowWork | None = None
+    beside: dict[str, Baseline] = Field(default_factory=dict)
 
 
 class DetectionRule(Part):
@@ -263,63 +131,6 @@ class DetectionRule(Part):
     margin: Number
     choose: str = "protocol"
     """What chose them: `protocol`, `validation` or `test`."""
-
-
-class FalseEarlyRate(Part):
-    """A share of trials with its exact interval."""
-
-    value: Known
-    low: Known
-    high: Known
-
-
-class DetectorScores(Part):
-    """A detector on the trials of one split."""
-
-    latency_ms: ByOnset[Statistics]
-    lead_ms: Lead
-    false_early_rate: FalseEarlyRate
-    median_with_missed_ms: Known
-    """Median incipient latency, missed and late ones as infinite; null where that is infinite."""
-
-
-class DetectorRate(Part):
-    """A detector whose level allows a rate of false early detections."""
-
-    asked: Number
-    allowed: Int
-    """Validation trials that may be false early."""
-    choice: Any = None
-    """What else was chosen, such as the windows that are averaged."""
-    validation: DetectorScores
-    test: DetectorScores
-
-
-class CurvePoint(Part):
-    """Latency on test trials at one rate on validation trials."""
-
-    rate: Number
-    median_ms: Known
-
-
-class Detector(Part):
-    """A detector at all rates."""
-
-    name: str
-    stride_ms: Int
-    curve: tuple[CurvePoint, ...]
-    rates: tuple[DetectorRate, ...]
-
-
-class Detectors(Part):
-    """Detectors compared at equal rates of false early detections."""
-
-    detectors: tuple[Detector, ...]
-    carried: tuple[Detector, ...] = ()
-    """The same of a network whose states are carried from window to window."""
-    strides_ms: tuple[Int, ...]
-    trials: dict[str, Int]
-    """By split."""
 
 
 class Network(Part):
@@ -399,46 +210,6 @@ class References(Part):
     wear: dict[str, Trend]
 
 
-class Spread(Part):
-    """Distances of onsets."""
-
-    n: Int
-    median: Known
-    median_abs: Known
-    max_abs: Known
-
-
-class LabelErrors(Part):
-    """Labels in use less the simulation's truth of their rule."""
-
-    rule: str
-    incipient: Spread
-    gross: Spread
-
-
-class Papillae(Spread):
-    """Change points of all papillae, and the share of intervals that hold the truth."""
-
-    coverage: Known
-
-
-class Rules(Part):
-    """Both labelling rules less their truth, and less each other."""
-
-    paper: ByOnset[Spread]
-    change_point: ByOnset[Spread]
-    apart: ByOnset[Spread]
-    papillae: Papillae
-
-
-class LabelCheck(Part):
-    """Labels of slides taken again with video."""
-
-    trials: Int
-    simulated: Bool = True
-    rules_ms: Rules
-
-
 class Hold(Part):
     """Slips in the hold of a campaign's trials."""
 
@@ -446,7 +217,7 @@ class Hold(Part):
     slipped: Int
     limit_px: Known
     most_px: Number
-    apart_ms: ByOnset[Spread]
+    apart_ms: DeviationByOnset
     """The paper's onset from the hold's end less the one from its start."""
 
 
@@ -454,7 +225,7 @@ class Labels(Part):
     """The labels behind all figures."""
 
     error_ms: LabelErrors
-    rules_ms: Rules
+    rules_ms: RuleErrors
     source: dict[str, Int] = Field(default_factory=dict)
     reviewed: dict[str, Int] | None = None
     check: LabelCheck | None = None
@@ -477,8 +248,8 @@ class Holdout(Part):
     model: str
     versions: tuple[str, ...]
     windows: HoldoutWindows
-    latency_ms: ByOnset[Statistics]
-    lead_ms: Lead
+    latency_ms: LatencyByOnset
+    lead_ms: LeadFigures
     without_onsets: Int = 0
     intervals: TrialIntervals
 
@@ -541,9 +312,9 @@ class Summary(Document):
     labels: Labels
     detection: dict[str, DetectionRule] = Field(default_factory=dict)
     """By campaign."""
-    choices: dict[str, Any] = Field(default_factory=dict)
+    choices: dict[str, Choice | None] = Field(default_factory=dict)
     """By campaign, what chose the rule; null where the protocol says it."""
-    detectors: Detectors | None = None
+    detectors: DetectorComparison | None = None
     holdout: Holdout | None = None
     sync: Sync
     quality: Quality

@@ -32,12 +32,13 @@ from sliplab.analysis.report.tradeoff_scene import ERRORS
 from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collect import collect
 from sliplab.flows.labelling.label import label
+from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report
 from sliplab.flows.study import Outcome
 from sliplab.storage.files import json_text, read_json, write_json
-from sliplab.storage.schema.summary import ReferenceTrial, Seed, Seeds, Summary, TrialOutcome
-from sliplab.storage.trials.derived import Derived
+from sliplab.storage.schema.evaluation import Seeds, SeedScores, TrialScore
+from sliplab.storage.schema.summary import ReferenceTrial, Summary, TrialOutcome
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
 from tests.flows.collecting.test_session import short
@@ -89,8 +90,8 @@ def test_a_summary_is_read_and_written_to_the_byte(store: Store) -> None:
 
 def test_trials_that_were_not_judged_are_told_apart(store: Store) -> None:
     campaigns = collected(store)
-    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
-    others = [trial_outcome(row) for row in rows if row["campaign"] != "tiny"]
+    rows = evaluation_of(store).trials
+    others = [trial_outcome(row) for row in rows if row.campaign != "tiny"]
     later = account(campaigns, others, "kinematic")
     assert (later.planned, later.not_evaluated) == (2, 2)
     lost = copy.copy(campaigns[0])
@@ -106,12 +107,14 @@ FOUND = {
 }  # fmt: skip
 
 
-def judged(**changed: Any) -> Json:
+def judged(**changed: Any) -> TrialScore:
     """An evaluated trial."""
-    return {
+    row = {
         "campaign": "g", "experiment": "gravity", "trial": "t", "condition": {},
-        "incipient_ns": 10**9, "gross_ns": 2 * 10**9, "latency": {**FOUND, **changed},
+        "incipient_ns": 10**9, "gross_ns": 2 * 10**9, "end_ns": 3 * 10**9,
+        "detected_incipient_ns": 1, "detected_gross_ns": 2, "latency": {**FOUND, **changed},
     }  # fmt: skip
+    return TrialScore.model_validate(row)
 
 
 def test_what_became_of_a_trial() -> None:
@@ -124,7 +127,7 @@ def test_what_became_of_a_trial() -> None:
     assert trial_outcome(judged(false_early_incipient=True)).outcome == "false_early"
     assert trial_outcome(judged(false_early_gross=True)).gross == "false_early"
     assert trial_outcome(judged(missed_gross=True)).gross == "missed"
-    none = trial_outcome({**judged(), "latency": None, "gross_ns": None})
+    none = trial_outcome(judged().model_copy(update={"latency": None, "gross_ns": None}))
     assert (none.outcome, none.gross, none.lead_ms) == (
         "without_onsets", "without_onsets", None
     )  # fmt: skip
@@ -136,7 +139,7 @@ def test_what_became_of_a_trial() -> None:
 
 def test_trials_stand_under_their_conditions(store: Store) -> None:
     campaigns = collected(store)
-    rows = Derived.of(store, "evaluation").read("evaluation")["trials"]
+    rows = evaluation_of(store).trials
     found = Conditions(campaigns, rows, "gravity")
     cells = found.cells(list(found.factors))
     assert sum(map(len, cells.values())) == 2
@@ -374,8 +377,13 @@ def test_a_report_against_itself_differs_in_nothing(store: Store) -> None:
 
 def several_seeds(summary: Summary, *shares: tuple[float, float]) -> Summary:
     """The same with trained seeds of these accuracies, and margins."""
-    each = tuple(Seed(strict=share, argmax=share, margin=margin) for share, margin in shares)
-    kinematic = summary.kinematic.model_copy(update={"seeds": Seeds(each=each)})
+    each = tuple(
+        SeedScores(
+            seed=k, chosen=not k, validation_strict=None, strict=share, argmax=share, margin=margin
+        )
+        for k, (share, margin) in enumerate(shares)
+    )
+    kinematic = summary.kinematic.model_copy(update={"seeds": Seeds(each=each, spread={})})
     return summary.model_copy(update={"kinematic": kinematic})
 
 

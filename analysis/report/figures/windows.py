@@ -19,7 +19,7 @@ from sliplab.analysis.report.figures.style import (
     name_cells,
     svg_text,
 )
-from sliplab.storage.schema.summary import Reliability, Tenth
+from sliplab.storage.schema.evaluation import LeadShare, Tenth
 
 
 def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simulated: bool) -> str:
@@ -95,7 +95,7 @@ def recall_by_tenth(tenths: Mapping[str, Sequence[Tenth]], *, simulated: bool) -
         return svg_text(figure, simulated)
 
 
-def reliability(rows: Sequence[Reliability], *, simulated: bool) -> str:
+def reliability(rows: Sequence[LeadShare], *, simulated: bool) -> str:
     """Share right by lead with its interval, and how many windows there are of each.
 
     Args:

@@ -6,23 +6,38 @@ import pytest
 
 from sliplab.analysis.report.page import render_section
 from sliplab.analysis.report.windows import WorkSection, work_section
-from sliplab.storage.schema.summary import Compared, Kinematic, Range, Seed, Seeds, Share, Work
+from sliplab.storage.schema.evaluation import (
+    Seeds,
+    SeedScores,
+    Share,
+    Spread,
+    TrainedBaseline,
+    WindowWork,
+)
+from sliplab.storage.schema.summary import Kinematic
 
 
 def made(strict: tuple[float, ...], argmax: tuple[float, ...]) -> tuple[WorkSection, str]:
     """The section of a network with these accuracies, and a rival's; and its words."""
     layers = {"conv1": 10.0, "all": 10.0}
-    work = Work(
+    work = WindowWork(
         synaptic_operations=layers, dense_multiply_adds={"conv1": 100, "all": 100}, share=0.1,
         spikes={"iaf1": 3.0}, rates={"iaf1": 0.01}, events=7.0, n=5,
     )  # fmt: skip
-    mean = Range(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
-    each = tuple(Seed(seed=k, strict=share) for k, share in enumerate(strict))
+    mean = Spread(mean=sum(strict) / len(strict), min=min(strict), max=max(strict))
+    each = tuple(
+        SeedScores(
+            seed=k, chosen=not k, validation_strict=None, argmax=share, strict=share, margin=share
+        )
+        for k, share in enumerate(strict)
+    )
     rivals = {}
     if argmax:
         seeds = [{"seed": k, "argmax": share} for k, share in enumerate(argmax)]
-        rivals["cnn_frame"] = Compared(
+        rivals["cnn_frame"] = TrainedBaseline(
             argmax=argmax[0],
+            low=None,
+            high=None,
             network_ahead=Share(share=-0.01, low=-0.02, high=-0.001, n=5, trials=2),
             made={"epochs": 10, "weights": 1234, "multiply_adds": 5678, "seeds": seeds},
         )
