@@ -1,12 +1,13 @@
 """Pages of the site that are made from the program itself when it is built, so that they are true.
 
-The command line, the keys of protocol and rig files, and the list of decisions.
+The command line, the keys of protocol and rig files and of documents, and the list of decisions.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,25 @@ from mkdocs.structure.files import File, Files
 from schema_tables import tables
 
 DOCS = Path(__file__).parent
+_DOCUMENTS = {
+    "trial": (
+        "The record of a trial",
+        "`campaigns/NAME/trials/ID/record.json`: what was recorded, and how well.",
+    ),
+    "label": (
+        "The label of a trial",
+        "`derived/labels/NAME/ID.json`: its onsets, and doubts of them ([Labels](../labels.md)).",
+    ),
+    "evaluation": (
+        "An evaluation",
+        "`derived/evaluation/evaluation.json`: figures of test trials ([Metrics](../metrics.md)).",
+    ),
+    "summary": (
+        "The summary of a report",
+        "`report/summary.json`: the numbers of a report ([The report's numbers](../summary.md)).",
+    ),
+}
+"""Title and place of each document in a store."""
 _ITEM = re.compile(r"(- |1\. )\S")
 
 
@@ -32,6 +52,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/commands.md": commands,
         "reference/protocol-file.md": protocol_file,
         "reference/rig-file.md": rig_file,
+        **{f"reference/{kind}-document.md": partial(document, kind) for kind in _DOCUMENTS},
     }
     for name, make in pages.items():
         files.append(File.generated(config, name, content=make()))
@@ -90,6 +111,20 @@ differ, and all others from that file. [Bring up a rig](../howto/bring-up-a-rig.
 by their values; for editors there is [rig.json](../schema/rig.json).
 
 {tables(models["RigFile"], models)}"""
+
+
+def document(kind: str) -> str:
+    """Every key of a document in a store."""
+    from sliplab.flows.planning.schema import file_schema
+
+    title, text = _DOCUMENTS[kind]
+    schema = file_schema(kind)
+    return f"""# {title}
+
+{text} Programs check what they read by [{kind}.json](../schema/{kind}.json). A key that a version
+does not know is kept; one that is not needed may be missing in documents of older versions.
+
+{tables(schema, schema["definitions"])}"""
 
 
 def commands() -> str:

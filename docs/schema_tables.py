@@ -1,4 +1,4 @@
-"""The keys of a protocol or rig file as tables, made from its JSON Schema."""
+"""The keys of a file or document as tables, made from its JSON Schema."""
 
 from __future__ import annotations
 
@@ -106,7 +106,11 @@ def _may_be_null(part: Schema) -> bool:
 def _bounds(part: Schema) -> str:
     words = {"minimum": "from", "exclusiveMinimum": "above"}
     words |= {"maximum": "to", "exclusiveMaximum": "below"}
-    said = [f"{word} {part[key]:,}" for key, word in words.items() if key in part]
+    said = [
+        f"{word} {part[key]:,}"
+        for key, word in words.items()
+        if key in part and abs(part[key]) < 2**63  # else it only says that it has 64 bits
+    ]
     return f", {' '.join(said)}" if said else ""
 
 

@@ -1,9 +1,9 @@
-"""`sliplab schema`: what an editor needs to complete and check protocol and rig files."""
+"""`sliplab schema`: JSON Schemas of protocol and rig files, and of the documents in a store."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -11,26 +11,29 @@ from sliplab.flows.cli.common import JsonOption, finish
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 
+if TYPE_CHECKING:
+    from sliplab.flows.planning.schema import Kind
+
 app = typer.Typer()
 
-KINDS = ("protocol", "rig")
+KINDS = ("protocol", "rig", "trial", "label", "evaluation", "summary")
 
 
 @app.command()
 def schema(
-    kind: Annotated[str, typer.Argument(help="Of which file: protocol or rig.")],
+    kind: Annotated[str, typer.Argument(help=f"Of which file: {', '.join(KINDS)}.")],
     out: Annotated[
         Path | None, typer.Option("--out", help="Write it into this file instead.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the JSON Schema of a protocol or rig file."""
+    """Print the JSON Schema of a protocol, a rig file or a document in a store."""
     if kind not in KINDS:
         raise InputError("KIND", "", kind, f"must be one of {', '.join(KINDS)}")
     from sliplab.flows.planning.schema import file_schema
     from sliplab.storage.files import write_json
 
-    made = file_schema("protocol" if kind == "protocol" else "rig")
+    made = file_schema(cast("Kind", kind))
     if out is None:
         console.print_json(made)
         return

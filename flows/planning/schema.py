@@ -1,8 +1,10 @@
-"""JSON Schemas of protocol and rig files, for editors that complete, explain and check YAML.
+"""JSON Schemas of protocol and rig files, and of the documents in a store.
 
-They are made from the models that read the files, so they know the same keys. They know less than
-`sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level breaks,
-stands in the models alone. They are of draft 7, the newest that the YAML language server knows.
+Editors complete, explain and check YAML by the first two; programs check what they read by the
+others. They are made from the models that read the files, so they know the same keys. They know
+less than `sliplab plan` and `sliplab check`: a rule over several keys, such as a limit that a level
+breaks, stands in the models alone. They are of draft 7, the newest that the YAML language server
+knows.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import ast
 import inspect
 import sys
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
@@ -19,9 +21,27 @@ from pydantic.json_schema import GenerateJsonSchema
 from sliplab.protocols.model import Protocol
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.rig_inheritance import KEY
+from sliplab.storage.schema.document import Document
+from sliplab.storage.schema.evaluation import Evaluation
+from sliplab.storage.schema.label import TrialLabel
+from sliplab.storage.schema.summary import Summary
+from sliplab.storage.schema.trial import TrialRecord
 
-Kind = Literal["protocol", "rig"]
+Kind = Literal["protocol", "rig", "trial", "label", "evaluation", "summary"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 Schema = dict[str, Any]
+DOCUMENTS: dict[Kind, type[Document]] = {
+    "trial": TrialRecord,
+    "label": TrialLabel,
+    "evaluation": Evaluation,
+    "summary": Summary,
+}
+TITLES: dict[Kind, str] = {
+    "trial": "The record of a trial of SlipLab",
+    "label": "The label of a trial of SlipLab",
+    "evaluation": "An evaluation of SlipLab",
+    "summary": "The summary of a report of SlipLab",
+}
 _DIALECT = "http://json-schema.org/draft-07/schema#"
 _PART = "Part"
 
@@ -42,12 +62,12 @@ class _Described(GenerateJsonSchema):
 
 
 def file_schema(kind: Kind) -> Schema:
-    """The JSON Schema (draft 7) of a protocol file or a rig file, as plain data."""
-    return _protocol_schema() if kind == "protocol" else _rig_schema()
-
-
-def _protocol_schema() -> Schema:
-    return _finished(_made(Protocol), "A protocol of SlipLab")
+    """Return the JSON Schema (draft 7) of a file or document, as plain data."""
+    if kind == "rig":
+        return _rig_schema()
+    if kind == "protocol":
+        return _finished(_made(Protocol), "A protocol of SlipLab")
+    return _finished(_made(DOCUMENTS[kind]), TITLES[kind])
 
 
 def _rig_schema() -> Schema:

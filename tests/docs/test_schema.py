@@ -13,20 +13,21 @@ import pytest
 import yaml
 from jsonschema import Draft7Validator
 
-from sliplab.flows.planning.schema import Kind, file_schema
+from sliplab.flows.planning.schema import DOCUMENTS, KINDS, Kind, file_schema
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.model import Protocol
 from sliplab.protocols.yaml_file import StrictModel, validate
 from sliplab.rigs.rig_file import RigFile, load_rig_file
-from sliplab.storage.files import json_text
+from sliplab.storage.files import json_text, read_json
+from sliplab.storage.schema.document import DocumentError
 from tests.conftest import ROOT
+from tests.flows.older import older_store
 
 FILES: list[tuple[Kind, Path]] = [
     *(("protocol", path) for path in sorted((ROOT / "protocols").glob("*.yaml"))),
     *(("rig", path) for path in sorted((ROOT / "rigs").glob("*.yaml"))),
 ]
 MODELS: dict[Kind, type[StrictModel]] = {"protocol": Protocol, "rig": RigFile}
-KINDS: tuple[Kind, ...] = ("protocol", "rig")
 CHECKERS = {kind: Draft7Validator(file_schema(kind)) for kind in KINDS}
 
 
@@ -57,6 +58,55 @@ def test_every_shipped_file_is_accepted(kind: Kind, path: Path) -> None:
         f"{error.json_path}: {error.message}" for error in CHECKERS[kind].iter_errors(_read(path))
     ]
     assert not found
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of an older version."""
+    return older_store(tmp_path_factory.mktemp("older") / "store")
+
+
+@pytest.mark.parametrize(
+    ("kind", "pattern", "count"),
+    [
+        ("trial", "campaigns/*/trials/*/record.json", 4),
+        ("label", "derived/labels/*/*.json", 4),
+        ("evaluation", "derived/evaluation/*.json", 1),
+        ("summary", "report/summary.json", 1),
+    ],
+)
+def test_documents_of_a_store_are_accepted_and_read(
+    older: Path, kind: Kind, pattern: str, count: int
+) -> None:
+    paths = sorted(older.glob(pattern))
+    assert len(paths) == count
+    for path in paths:
+        data = read_json(path)
+        found = [f"{e.json_path}: {e.message}" for e in CHECKERS[kind].iter_errors(data)]
+        assert not found
+        assert DOCUMENTS[kind].parse(data, path).to_json() == data
+
+
+@pytest.mark.parametrize("kind", DOCUMENTS)
+def test_nothing_is_refused_in_a_document_that_its_reader_takes(older: Path, kind: Kind) -> None:
+    """With every value made nonsense, one at a time, the readers refuse what the schema does."""
+    patterns: dict[Kind, str] = {
+        "trial": "campaigns/*/trials/*/record.json", "label": "derived/labels/*/*.json",
+        "evaluation": "derived/evaluation/*.json", "summary": "report/summary.json",
+    }  # fmt: skip
+    path = min(older.glob(patterns[kind]))
+    data, refused = read_json(path), 0
+    for at in _leaves(data):
+        if any(isinstance(key, int) and key for key in at):
+            continue  # of a list the first entry stands for all
+        for junk in JUNK:
+            wrong = _set(data, at, junk)
+            if CHECKERS[kind].is_valid(wrong):
+                continue
+            refused += 1
+            with pytest.raises(DocumentError, match=path.name):
+                DOCUMENTS[kind].parse(wrong, path)
+    assert refused > 100
 
 
 def _leaves(part: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -197,5 +247,5 @@ def test_the_command_prints_and_writes_it(
     capsys.readouterr()
     assert not app(["schema", "protocol"], standalone_mode=False)
     assert json.loads(capsys.readouterr().out) == file_schema("protocol")
-    with pytest.raises(InputError, match="must be one of protocol, rig"):
+    with pytest.raises(InputError, match="must be one of protocol, rig, trial, label"):
         app(["schema", "store"], standalone_mode=False)
