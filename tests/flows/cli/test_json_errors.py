@@ -171,7 +171,7 @@ def test_a_trial_that_was_shown_is_an_object_too(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(view, "find", lambda *_: None)
     monkeypatch.setattr(view, "show", lambda _: None)
-    monkeypatch.setattr(Store, "open", lambda _: None)
+    monkeypatch.setattr("sliplab.storage.remote.mirror.open_store", lambda _: None)
     done = here("view", "s", "depth=1mm", "--json")
     assert json.loads(done.stdout) == {"trial": "depth=1mm", "file": None}
 
