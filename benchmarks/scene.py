@@ -32,8 +32,7 @@ from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
 from benchmarks.trials import run_session
 from sliplab.analysis.sweeps.scene_error import match_events
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
 from sliplab.rigs.scene.slides import run_slide
 from sliplab.storage.streams import F64, I64, EventChunk

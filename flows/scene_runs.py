@@ -33,8 +33,7 @@ from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import Clocks, MockSettings
-from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.mock.settings import Clocks, MockSettings, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
 from sliplab.rigs.scene.slides import run_slide

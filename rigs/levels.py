@@ -1,7 +1,7 @@
 """The level of physics that a plan needs in a simulated rig, and the slip to expect from it.
 
 A scene takes the lowest level whose onsets differ from the next level's by less than two seeds of
-the same scene differ. That is reckoned from onsets in closed form (`rigs.scene.onsets`), in
+the same scene differ. That is computed from onsets in closed form (`rigs.scene.onsets`), in
 milliseconds and without a simulation; `sliplab tradeoff --scene` measures the same by windows.
 """
 
@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from sliplab.protocols.plan import Plan
 from sliplab.protocols.program import Dwell, Move, Program
-from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import Material, slide_onsets
 from sliplab.rigs.scene.randomness import generator

@@ -28,7 +28,7 @@ from sliplab.protocols.yaml_file import (
 from sliplab.rigs.core.arm_settings import check_units
 from sliplab.rigs.core.calibration import Calibration, without_taught
 from sliplab.rigs.devices.settings import DeviceSettings
-from sliplab.rigs.mock.settings import MockSettings, check_promises
+from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 
 SCALE_ERROR = 0.005
@@ -180,7 +180,7 @@ class RigFile(StrictModel):
     def _promises_are_kept(self) -> RigFile:
         """The simulated clocks are no worse than `timing` says."""
         if self.mock is not None:
-            check_promises(self.mock, self.timing)
+            check_timing(self.mock, self.timing)
         return self
 
     @property

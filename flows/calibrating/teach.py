@@ -82,7 +82,7 @@ def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repea
         RigError: a touch never came, or the fourth is off the plane by more than 0.1 mm.
     """
     rig = session.rig
-    rig.frame = rig.frame.with_zero(0.0)
+    rig.plate_frame = rig.plate_frame.with_zero(0.0)
     places = plane_places(span_mm)
     found: dict[str, list[Touch]] = {name: [] for name in places}
     with console.bar(f"{session.simulated}touches", repeats * len(places)) as bar:
@@ -93,7 +93,7 @@ def teach_plane(session: CalibrationSession, span_mm: float, creep: Creep, repea
                 bar.advance(1, f"{name} {found[name][-1].depth_mm:+.3f} mm")
     depths = {name: [t.depth_mm for t in touches] for name, touches in found.items()}
     points = {
-        name: rig.frame.pose(Position(*xy, float(np.mean(depths[name])))).xyz_mm
+        name: rig.plate_frame.pose(Position(*xy, float(np.mean(depths[name])))).xyz_mm
         for name, xy in places.items()
     }
     scatter = max(float(np.ptp(values)) / 2 for values in depths.values())
@@ -144,7 +144,7 @@ def _plane_found(
             f"within {scatter_mm:.3f} mm: at most {MOST_PLANE_MM:g} mm is good. Is something "
             "loose, or the skin dirty? Nothing was written",
         )
-    before = session.rig.frame
+    before = session.rig.plate_frame
     turned = np.degrees(np.arccos(np.clip(float(before.axes[2] @ frame.axes[2]), -1.0, 1.0)))
     moved = float(before.axes[2] @ (frame.origin - before.origin))
     entry = {
@@ -191,7 +191,7 @@ def teach_zero(
         RigError: a touch never came, or the two differ by more than 0.15 mm.
     """
     rig, camera = session.rig, session.file.frame_camera
-    rig.frame = rig.frame.with_zero(0.0)
+    rig.plate_frame = rig.plate_frame.with_zero(0.0)
     if with_markers:
         side = max(16, round(REGION_MM * camera.scale_px_per_mm / 16) * 16)
         rig.frames.set_region(min(side, camera.width_px), min(side, camera.height_px))

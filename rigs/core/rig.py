@@ -86,7 +86,7 @@ class Rig:
     frames: FrameCamera
     sync: SyncBox
     operator: Operator
-    frame: PlateFrame
+    plate_frame: PlateFrame
     poll_s: float
     timing: Timing = field(default_factory=Timing)
     touch_mm: float = 0.0
@@ -191,7 +191,7 @@ class Rig:
             if self.simulation is not None:
                 hold = next(times.start_ns for times, kept in steps if kept)
                 truth = self.simulation.truth(reference, hold)
-            return TrialRun(tuple(steps), self.frame.zero_mm, truth, tuple(path))
+            return TrialRun(tuple(steps), self.plate_frame.zero_mm, truth, tuple(path))
 
     def press(self, depth_mm: float, speed_mm_s: float, clearance_mm: float, times: int) -> None:
         """Warm the skin up: press at the plate's centre and let go, `times` times."""
@@ -218,7 +218,7 @@ class Rig:
         Raises:
             RigError: nothing was touched within `search_mm`.
         """
-        self.frame = self.frame.with_zero(0.0)
+        self.plate_frame = self.plate_frame.with_zero(0.0)
         start = Position(0.0, 0.0, -search_mm)
         with self.safely(start):
             self.begin_trial(start, seed)
@@ -227,7 +227,7 @@ class Rig:
             zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
             self.events.stop()
             self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
-        self.frame = self.frame.with_zero(zero)
+        self.plate_frame = self.plate_frame.with_zero(zero)
         return zero
 
     def listen(self, seconds: float, sink: Sink, rate_hz: int) -> None:
@@ -243,10 +243,10 @@ class Rig:
 
     def _creep(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
-        self.arm.start([Segment(self.frame.pose(target), speed_mm_s)])
+        self.arm.start([Segment(self.plate_frame.pose(target), speed_mm_s)])
         while not self.arm.progress().done:
             self.wait(LOOK_S)
-            depth = self.frame.position(self.arm.pose().xyz_mm).depth_mm
+            depth = self.plate_frame.position(self.arm.pose().xyz_mm).depth_mm
             if rate.touched(self.central_events()):
                 self.arm.stop()
                 return depth - speed_mm_s * rate.LATE_S - self.touch_mm
@@ -295,7 +295,7 @@ class Rig:
         seconds = at.distance_mm(step.to) / step.speed_mm_s
         if seconds == 0:
             return start, start
-        self.arm.start([Segment(self.frame.pose(step.to), step.speed_mm_s)])
+        self.arm.start([Segment(self.plate_frame.pose(step.to), step.speed_mm_s)])
         deadline = self.clock.now_ns() + int((2 * seconds + _MOVE_GRACE_S) * 1e9)
         while not (progress := self.arm.progress()).done:
             if not progress.state.healthy:
@@ -375,12 +375,12 @@ class Rig:
     def _segment(
         self, times: StepTimes, begin: Position, end: Position, speed: float
     ) -> PathSegment:
-        places = self.frame.pose(begin).xyz_mm, self.frame.pose(end).xyz_mm
+        places = self.plate_frame.pose(begin).xyz_mm, self.plate_frame.pose(end).xyz_mm
         return PathSegment(times.start_ns, times.end_ns, *places, speed)
 
     def position(self) -> Position:
         """Return where the tool centre point is now, in plate coordinates."""
-        return self.frame.position(self.arm.pose().xyz_mm)
+        return self.plate_frame.position(self.arm.pose().xyz_mm)
 
     @contextmanager
     def safely(self, clear: Position) -> Iterator[None]:
@@ -446,7 +446,7 @@ class Rig:
             out = Position(at.x_mm, at.y_mm, min(at.depth_mm, clear.depth_mm))
             if at.distance_mm(out) == 0:
                 return None
-            self.arm.start([Segment(self.frame.pose(out), RETRACT_SPEED_MM_S)])
+            self.arm.start([Segment(self.plate_frame.pose(out), RETRACT_SPEED_MM_S)])
             polls = int((at.distance_mm(out) / RETRACT_SPEED_MM_S + 2.0) / self.poll_s) + 1
             for _ in range(polls):
                 if (progress := self.arm.progress()).done:

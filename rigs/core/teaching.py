@@ -146,7 +146,7 @@ def _approach(rig: Rig, begin: Position, end: Position, rate: RateTouch) -> None
     way = begin.distance_mm(end)
     if way == 0.0:
         return
-    rig.arm.start([Segment(rig.frame.pose(end), APPROACH_MM_S)])
+    rig.arm.start([Segment(rig.plate_frame.pose(end), APPROACH_MM_S)])
     deadline = rig.clock.now_ns() + int((2 * way / APPROACH_MM_S + _GRACE_S) * 1e9)
     while not (progress := rig.arm.progress()).done:
         if rig.clock.now_ns() > deadline:
@@ -220,7 +220,7 @@ class _Watch:
 
 def _creep(rig: Rig, clear: Position, deepest: Position, watch: _Watch) -> None:
     seconds = clear.distance_mm(deepest) / watch.speed_mm_s
-    rig.arm.start([Segment(rig.frame.pose(deepest), watch.speed_mm_s)])
+    rig.arm.start([Segment(rig.plate_frame.pose(deepest), watch.speed_mm_s)])
     deadline = rig.clock.now_ns() + int((2 * seconds + _GRACE_S) * 1e9)
     while not rig.arm.progress().done:
         rig.wait(LOOK_S)

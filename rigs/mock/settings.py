@@ -8,13 +8,16 @@ none of them was measured on a real skin, and whatever is computed from them is 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from sliplab.protocols.timing import Delay, Timing
 from sliplab.protocols.yaml_file import KeyedError, StrictModel
 from sliplab.rigs.mock.fault_settings import Fault, check_papillae
+
+if TYPE_CHECKING:
+    from sliplab.rigs.scene import skin as scene_skin
 
 Positive = Annotated[float, Field(gt=0, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]
@@ -328,7 +331,19 @@ class MockSettings(StrictModel):
         return self
 
 
-def check_promises(mock: MockSettings, timing: Timing) -> None:
+def skin_of(settings: MockSettings) -> scene_skin.Skin:
+    """Return the skin that belongs to a simulated rig."""
+    from sliplab.rigs.scene import skin as scene_skin  # numpy, which a rig file does without
+
+    made = settings.scene.skin
+    geometry = scene_skin.SkinGeometry(
+        **made.model_dump(exclude={"seed", "relaxation_share", "relaxation_s"}),
+        friction_scatter=settings.scene.friction.papilla_scatter,
+    )
+    return scene_skin.make_skin(geometry, settings.seed if made.seed is None else made.seed)
+
+
+def check_timing(mock: MockSettings, timing: Timing) -> None:
     """Hold a simulated rig's clocks and delays against `timing`.
 
     Raises:

@@ -22,8 +22,7 @@ from sliplab.rigs.mock.faults import FaultBook
 from sliplab.rigs.mock.history import History
 from sliplab.rigs.mock.path import SENSOR, ArmPath, ContactPlane, Deviation, Leg
 from sliplab.rigs.mock.physics import Physics
-from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.lens import BoardPlace
 from sliplab.rigs.scene.skin import Skin
 from sliplab.rigs.scene.vibration import Vibration

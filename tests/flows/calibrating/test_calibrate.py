@@ -32,7 +32,7 @@ from tests.conftest import ROOT
 
 MOCK = (ROOT / "rigs" / "mock.yaml").read_text()
 QUICK = Creep(clearance_mm=2.5, search_mm=2.0)
-TRUE_PLANE = build_rig(load_rig_file(Path("mock"))[0]).frame
+TRUE_PLANE = build_rig(load_rig_file(Path("mock"))[0]).plate_frame
 """The shipped file's plane, which is the true one to 0.01 mm."""
 
 

@@ -80,7 +80,7 @@ def _numbers_aside(text: str) -> str:
 def _arm(rig: Rig) -> str:
     """What the arm did when its trial ended early."""
     try:
-        clear = rig.frame.position(rig.arm.pose().xyz_mm).depth_mm < CLEAR_MM
+        clear = rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm < CLEAR_MM
         ready = rig.arm.state() is ArmState.READY
     except ArmFault:
         return "stands still, and is not asked to move"

@@ -59,7 +59,7 @@ def test_a_full_disk_ends_the_stretch_and_loses_nothing(tmp_path: Path) -> None:
     kept = checksums(campaign)
     assert len(kept) == 1
     assert "No space left on device" in campaign.quarantined()[0]["cause"]
-    depth = work.rig.frame.position(work.rig.arm.pose().xyz_mm).depth_mm
+    depth = work.rig.plate_frame.position(work.rig.arm.pose().xyz_mm).depth_mm
     assert depth == pytest.approx(-5.0, abs=1e-3)  # clear of the plate
     goes_on(tmp_path, kept)
 
@@ -146,7 +146,7 @@ def test_a_protective_stop_at_a_point_ends_the_stretch(tmp_path: Path) -> None:
     work, campaign = begin(tmp_path, [{"kind": "arm_protective_stop", "trial": 2, "at_mm": 0.8}])
     with pytest.raises(ArmFault, match="protective stop in the phase 'slide'; the arm stays"):
         take_all(work)
-    at = work.rig.frame.position(work.rig.arm.pose().xyz_mm)
+    at = work.rig.plate_frame.position(work.rig.arm.pose().xyz_mm)
     assert at.depth_mm == pytest.approx(2.4, abs=1e-3)
     # the slide of 1.6 mm is centred on the plate
     assert (at.x_mm, at.y_mm) == pytest.approx((0.0, 0.0), abs=1e-3)

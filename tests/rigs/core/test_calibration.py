@@ -149,12 +149,12 @@ def test_an_age_is_a_number_of_days(age: object, says: str) -> None:
 def test_a_rig_begins_with_what_was_found() -> None:
     data = parse_yaml(MOCK, "mock")
     plain = build_rig(validate(RigFile, data, "mock"))
-    assert plain.frame.zero_mm == 0.0
+    assert plain.plate_frame.zero_mm == 0.0
     assert plain.centre_px is None
     data["calibration"] |= {k: WHOLE[k] for k in ("depth_zero", "event_crop")}
     data = parse_yaml(yaml.safe_dump(yaml.safe_load(yaml.safe_dump(_plain(data)))), "mock")
     rig = build_rig(validate(RigFile, data, "mock"))
-    assert rig.frame.zero_mm == 0.01
+    assert rig.plate_frame.zero_mm == 0.01
     assert rig.centre_px == (318.0, 241.0)
 
 

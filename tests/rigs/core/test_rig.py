@@ -118,7 +118,7 @@ def test_a_trial_depends_on_nothing_that_ran_before() -> None:
     other = make_rig()
     other.press(2.0, 2.0, 5.0, 2)
     run(other, plan, Memory(), seed=99)
-    other.frame = other.frame.with_zero(0.0)
+    other.plate_frame = other.plate_frame.with_zero(0.0)
     run(other, plan, second)
     for name in first.parts:
         assert np.array_equal(first.all(name), second.all(name)), name
@@ -218,7 +218,7 @@ def test_on_any_failure_the_arm_stops_first_and_a_healthy_one_retracts(
         run(rig, short_plan(), Memory(fail_after=3, error=error))
     calls = after_the_stop(notes)
     assert calls.index("arm.start") < calls.index("events.stop")
-    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
+    assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
     assert rig.arm.state() is ArmState.READY
 
 
@@ -229,29 +229,31 @@ def test_a_stop_request_is_looked_at_in_the_motion() -> None:
     with pytest.raises(StopRequested):
         run(rig, short_plan(), Memory())
     rig.should_stop = lambda: False
-    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm <= -5.0 + 1e-6
+    assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm <= -5.0 + 1e-6
 
 
 def test_touching_off_finds_the_surface() -> None:
     rig = make_rig()
     found = [rig.touch_off(0.5, 1.5, seed) for seed in range(1, 5)]
     assert np.abs(found).max() < 0.06  # the taught plane is the true one; depth steps are 0.2 mm
-    assert rig.frame.zero_mm == found[-1]
+    assert rig.plate_frame.zero_mm == found[-1]
 
 
 def test_touching_off_finds_a_surface_that_was_taught_wrong() -> None:
     rig = make_rig()
-    origin, axes = rig.frame.origin - 0.5 * rig.frame.axes[2], rig.frame.axes
-    rig.frame = PlateFrame(origin, axes)
+    origin, axes = rig.plate_frame.origin - 0.5 * rig.plate_frame.axes[2], rig.plate_frame.axes
+    rig.plate_frame = PlateFrame(origin, axes)
     assert rig.touch_off(0.5, 1.5, 1) == pytest.approx(0.5, abs=0.06)
 
 
 def test_touching_off_goes_no_deeper_than_its_limit() -> None:
     rig = make_rig()
-    rig.frame = PlateFrame(rig.frame.origin - 5.0 * rig.frame.axes[2], rig.frame.axes)
+    rig.plate_frame = PlateFrame(
+        rig.plate_frame.origin - 5.0 * rig.plate_frame.axes[2], rig.plate_frame.axes
+    )
     with pytest.raises(RigError, match=r"within 1.5 mm of the taught plane; teach"):
         rig.touch_off(0.5, 1.5, 1)
-    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm <= -1.5 + 1e-6
+    assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm <= -1.5 + 1e-6
 
 
 def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
@@ -262,7 +264,7 @@ def test_a_stop_while_touching_off_is_not_blamed_on_the_plane() -> None:
     with pytest.raises(ArmFault, match="protective stop in the phase 'touching off'"):
         rig.touch_off(0.5, 1.5, 1)
     assert notes.index("arm.stop") < notes.index("events.stop")
-    assert rig.frame.zero_mm == 0.0
+    assert rig.plate_frame.zero_mm == 0.0
 
 
 def test_a_plate_that_is_not_there_cannot_be_moved() -> None:

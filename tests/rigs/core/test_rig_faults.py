@@ -147,7 +147,7 @@ def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped() -> None:
     with pytest.raises(KeyboardInterrupt):
         run(rig, short_plan(), Memory(fail_after=3, error=KeyboardInterrupt()))
     assert rig.arm.state() is ArmState.READY
-    assert rig.frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
+    assert rig.plate_frame.position(rig.arm.pose().xyz_mm).depth_mm == pytest.approx(-5.0, abs=1e-6)
 
 
 def test_ctrl_c_while_the_arm_moves_clear_stops_it() -> None:

@@ -27,7 +27,9 @@ def find(chunk: FrameChunk) -> Any:
 
 def off(rig: Rig, mm: float) -> Rig:
     """The rig with a plane that lies `mm` before the one it has."""
-    rig.frame = PlateFrame(rig.frame.origin - mm * rig.frame.axes[2], rig.frame.axes)
+    rig.plate_frame = PlateFrame(
+        rig.plate_frame.origin - mm * rig.plate_frame.axes[2], rig.plate_frame.axes
+    )
     return rig
 
 
@@ -69,7 +71,7 @@ def test_a_touch_that_never_comes_ends_at_the_hard_limit() -> None:
     pose = rig.arm.pose
 
     def noted() -> Any:
-        deepest.append(rig.frame.position(pose().xyz_mm).depth_mm)
+        deepest.append(rig.plate_frame.position(pose().xyz_mm).depth_mm)
         return pose()
 
     rig.arm.pose = noted  # type: ignore[method-assign]
@@ -86,7 +88,7 @@ def test_an_arm_that_runs_on_is_stopped_at_the_limit() -> None:
 
     def overshoots(path: Any) -> None:
         if path[-1].speed_mm_s == QUICK.speed_mm_s:
-            far = rig.frame.pose(Position(0.0, 0.0, 3.5))
+            far = rig.plate_frame.pose(Position(0.0, 0.0, 3.5))
             path = [type(path[-1])(far, path[-1].speed_mm_s)]
         start(path)
 
@@ -208,7 +210,7 @@ def test_the_rate_is_that_of_touching_off() -> None:
 def test_a_person_jogs_and_confirms() -> None:
     rig = make_rig()
     poses = jogged(rig, [("", "touched centre"), ("", "touched right"), ("", "touched above")])
-    places = [rig.frame.position(pose.xyz_mm) for pose in poses]
+    places = [rig.plate_frame.position(pose.xyz_mm) for pose in poses]
     assert [round(p.x_mm) for p in places] == [0, 12, 0]
     assert all(abs(p.depth_mm) < 0.15 for p in places)
 
@@ -238,7 +240,7 @@ def test_an_arm_that_was_stopped_or_still_moves_gives_no_pose() -> None:
 def type_segment(rig: Rig, depth_mm: float) -> Any:
     from sliplab.rigs.core.capabilities import Segment
 
-    return Segment(rig.frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
+    return Segment(rig.plate_frame.pose(Position(0.0, 0.0, depth_mm)), 5.0)
 
 
 def test_looking_gives_frames_and_moves_nothing() -> None:

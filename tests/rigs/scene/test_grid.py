@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import MockSettings
-from sliplab.rigs.mock.skins import skin_of
+from sliplab.rigs.mock.settings import MockSettings, skin_of
 from sliplab.rigs.scene.slides import SlideRun, run_slide
 
 DEPTHS = (2.4, 2.6, 2.8, 3.0, 3.2, 3.4)

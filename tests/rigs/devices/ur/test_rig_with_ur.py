@@ -70,7 +70,7 @@ def rig_on(arm: Any) -> Rig:
         frames=cast("FrameCamera", nothing),
         sync=cast("SyncBox", nothing),
         operator=cast("Operator", nothing),
-        frame=frame,
+        plate_frame=frame,
         poll_s=0.02,
     )
 
