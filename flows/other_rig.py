@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label import label
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import label
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.trial_scores import score_row
 from sliplab.flows.planning.run_request import RunRequest, make_request

@@ -12,6 +12,7 @@ from typing import Any
 from prefect import flow
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels import label_errors
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.report import against as comparison
 from sliplab.analysis.report import report as content
@@ -21,7 +22,6 @@ from sliplab.analysis.report.programs import read_programs, shape_checked
 from sliplab.analysis.report.summary import Sources, make_summary
 from sliplab.analysis.report.tradeoff_scene import scene_cost
 from sliplab.analysis.report.trial import choose_example
-from sliplab.flows.labelling import label_errors
 from sliplab.flows.learning import evaluate, other_networks, window_baselines, window_scores
 from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.planning.estimate import plan_bytes

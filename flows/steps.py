@@ -10,7 +10,7 @@ from sliplab.flows.running import console
 
 STEPS = {
     "sync": "sliplab.flows.sync",
-    "label": "sliplab.flows.labelling.label",
+    "label": "sliplab.flows.label",
     "train": "sliplab.flows.learning.train",
     "evaluate": "sliplab.flows.learning.evaluate",
     "judge_model": "sliplab.flows.learning.other_networks",

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.labels.label_errors import CHECK
 from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
@@ -23,10 +24,7 @@ from sliplab.flows.collect import collect
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.holdout import STEP, measure_holdout
-from sliplab.flows.labelling import label_check
-from sliplab.flows.labelling.label import label
-from sliplab.flows.labelling.label_check import check_labels
-from sliplab.flows.labelling.label_errors import CHECK
+from sliplab.flows.label import check_labels, check_wanted, label
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.learning.window_baselines import window_baselines
@@ -98,7 +96,7 @@ def study(
         holdout: trials of the campaign that chooses nothing, where slides are simulated.
     """
     Store.create(run_requests[0].store)
-    check = check if label_check.wanted(run_requests[0]) else 0
+    check = check if check_wanted(run_requests[0]) else 0
     slides = _slides(run_requests)
     holdout = holdout if slides and slides[0].rig.simulated else 0
     ledger = Ledger(run_requests[0].store, expected(run_requests, check, more, holdout))

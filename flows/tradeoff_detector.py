@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.report import tradeoff_detector as page
 from sliplab.analysis.sweeps.detector_grid import Axes, make_grid
 from sliplab.analysis.sweeps.detector_rows import Row, plan, search_result, table
 from sliplab.analysis.sweeps.detector_search import STEP, DetectorSearch, SearchSize, search_trials
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_json, write_text

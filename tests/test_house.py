@@ -24,7 +24,7 @@ def test_only_error_reports_read_the_simulations_truth() -> None:
         "flows/collecting/session.py",
         "storage/trials/recording.py",
         "storage/schema/trial.py",
-        "flows/labelling/label_errors.py",
+        "analysis/labels/label_errors.py",
         "flows/ui/view.py",  # drawn beside the label, and called simulated
     }
 

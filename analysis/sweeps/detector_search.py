@@ -79,7 +79,7 @@ class SearchSize:
 
 
 class LabelSource(Protocol):
-    """Labels of a store, such as `sliplab.flows.labelling.reviewed.Labels`."""
+    """Labels of a store, such as `sliplab.analysis.labels.reviewed.Labels`."""
 
     def fresh(self, item: Collected, recording: Recording) -> bool:
         """Return whether a trial has its label."""

@@ -10,7 +10,7 @@ from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
 from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.schema.evaluation import Choice, DetectorComparison

@@ -10,9 +10,10 @@ from prefect.cache_policies import NO_CACHE
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.rule_sweep import settled
+from sliplab.analysis.labels.label_errors import label_errors, rules_compared
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.labelling.label_errors import label_errors, rules_compared
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import report_states
 from sliplab.flows.learning import counting, window_scores
 from sliplab.flows.learning.counting import COUNTS, count_spikes
 from sliplab.flows.learning.detector_trials import predict_trials, predictions_step
@@ -203,5 +204,5 @@ def evaluate(
         "step": "evaluate",
         "done": int(stale),
         "fresh": int(not stale),
-        **job.labels.report_states(campaigns),
+        **report_states(job.labels, campaigns),
     }

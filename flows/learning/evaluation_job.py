@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.flows.learning.detector_work import DetectorWork
 from sliplab.flows.learning.train import Model
 from sliplab.protocols import Trial

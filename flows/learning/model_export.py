@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.activity import activity
@@ -32,7 +33,6 @@ from sliplab.analysis.networks.quantised import (
 from sliplab.analysis.networks.speck import speck_fit, speck_markdown
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.model_latency import latencies
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import (

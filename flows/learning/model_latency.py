@@ -8,11 +8,11 @@ from typing import Any
 from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.quantised import Quantised, chip_run, quantised_net
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows import dataset
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.train import rules_of
 
 Latency = dict[str, Any]

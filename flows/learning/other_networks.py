@@ -18,6 +18,7 @@ import numpy.typing as npt
 from prefect import flow
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
@@ -27,7 +28,7 @@ from sliplab.analysis.networks.spiking import Engine
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import report_states
 from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.train import comparison_models, rules_of, training_settings
 from sliplab.flows.learning.trial_scores import score_row, summaries
@@ -258,7 +259,7 @@ def judge_model(
             for name, scores in found.experiments.items()
             if name != "kinematic"
         },
-        **labels.report_states(campaigns),
+        **report_states(labels, campaigns),
     }
 
 

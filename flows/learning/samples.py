@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.running.parallel_map import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer

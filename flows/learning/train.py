@@ -14,12 +14,13 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.report.figures.windows import training_curves
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import report_states
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.orchestration import Opaque, run
@@ -250,7 +251,7 @@ def train(
         "step": "train",
         "done": len(stale),
         "fresh": len(models) - len(stale),
-        **labels.report_states(campaigns),
+        **report_states(labels, campaigns),
     }
 
 

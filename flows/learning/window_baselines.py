@@ -12,11 +12,11 @@ from typing import Any
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
 from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning import window_scores
 from sliplab.flows.learning.samples import STEP as SAMPLES
 from sliplab.flows.learning.samples import load_samples

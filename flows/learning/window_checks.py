@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.window_checks import (
@@ -17,7 +18,6 @@ from sliplab.analysis.networks.window_checks import (
     permuted,
     shuffled_chance,
 )
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import choose_model
 from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.learning.train import training_settings, wanted_models

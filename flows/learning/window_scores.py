@@ -43,7 +43,7 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 if TYPE_CHECKING:
-    from sliplab.flows.labelling.reviewed import Labels
+    from sliplab.analysis.labels.reviewed import Labels
     from sliplab.flows.learning.evaluation_job import Job
 
 VERSION = 4

@@ -15,9 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import State, label_key, state_of
 from sliplab.analysis.windows.dataset import recorded_span
-from sliplab.flows.labelling.label import label_key
-from sliplab.flows.labelling.reviewed import State, state_of
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import KINDS, LABELS, TrialLabel

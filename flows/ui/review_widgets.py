@@ -20,7 +20,7 @@ from bokeh.models import (
     TextInput,
 )
 
-from sliplab.flows.labelling.reviewed import STATES
+from sliplab.analysis.labels.reviewed import STATES
 from sliplab.flows.ui.review import ShownTrial
 from sliplab.storage.trials.review import Decision, Onsets, Verdict
 

@@ -33,10 +33,9 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import label_key, state_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.windows.dataset import recorded_span
-from sliplab.flows.labelling.label import label_key
-from sliplab.flows.labelling.reviewed import state_of
 from sliplab.flows.running import stopping
 from sliplab.flows.ui.review import event_rate
 from sliplab.protocols.errors import InputError

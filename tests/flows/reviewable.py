@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.label import STEP, label_key
+from sliplab.analysis.labels.reviewed import label_key
 from sliplab.storage.files import sha256
+from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
 from sliplab.storage.trials.derived import Derived

@@ -12,7 +12,7 @@ from sliplab.analysis.campaigns import collected
 from sliplab.analysis.report.holdout import holdout_part, holdout_rows
 from sliplab.flows import generalise, holdout
 from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
-from sliplab.flows.labelling.label import label
+from sliplab.flows.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report

@@ -31,7 +31,7 @@ from sliplab.analysis.report.programs import FILES
 from sliplab.analysis.report.tradeoff_scene import ERRORS
 from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label import label
+from sliplab.flows.label import label
 from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected, training_campaigns
+from sliplab.analysis.labels.label_errors import read_check
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label_check import check_labels, folder_of, wanted
-from sliplab.flows.labelling.label_errors import read_check
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import check_folder, check_labels, check_wanted
 from sliplab.flows.learning import window_baselines, window_checks
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.samples import by_id, load_samples, split_trials
@@ -64,7 +64,7 @@ def test_labels_of_tracks_are_checked_with_video(
 ) -> None:
     run_request = replace(ran[0][0], store=tmp_path / "store")
     shutil.copytree(store_of(ran).folder, run_request.store)
-    assert wanted(run_request)
+    assert check_wanted(run_request)
     assert check_labels(run_request, 2)["done"] == 2
     found = read_check(Store.open(run_request.store))
     assert found is not None
@@ -73,7 +73,9 @@ def test_labels_of_tracks_are_checked_with_video(
     assert (
         found["rules_ms"]["paper"]["incipient"]["max_abs"] < 25.0
     )  # the true onset to within 2.5 frames
-    (first, second) = Store.open(folder_of(run_request)).campaign(run_request.campaign).committed()
+    (first, second) = (
+        Store.open(check_folder(run_request)).campaign(run_request.campaign).committed()
+    )
     assert {first, second} <= {trial.id for trial in run_request.plan}
     assert check_labels(run_request, 2)["done"] == 0
     assert check_labels(run_request, 3)["done"] == 1

@@ -16,7 +16,7 @@ from sliplab.analysis.clocks.refit import fit_again, same_clocks
 from sliplab.analysis.report.summary import sync_part
 from sliplab.flows.__main__ import main
 from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label import label
+from sliplab.flows.label import label
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.sync import sync
 from sliplab.storage.files import read_json, sha256, write_json

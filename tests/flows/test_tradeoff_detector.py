@@ -14,6 +14,7 @@ import pytest
 from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
+from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.networks import training
 from sliplab.analysis.sweeps.detector_grid import (
     PAPER,
@@ -24,11 +25,11 @@ from sliplab.analysis.sweeps.detector_grid import (
 from sliplab.analysis.sweeps.detector_rows import OBJECTIVES, RULES, Row, mean
 from sliplab.analysis.sweeps.detector_search import PRECISIONS, SearchSize, trial_counts
 from sliplab.analysis.windows import dataset
-from sliplab.flows.labelling.label import STEP, label_key
 from sliplab.flows.running import console, stopping
 from sliplab.flows.tradeoff_detector import NUMBERS, PAGE, TABLE, detector_search, tradeoff_detector
 from sliplab.protocols.settings import Detection
 from sliplab.storage.errors import StoreError
+from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 from tests.command_line import here

@@ -13,12 +13,12 @@ import torch
 import yaml
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.training import restore
 from sliplab.analysis.windows.dataset import trial_windows
-from sliplab.flows.labelling.reviewed import Labels
 from sliplab.flows.learning.evaluate import evaluate, evaluation_of
 from sliplab.flows.learning.other_networks import STEP, judge_model
 from sliplab.flows.learning.samples import load_samples

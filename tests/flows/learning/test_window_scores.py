@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.windows.dataset import TrialId
 from sliplab.flows.collect import collect
-from sliplab.flows.labelling.label import label
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.flows.label import label
 from sliplab.flows.learning.evaluate import evaluate, evaluation_of
 from sliplab.flows.learning.samples import load_samples, split_trials
 from sliplab.flows.learning.train import train

@@ -19,7 +19,7 @@ import distributed
 import pytest
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.labelling.label import label
+from sliplab.flows.label import label
 from sliplab.flows.learning.evaluate import evaluate
 from sliplab.flows.learning.train import train
 from sliplab.flows.running import cluster as clusters

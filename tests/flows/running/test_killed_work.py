@@ -17,7 +17,7 @@ from random import Random
 import pytest
 
 from sliplab.analysis.campaigns import collected
-from sliplab.flows.labelling.label import label
+from sliplab.flows.label import label
 from sliplab.flows.running import parallel_map
 from sliplab.flows.running.parallel_map import WorkerKilled
 from sliplab.storage.files import read_json

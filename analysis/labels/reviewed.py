@@ -1,4 +1,4 @@
-"""Labels as the steps after labelling read them: automatic, or with people's decisions applied.
+"""Labels as later steps read them: automatic, or with people's decisions applied.
 
 A decision counts only for the very label it was made on. Where that label has changed since, the
 automatic one is used and the decision is counted as stale, so that nobody's word is put on
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.flows.labelling.label import label_key
-from sliplab.flows.running import console
+from sliplab.analysis.labels import labelling
+from sliplab.protocols.settings import Labelling
 from sliplab.storage.schema.label import LABELS, OnsetDoubts, TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
@@ -27,8 +27,14 @@ _AFTER: dict[str, State] = {
 }  # fmt: skip
 
 
+def label_key(recording: Recording, settings: Labelling) -> str:
+    """Return the key of a trial's automatic label."""
+    parameters = settings.model_dump(mode="json")
+    return make_key(LABELS, labelling.VERSION, recording.checksum, parameters)
+
+
 def state_of(decision: Decision | None, key: str) -> State:
-    """What is decided about the label with this key; ``stale``: about an older one."""
+    """Return a decision's state for the label with this key; ``stale``: of an older label."""
     if decision is None or decision.verdict == "reopen":
         return "open"
     return _AFTER[decision.verdict] if decision.label == key else "stale"
@@ -39,14 +45,14 @@ class Labels:
     """The labels of a store.
 
     Attributes:
-        reviewed: whether people's decisions are applied.
+        reviewed: people's decisions are applied.
     """
 
     store: Store
     reviewed: bool = False
 
     def fresh(self, item: Collected, recording: Recording) -> bool:
-        """Whether a trial has its automatic label."""
+        """Check that a trial has its automatic label."""
         name = recording.folder.name
         return Derived.of(self.store, LABELS, item.name).fresh(name, _automatic(item, recording))
 
@@ -78,7 +84,7 @@ class Labels:
         return label.model_copy(update={**vars(decision.new), "doubts": doubts})
 
     def states(self, campaigns: list[Collected]) -> dict[State, int] | None:
-        """How many trials there are of each state; None where no decision is asked for."""
+        """Count the trials of each state; None where no decision is asked for."""
         if not self.reviewed:
             return None
         found = dict.fromkeys(STATES, 0)
@@ -87,18 +93,6 @@ class Labels:
                 decision = last(self.store, item.name, recording.folder.name)
                 found[state_of(decision, _automatic(item, recording))] += 1
         return found
-
-    def report_states(self, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
-        """Return the states as part of a step's result; warn of decisions that are not applied."""
-        states = self.states(campaigns)
-        if states is None:
-            return {}
-        if states["stale"]:
-            console.say(
-                f"warning: decisions on {states['stale']} trials were made on labels that have "
-                f"changed since and are not applied; see `sliplab review {self.store.folder}`"
-            )
-        return {"reviewed": states}
 
     def _applied(self, item: Collected, recording: Recording) -> Decision | None:
         if not self.reviewed:

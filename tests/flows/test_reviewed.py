@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.flows.labelling.label import STEP
-from sliplab.flows.labelling.reviewed import Labels
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.flows.label import report_states
 from sliplab.flows.learning import evaluate, train
 from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError
 from sliplab.storage.formats.import_trials import import_trials, trials_in
+from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
@@ -58,7 +59,7 @@ def test_decisions_count_only_when_asked(made: Reviewable) -> None:
         assert found.to_json() == {"key": made.keys[trial], **label()}
         assert plain.key(made.item, recording(made, trial)) == made.keys[trial]
     assert plain.states([made.item]) is None
-    assert plain.report_states([made.item]) == {}
+    assert report_states(plain, [made.item]) == {}
 
     found = reviewed.read(made.item, recording(made, one))
     assert (found.incipient_ns, found.gross_ns) == (NEW.incipient_ns, NEW.gross_ns)
@@ -97,7 +98,7 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     labels = Labels(made.store, reviewed=True)
     found = labels.read(made.item, recording(made, trial))
     assert found.incipient_ns == label()["incipient_ns"]
-    assert labels.report_states([made.item])["reviewed"]["stale"] == 1
+    assert report_states(labels, [made.item])["reviewed"]["stale"] == 1
     assert (
         "decisions on 1 trials were made on labels that have changed since"
         in capsys.readouterr().err

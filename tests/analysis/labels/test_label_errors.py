@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from sliplab.flows.labelling.label import STEP
-from sliplab.flows.labelling.label_errors import distances, holds_compared
+from sliplab.analysis.labels.label_errors import distances, holds_compared
+from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
 from tests.flows.reviewable import NAME, Reviewable, label

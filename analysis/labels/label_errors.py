@@ -1,4 +1,4 @@
-"""How far the labels' two rules are apart, and each from the simulation's truth."""
+"""Differences between the two rules of labelling, and of each from the simulation's truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sliplab.storage.trials.store import Store
 
 REFERENCES = ("hold_start", "hold_end")
 CHECK = "label-check"
-"""The step of `flows.labelling.label_check`, and where its own store stands."""
+"""The step that checks labels from drawn video, and the folder of its own store."""
 _TRUTH: dict[Rule, dict[Kind, str]] = {
     "paper": {"incipient": "incipient_ns", "gross": "gross_ns"},
     "change_point": {"incipient": "first_slip_ns", "gross": "slip_per_papilla_ns"},

@@ -1,0 +1,119 @@
+"""Labelling: onsets of every committed trial whose label is missing or stale, and a check of them.
+
+A study on a rig that hands over tracks in the place of video sees labels, but not what finding the
+markers does to them. So some of its trials, the first of its shuffled order, are taken once more
+on the same rig with its camera at the level `video`, into a store of their own inside the study's,
+and their labels are compared with the simulation's truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sliplab.analysis.campaigns import Collected, collected
+from sliplab.analysis.labels import labelling
+from sliplab.analysis.labels.label_errors import CHECK, rules_compared
+from sliplab.analysis.labels.reviewed import Labels, State, label_key
+from sliplab.flows.running import console
+from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
+from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
+from sliplab.rigs.rig_inheritance import rig_yaml
+from sliplab.storage.files import write_text
+from sliplab.storage.schema.evaluation import LabelCheck
+from sliplab.storage.schema.label import LABELS
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
+
+if TYPE_CHECKING:
+    from sliplab.flows.planning.run_request import RunRequest
+    from sliplab.flows.running.cluster import Cluster
+
+CHECK_VERSION = 1
+CHECKED_TRIALS = 60
+
+
+def _wanted(campaigns: list[Collected]) -> list[TrialWork]:
+    """The label of every trial."""
+    return [
+        TrialWork(recording, item.name, label_key(recording, settings), settings)
+        for item in campaigns
+        for settings in (item.settings.labelling,)
+        for _, recording in item.trials
+    ]
+
+
+def label(
+    store: Store, campaigns: list[Collected], cluster: Cluster | None = None
+) -> dict[str, Any]:
+    """Label every trial of `campaigns` that needs it."""
+    wanted = _wanted(campaigns)
+    stale = stale_trials(store, LABELS, wanted)
+    run_trials(store, LABELS, "label", stale, labelling.label_results, cluster)
+    return {"step": "label", "done": len(stale), "fresh": len(wanted) - len(stale)}
+
+
+def report_states(labels: Labels, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
+    """Return review states as part of a step's result; warn of decisions that are not applied."""
+    states = labels.states(campaigns)
+    if states is None:
+        return {}
+    if states["stale"]:
+        console.say(
+            f"warning: decisions on {states['stale']} trials were made on labels that have "
+            f"changed since and are not applied; see `sliplab review {labels.store.folder}`"
+        )
+    return {"reviewed": states}
+
+
+def check_folder(run_request: RunRequest) -> Path:
+    """The store with the video."""
+    return run_request.store / CHECK
+
+
+def video_request(run_request: RunRequest, trials: int) -> RunRequest:
+    """The same collection at the level `video`, for the trials that are still missing.
+
+    Args:
+        run_request: the study's own, of which something was collected.
+    """
+    from sliplab.flows.planning.run_request import make_request
+
+    folder = check_folder(run_request)
+    data = parse_yaml(mask_secrets(run_request.rig_text), "rig file")
+    data["name"] = f"{run_request.rig.name}-video"
+    data.setdefault("mock", {}).setdefault("frame_camera", {})["level"] = "video"
+    rig = folder.with_suffix(".yaml")
+    write_text(rig, rig_yaml(data))
+    protocol = Store.open(run_request.store).campaign(run_request.campaign).protocol_file
+    wanted = make_request(protocol, rig, folder, campaign=run_request.campaign)
+    there = 0
+    if (folder / "store.json").exists():
+        there = len(Store.open(folder).campaign(run_request.campaign).committed())
+    return replace(wanted, most=max(trials - there, 0))
+
+
+def check_wanted(run_request: RunRequest) -> bool:
+    """Check that there is anything to check: a simulated rig that draws no video."""
+    return run_request.rig.simulated and run_request.rig.frame_source == "tracks"
+
+
+def check_labels(run_request: RunRequest, trials: int = CHECKED_TRIALS) -> dict[str, Any]:
+    """Take, label and compare what is missing; the figures are kept in the study's store."""
+    from sliplab.flows.collect import collect  # a command that only labels needs no rig
+
+    video = video_request(run_request, trials)
+    taken = collect(video)["taken"] if video.most else 0
+    store = Store.open(check_folder(run_request))
+    campaigns = collected(store, [video.campaign])
+    label(store, campaigns)
+    made_of = [recording.checksum for _, recording in campaigns[0].trials]
+    key = make_key(CHECK, CHECK_VERSION, [made_of, labelling.VERSION], None)
+    kept = Derived.of(Store.open(run_request.store), CHECK)
+    stale = not kept.fresh(CHECK, key)
+    if stale:
+        figures = rules_compared(store, campaigns)
+        found = LabelCheck(trials=len(made_of), simulated=True, rules_ms=figures)
+        kept.write(CHECK, key, found)
+    return {"step": CHECK, "done": taken or int(stale), "fresh": len(made_of) - taken}

@@ -1,1 +1,0 @@
-"""Labels of stored trials: made, held against the truth, read with people's decisions."""
