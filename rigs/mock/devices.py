@@ -138,17 +138,3 @@ def build_mock(settings: MockSettings, timing: Timing | None = None) -> MockDevi
         world=world,
         timing=timing,
     )
-
-
-__all__ = [
-    "MockArm",
-    "MockDevices",
-    "MockEventCamera",
-    "MockFrameCamera",
-    "MockPlate",
-    "MockSyncBox",
-    "SimulatedOperator",
-    "VirtualClock",
-    "World",
-    "build_mock",
-]

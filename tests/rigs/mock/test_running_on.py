@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sliplab.rigs.mock.devices import World
+from sliplab.rigs.mock.world import World
 from tests.rigs.mock.driving import SMALL
 
 CLOCKS = ("arm", "event_camera", "frame_camera")
