@@ -18,9 +18,8 @@ from sliplab.analysis.report import against as comparison
 from sliplab.analysis.report import report as content
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
 from sliplab.analysis.report.page import write_figures
-from sliplab.analysis.report.programs import read_programs, shape_checked
+from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.report.summary import Sources, make_summary
-from sliplab.analysis.report.tradeoff_scene import scene_cost
 from sliplab.analysis.report.trial import choose_example
 from sliplab.flows.learning import evaluate, other_networks, window_baselines, window_scores
 from sliplab.flows.learning.train import training_settings, wanted_models
@@ -139,15 +138,10 @@ def _shown(sources: Sources) -> content.Shown:
         rule = evaluation.detection[example.item.name]
         trial = example.recording.trial_id
         counts = evaluate.trial_counts(store, example.item.name, trial, rule)
-    scene = None
-    if "scene" in sources.programs:
-        with shape_checked("scene"):
-            scene = scene_cost(sources.programs["scene"])
     return content.Shown(
         model_file.load(model.path),
         None if example is None else (example, counts),
         label_errors.distances(store, campaigns),
-        scene,
     )
 
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from sliplab.analysis.metrics.intervals import (
     share_difference,
 )
 from sliplab.analysis.report.figures.intervals import differences
-from sliplab.analysis.report.page import Content, Figure, Number, Table, render_page
+from sliplab.analysis.report.page import Figure, Number, Table, render_page
 from sliplab.protocols.errors import InputError
 from sliplab.storage.schema.document import DocumentError, NewerFormat
 from sliplab.storage.schema.summary import Kinematic, Summary, TrialOutcome
@@ -312,32 +312,12 @@ def _plain(here: Summary, there: Summary) -> list[Change]:
     return found
 
 
-@dataclass(frozen=True)
-class ChangedSection(Content):
-    """Every figure of both reports; figures of times and shares, by title."""
-
-    template: ClassVar[str] = "changed.html"
-    titles: Sequence[str]
-    figures: Sequence[Figure]
-    table: Table
-
-
-@dataclass(frozen=True)
-class MadeSection(Content):
-    """What made the two reports, where it differs."""
-
-    template: ClassVar[str] = "made.html"
-    table: Table
-
-
 def render(compared: Comparison, here: Path, there: Path) -> str:
     """Render the page; everything in it is escaped but the figures' SVG."""
     simulated, other = compared.simulated
-    figures, titles = [], []
-    for unit, title, factor, axis in (
-        ("ms", "Times", 1.0, "ms"),
-        ("share", "Shares", 100.0, "points"),
-    ):
+    figures = []
+    panels = (("ms", "Times", 1.0, "ms"), ("share", "Shares", 100.0, "points"))
+    for unit, title, factor, axis in panels:
         rows = [
             (row.name, factor * row.difference, factor * row.low, factor * row.high)
             for row in compared.figures
@@ -345,25 +325,20 @@ def render(compared: Comparison, here: Path, there: Path) -> str:
         ]
         if rows:
             label = f"difference, here less there ({axis})"
-            figures.append(Figure(differences(rows, label, simulated=simulated or other)))
-            titles.append(title)
+            svg = differences(rows, label, simulated=simulated or other)
+            figures.append((title, Figure(svg)))
     made = [[row.what, _short(row.here), _short(row.there)] for row in compared.settings]
-    which = (
-        "Both reports are"
-        if simulated == other
-        else f"The one {'here' if simulated else 'there'} is"
-    )
+    one = "The one here is" if simulated else "The one there is"
     return render_page(
         "against.html",
-        [
-            ChangedSection(titles, figures, Table(COLUMNS, table(compared.figures))),
-            MadeSection(Table(("what", "here", "there"), made)),
-        ],
         simulated=simulated or other,
-        simulated_words=f"{which} simulated.",
+        which="Both reports are" if simulated == other else one,
         here=str(here.resolve()),
         there=str(there.resolve()),
         headline=_headline(compared),
+        figures=figures,
+        changes=Table(COLUMNS, table(compared.figures)),
+        settings=Table(("what", "here", "there"), made),
     )
 
 

@@ -24,19 +24,16 @@ from sliplab.storage.files import make_folder, safe_name, write_text
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture (SVG text), its data, and what to see in it where no template says that.
+    """A picture (SVG text) and its data; what to see in it is said by a template.
 
     Attributes:
         name: of its files beside the page, without an ending; none are written without a name.
         data: what is drawn, columns by their headings, units in these; they may differ in length.
-        paper: what the paper shows in its place, in words.
     """
 
     svg: str
-    caption: str = ""
     name: str = ""
     data: Mapping[str, Sequence[object]] = field(default_factory=dict)
-    paper: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,14 +67,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Link:
-    """A page beside this one: its file's name, and what it shows."""
-
-    file: str
-    text: str
-
-
-@dataclass(frozen=True)
 class Number:
     """One headline number."""
 
@@ -99,23 +88,6 @@ class Content:
             value = getattr(self, item.name)
             values = value if isinstance(value, list | tuple) else [value]
             yield from (found for found in values if isinstance(found, Figure))
-
-
-@dataclass(frozen=True)
-class Section(Content):
-    """A section whose words were put together in Python.
-
-    Attributes:
-        commands: to be copied, each with what it does.
-    """
-
-    template: ClassVar[str] = "plain.html"
-    title: str
-    text: Sequence[str] = ()
-    figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = field(default=())
-    links: Sequence[Link] = ()
-    commands: Sequence[tuple[str, str]] = ()
 
 
 @lru_cache(maxsize=1)

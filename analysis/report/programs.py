@@ -17,8 +17,8 @@ import numpy as np
 
 from sliplab.analysis.report.figures.intervals import Share, shares
 from sliplab.analysis.report.figures.tradeoffs import Panel, Point, cost_and_error
-from sliplab.analysis.report.page import Content, Figure, Link, Table, number, percent
-from sliplab.analysis.report.tradeoff_scene import SceneCost
+from sliplab.analysis.report.page import Content, Figure, Table, number, percent
+from sliplab.analysis.report.tradeoff_scene import SceneCost, scene_cost
 from sliplab.analysis.report.windows import share_data
 from sliplab.storage.errors import StoreError
 from sliplab.storage.files import read_json
@@ -156,28 +156,26 @@ class TradeoffSection(Content):
     most: int
     front: int
     tried: int
-    links: Sequence[Link]
+    links: Sequence[tuple[str, str]]
 
 
-def tradeoff_section(
-    store: Store, found: Mapping[str, Json], scene: SceneCost | None
-) -> TradeoffSection:
+def tradeoff_section(store: Store, found: Mapping[str, Json]) -> TradeoffSection:
     """Show the searches for speed and error.
 
     Args:
         found: by name in `FILES`.
-        scene: cost and error of the scene.
 
     Raises:
         StoreError: a file is of another shape.
     """
     titles = {"scene": "the scene", "labels": "the labels", "labels_truth": "the labels",
               "detector": "the detector"}  # fmt: skip
-    scene_figure, search, table, front, tried = None, None, None, 0, 0
-    if scene is not None:
+    scene, scene_figure, search, table, front, tried = None, None, None, None, 0, 0
+    if "scene" in found:
         with shape_checked("scene"):
-            scene_figure = replace(scene.figure, name="tradeoff-scene",
-                                   data=_scene_data(found["scene"]["variants"]))  # fmt: skip
+            scene = scene_cost(found["scene"])
+            data = _scene_data(found["scene"]["variants"])
+            scene_figure = replace(scene.figure, name="tradeoff-scene", data=data)
     tables = []
     for name, make in (("labels", label_speed), ("labels_truth", label_truth)):
         if name in found:
@@ -194,7 +192,7 @@ def tradeoff_section(
         file = (store.folder / FILES[name]).with_suffix(".html")
         if name in found and file.exists():
             address = os.path.relpath(file, store.folder / "report").replace(os.sep, "/")
-            links.append(Link(address, f"The whole of {subject} search"))
+            links.append((address, f"The whole of {subject} search"))
     return TradeoffSection(
         [(titles[name], command(store, name)) for name in titles if name not in found],
         found["scene"]["protocol"] if scene is not None else None,

@@ -31,7 +31,6 @@ from sliplab.analysis.report.programs import (
 )
 from sliplab.analysis.report.sensitivity import sensitivity_section
 from sliplab.analysis.report.summary import Sources
-from sliplab.analysis.report.tradeoff_scene import SceneCost
 from sliplab.analysis.report.trial import Example, output_section, trial_section
 from sliplab.storage.schema.summary import SeedsUsed, Summary
 
@@ -43,13 +42,11 @@ class Shown:
     Attributes:
         example: the trial that is looked at, with its `counts` and `end_ns`.
         distances: of each trial's onset from the truth, ms, by rule and onset.
-        scene: cost and error of the scene, where they were measured.
     """
 
     fitted: Fitted
     example: tuple[Example, Mapping[str, Any]] | None
     distances: Mapping[str, Mapping[str, Sequence[float]]]
-    scene: SceneCost | None
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,7 @@ def make_sections(sources: Sources, summary: Summary, shown: Shown) -> list[Cont
             kinematic.accuracy.strict, simulated=simulated,
         ),
         sensitivity,
-        tradeoff_section(store, programs, shown.scene),
+        tradeoff_section(store, programs),
         _provenance(summary),
     ]  # fmt: skip
     return [section for section in sections if section is not None]

@@ -299,14 +299,14 @@ def test_results_of_other_programs_are_taken_up(store: Store, tmp_path: Path) ->
     with pytest.raises(StoreError, match=r"delete .*detector_tradeoff\.json"):
         report(other, collected(other))
     with pytest.raises(StoreError, match=r"report/detector_tradeoff\.json: is not of the shape"):
-        programs.tradeoff_section(other, {"detector": {"rows": [{}]}}, None)
+        programs.tradeoff_section(other, {"detector": {"rows": [{}]}})
     path.unlink()
     write_json(other.folder / FILES["scene"], {"variants": []})
     with pytest.raises(StoreError, match=r"derived/tradeoff/tradeoff\.json: is not of the shape"):
         report(other, collected(other))
     with pytest.raises(StoreError, match=r"results\.json: is not of the shape"):
         programs.skin_section({}, "sliplab generalise", 0.9, simulated=True)
-    absent = programs.tradeoff_section(other, {}, None)
+    absent = programs.tradeoff_section(other, {})
     assert absent.missing[0][1].startswith("sliplab tradeoff --scene PROTOCOL --out ")
     write_figures(other.folder / "report", [absent], simulated=True)
     assert list(data.iterdir()) == []  # an older report's figures go

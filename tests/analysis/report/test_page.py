@@ -19,8 +19,12 @@ from sliplab.analysis.report.figures.intervals import (
 )
 from sliplab.analysis.report.figures.tradeoffs import Panel as Pair
 from sliplab.analysis.report.figures.tradeoffs import Point, cost_and_error
-from sliplab.analysis.report.page import Figure, Section, Table, csv_text, render_page
+from sliplab.analysis.report.outcomes import FailureSection
+from sliplab.analysis.report.page import Content, Figure, Table, csv_text, render_page
+from sliplab.analysis.report.programs import SkinSection
+from sliplab.analysis.report.trial import TrialSection
 
+EVIL = "<img src=x onerror=alert(1)>"
 SVG = "<svg xmlns='http://www.w3.org/2000/svg'></svg>"
 ROWS = ["0.165 kg, 0.3 mm/s", "0.205 kg, 0.3 mm/s"]
 
@@ -85,11 +89,9 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
 }  # fmt: skip
 
 
-def render(campaigns: list[str], sections: list[Section], *, simulated: bool) -> str:
+def render(*sections: Content, simulated: bool = False) -> str:
     """The report's page without numbers on top."""
-    return render_page(
-        "report.html", sections, simulated=simulated, campaigns=campaigns, headline=[]
-    )
+    return render_page("report.html", sections, simulated=simulated, campaigns=[EVIL], headline=[])
 
 
 @pytest.mark.parametrize("name", sorted(DRAWN))
@@ -115,24 +117,31 @@ def test_a_figures_data_are_columns_with_units() -> None:
 
 
 def test_a_page_escapes_everything_but_its_figures() -> None:
-    evil = "<img src=x onerror=alert(1)>"
-    section = Section(
-        evil, [evil],
-        [Figure(SVG, evil, "name", {}, evil)],
-        [Table((evil, "command"), [[evil, f"sliplab view {evil}"]], evil, (1,))],
-        commands=[(evil, evil)],
-    )  # fmt: skip
-    page = render([evil], [section], simulated=True)
+    figure = Figure(SVG, "name", {})
+    commands = Table((EVIL, "command"), [[EVIL, f"sliplab view {EVIL}"]], commands=(1,))
+    sections = (
+        TrialSection(EVIL, {EVIL: 1.0}, EVIL, EVIL, figure),
+        FailureSection(1, 2, [(EVIL, 1)], 1, commands, EVIL),
+        SkinSection(EVIL),
+    )
+    page = render(*sections, simulated=True)
     assert "<img" not in page
+    assert page.count("&lt;img src=x onerror=alert(1)&gt;") > 9
     assert SVG in page
     assert 'href="figures/name.svg"' in page
     assert 'href="data/name.csv"' in page
     assert "Paper, on its own robot:" in page
     assert "What is drawn here is simulated." in page
     assert '<td class="command"><code>sliplab view ' in page
-    plain = render([], [Section("a", (), [Figure(SVG, "seen")])], simulated=False)
+    plain = render(TrialSection("a", {}, "", "", Figure(SVG)))
     assert "figures/" not in plain
     assert "imulated" not in plain.split("</style>")[1]
+    assert plain.startswith("<!doctype html>")
+
+
+def in_a_page(table: Table) -> str:
+    """A page that shows a table."""
+    return render(SkinSection("", None, table))
 
 
 def test_words_read_from_the_left_and_commands_as_code() -> None:
@@ -141,17 +150,15 @@ def test_words_read_from_the_left_and_commands_as_code() -> None:
         [["a", "late", "12", ""], ["b", "", "–", "–"], ["c", "early", "-3", ""]],
     )
     assert table.texts == {0, 1}
-    page = render([], [Section("a", ["run `a <b>` or `c`"], tables=[table])], simulated=False)
-    assert "<p>run <code>a &lt;b&gt;</code> or <code>c</code></p>" in page
+    page = in_a_page(table)
     assert '<th class="text">cause</th><th>lead (ms)</th>' in page
     assert '<td class="text">late</td><td>12</td>' in page
-    assert page.startswith("<!doctype html>")
 
 
 def test_a_column_with_a_sentence_has_its_heading_on_the_left() -> None:
     sentence = "30 ms windows every 10 ms, one class of two spikes ahead"
     table = Table(("", "detector", "ms"), [["a", sentence, "12"], ["b", "5 ms", "30"]])
     assert table.texts == {0, 1}
-    page = render([], [Section("a", (), tables=[table])], simulated=False)
+    page = in_a_page(table)
     assert '<th class="text">detector</th><th>ms</th>' in page
     assert f'<td class="words">{sentence}</td><td>12</td>' in page
