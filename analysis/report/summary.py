@@ -23,7 +23,15 @@ from sliplab.storage.schema.evaluation import (
     TrainedBaseline,
     WindowIntervals,
 )
-from sliplab.storage.schema.summary import Paper, Planned, Quality, Summary, Sync, TrialOutcome
+from sliplab.storage.schema.summary import (
+    Difference,
+    Paper,
+    Planned,
+    Quality,
+    Summary,
+    Sync,
+    TrialOutcome,
+)
 from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
@@ -165,28 +173,29 @@ def _paper(settings: AnalysisSettings, campaigns: Sequence[Collected]) -> Paper:
         for phase in item.plan.protocol.collection.motion
         if isinstance(phase, Press)
     }
-    rows = [
-        {"setting": each.words, "key": each.key, "paper": _said(each.value), "here": _said(here),
-         "source": each.source}
+    differences = tuple(
+        Difference(
+            setting=each.words, key=each.key, paper=_in_words(each.value), here=_in_words(here),
+            source=each.source,
+        )
         for each, here in settings.overrides
-    ]  # fmt: skip
-    assumed = [f"{each.words}: {_said(at(settings, each.key))}" for each in PAPER
+    )  # fmt: skip
+    assumed = [f"{each.words}: {_in_words(at(settings, each.key))}" for each in PAPER
                if each.source == "assumed"]  # fmt: skip
     if depths:
         assumed.append(
             f"press depth of gravity and disturbance trials: {', '.join(sorted(depths))}"
         )
-    found = {"preset": settings.preset, "differences": rows, "assumed": assumed}
-    return Paper.model_validate(found)
+    return Paper(preset=settings.preset, differences=differences, assumed=tuple(assumed))
 
 
-def _said(value: Any) -> str:
+def _in_words(value: Any) -> str:
     """Return a setting's value in words."""
     match value:
         case bool():
             return "yes" if value else "no"
         case tuple():
-            return ", ".join(map(_said, value))
+            return ", ".join(map(_in_words, value))
         case None:
             return "the window's length"
         case int() | float():

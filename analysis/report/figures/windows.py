@@ -32,13 +32,8 @@ def training_curves(history: Sequence[Mapping[str, float]], chosen: int, *, simu
         left.set_ylabel("cross-entropy (nats)")
         right.plot(epochs, [row["train_argmax"] for row in history], color=BLUE)
         right.plot(epochs, [row["val_argmax"] for row in history], color=ORANGE)
-        right.plot(
-            epochs,
-            [row["val_strict"] for row in history],
-            color=ORANGE,
-            ls=":",
-            label="validation, strict",
-        )
+        strict = [row["val_strict"] for row in history]
+        right.plot(epochs, strict, color=ORANGE, ls=":", label="validation, strict")
         right.set_ylabel("accuracy (share)")
         right.set_ylim(right.get_ylim()[0], min(right.get_ylim()[1], 1.0))
         for axes in (left, right):
@@ -57,15 +52,9 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
         share = np.divide(matrix, total, out=np.zeros(matrix.shape), where=total > 0)
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
         for (i, j), value in np.ndenumerate(matrix):
-            axes.text(
-                j,
-                i,
-                f"{100 * share[i, j]:.1f} %\n{value}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                color="white" if share[i, j] > 0.6 else "black",
-            )
+            text = f"{100 * share[i, j]:.1f} %\n{value}"
+            colour = "white" if share[i, j] > 0.6 else "black"
+            axes.text(j, i, text, ha="center", va="center", fontsize=8, color=colour)
         said = [*CLASS_WORDS, "undecided"]
         name_cells(axes, CLASS_WORDS, said, "true class", "class said by the network")
         return svg_text(figure, simulated)
@@ -108,18 +97,9 @@ def reliability(rows: Sequence[LeadShare], *, simulated: bool) -> str:
         places = range(len(rows))
         shares = np.array([row.share for row in rows])
         spans = [(row.share, row.share) if row.low is None else (row.low, row.high) for row in rows]
-        low_high = np.array(spans, np.float64)
-        off = np.column_stack([shares - low_high[:, 0], low_high[:, 1] - shares])
-        top.errorbar(
-            places,
-            100 * shares,
-            yerr=100 * off.T.clip(0),
-            fmt="o",
-            color=BLUE,
-            ms=4,
-            lw=1,
-            capsize=2,
-        )
+        low_high = np.array(spans, np.float64).reshape(-1, 2)
+        off = 100 * np.stack([shares - low_high[:, 0], low_high[:, 1] - shares]).clip(0)
+        top.errorbar(places, 100 * shares, off, fmt="o", color=BLUE, ms=4, lw=1, capsize=2)
         top.set_ylabel("windows called\nrightly (%)")
         top.set_ylim(-3, 103)
         low.bar(places, [row.n for row in rows], color=GREY, width=0.7)
