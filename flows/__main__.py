@@ -31,6 +31,9 @@ def main() -> None:
         code = _fail("interrupted", 130)
     except (ImportError, MemoryError, OSError, SystemError) as error:
         code = _fail(exhausted(error) or f"{type(error).__name__}: {error}", 1)
+    orchestration = sys.modules.get("sliplab.flows.running.orchestration")
+    if orchestration is not None and not orchestration.close():
+        os._exit(code)
     sys.exit(code)
 
 

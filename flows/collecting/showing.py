@@ -17,7 +17,7 @@ from typing import Any
 from uuid import UUID
 
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.running import orchestration, server_calls, stopping
+from sliplab.flows.running import orchestration, stopping
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_text
 from sliplab.storage.streams import Json
@@ -103,7 +103,7 @@ class _Page:
     def end(self) -> None:
         """Send the last report; wait for it, up to a limit."""
         self._over.set()
-        if self._thread.is_alive() and not server_calls.lost():
+        if self._thread.is_alive() and not orchestration.lost():
             self._thread.join(STOP_LIMIT_S if stopping.requested() else END_LIMIT_S)
 
     def _report_until_end(self) -> None:
@@ -130,7 +130,7 @@ class _Page:
                 try:
                     report(client)
                 except TransportError as error:
-                    server_calls.lose(server_calls.reason_of(error))
+                    orchestration.lose(orchestration.reason_of(error))
                     return
                 except Exception:
                     continue
@@ -142,7 +142,7 @@ class _Page:
         except Exception as error:
             self._misses += 1
             if self._misses == LOST_AFTER:
-                server_calls.lose(server_calls.reason_of(error))
+                orchestration.lose(orchestration.reason_of(error))
             return False
         self._misses = 0
         return True

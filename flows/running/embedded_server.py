@@ -15,7 +15,6 @@ Run as a module it is the server; imported it starts one.
 from __future__ import annotations
 
 import atexit
-import ctypes
 import fcntl
 import os
 import re
@@ -34,7 +33,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 
-from sliplab.flows.running.process import collect_garbage_seldom
+from sliplab.flows.running.process import collect_garbage_seldom, die_with
 from sliplab.flows.running.same_origin import SameOrigin
 
 START_LIMIT_S = 120.0
@@ -51,7 +50,6 @@ LEAN = {
 }
 """Settings of a server without a page; what the user has set in the environment counts more."""
 _HEADLESS = {"PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
-_PR_SET_PDEATHSIG = 1
 _RAISED = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 """The line of a traceback that says what was raised."""
 _direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
@@ -213,16 +211,6 @@ def _closed(port: int, password: str) -> dict[str, str]:
         "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
         "PREFECT_SERVER_UI_API_URL": f"{own}/api",
     }
-
-
-def die_with(parent: int) -> bool:
-    """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
-
-    Returns:
-        False if that one has ended already.
-    """
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    return os.getppid() == parent
 
 
 def _serve(handle: int, parent: int, home: Path) -> None:

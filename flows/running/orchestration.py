@@ -2,15 +2,24 @@
 
 `prepare` must run before Prefect is imported, because Prefect reads its settings then. A server
 that the user names with PREFECT_API_URL is used instead of the embedded one.
+
+No campaign waits for its server (docs/decisions/0095). Prefect's engine calls it in the flow's own
+thread, when a run begins and when it ends; `ServerLink` gives each of these requests a limit. A run
+that cannot begin there is made without Prefect, and an end that was not delivered is kept in the
+store (`run_records`), from where the next command reports it. One line says so.
 """
 
 from __future__ import annotations
 
+import logging
 import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from sliplab.flows.running import run_records, server_calls
+from sliplab.flows.running import console, run_records, stopping
 from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
 
 if TYPE_CHECKING:
@@ -18,6 +27,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+BEGIN_S = 15.0
+"""Limit of each request when a run begins; no arm moves yet."""
+END_S = 5.0
+"""Limit of each when it ends, and of the events that the program's end waits for."""
+LOST_S = 0.5
+"""Limit of each once the server was lost, or when a stop was requested."""
+NOWHERE = "http://127.0.0.1:9/api"
+"""The address that Prefect has where there is no server; it is never called."""
 _DEFAULTS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
@@ -26,9 +43,15 @@ _DEFAULTS = {
     "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",
     "PREFECT_CLI_PROMPT": "false",
 }
+NO_RESULTS: Any = Path(os.devnull)
+"""A flow's `result_storage`. Without one, Prefect asks the server for it, by a client of its own
+that has no limit and stays open."""
 _LOOPBACK = ("127.0.0.1", "localhost")
 _servers: dict[str, EmbeddedServer] = {}
 _store: Path | None = None
+_link: ServerLink | None = None
+_lost_servers: set[str] = set()
+"""Servers of which the line was said; one that answers again is taken out."""
 
 
 class Opaque(Generic[T]):
@@ -82,69 +105,295 @@ def begin() -> None:
 
 
 def embedded() -> EmbeddedServer:
-    """Return the embedded server of Prefect's home; start it if there is none, or it was lost."""
-    home = os.environ["PREFECT_HOME"]
-    there = _servers.get(home)
-    doubtful = server_calls.was_lost(run_records.EMBEDDED)  # one that is slow is left alone
-    if there is not None and (not there.alive or (doubtful and not there.answers)):
-        from sliplab.flows.running import run_events
+    """Return the embedded server of Prefect's home; start it if there is none, or it was lost.
 
+    Raises:
+        ServerError: another program has taken the port of the one that was lost.
+    """
+    home = os.environ["PREFECT_HOME"]
+    server = _servers.get(home)
+    doubtful = run_records.EMBEDDED in _lost_servers  # one that is only slow is left alone
+    if server is not None and (not server.alive or (doubtful and not server.answers)):
         _servers.pop(home).stop()
-        run_events.renew()
-    if home not in _servers:
+        # at the same address, where what Prefect could not send yet is sent to
+        _servers[home] = EmbeddedServer(Path(home), server.port, password=server.password)
+    elif server is None:
         _servers[home] = EmbeddedServer(Path(home))
-        server_calls.forget(run_records.EMBEDDED)
     return _servers[home]
 
 
 def private() -> bool:
-    """Whether Prefect's server is this program's own, with no page that anybody could look at."""
+    """Return True if the server is this program's own, with no page, or there is none."""
     from prefect.settings import PREFECT_API_URL
 
-    return PREFECT_API_URL.value() in {None, *(server.address for server in _servers.values())}
+    own = {None, NOWHERE, *(server.address for server in _servers.values())}
+    return PREFECT_API_URL.value() in own
+
+
+class ServerLink:
+    """The connection of one flow run to Prefect's server: limits, and whether it answers.
+
+    Each request passes here (httpx's event hooks) and gets a limit. After one that failed no other
+    is sent, so a lost server costs a run one limit at its begin and one at its end.
+
+    Args:
+        server: as `run_records.server_name` calls it.
+    """
+
+    def __init__(self, server: str) -> None:
+        global _link
+        self.server = server
+        self.ending = False
+        """The work is over, and only its end is to be reported."""
+        self._unanswered = False
+        """The last request had no answer, or that of a broken server."""
+        self._limit_s = BEGIN_S
+        _link = self
+
+    @contextmanager
+    def client(self) -> Iterator[Any]:
+        """Give Prefect's engine a client with these limits while the block runs."""
+        from prefect.context import SyncClientContext
+
+        hooks = {"request": [self._before], "response": [self._after]}
+        with SyncClientContext(httpx_settings={"event_hooks": hooks}) as context:
+            yield context.client
+
+    def lose(self, error: BaseException | str) -> None:
+        """Say once that the server does not answer."""
+        if self.server not in _lost_servers:
+            _lost_servers.add(self.server)
+            name = "" if self.server == run_records.EMBEDDED else f" {self.server}"
+            reason = error if isinstance(error, str) else self._reason(error)
+            console.say(
+                f"warning: the Prefect server{name} does not answer ({reason}); the work goes on "
+                "without it, the store keeps everything, and the next command reports this run"
+            )
+
+    def _before(self, request: Any) -> None:
+        if self._unanswered:
+            raise _NotSent
+        self._unanswered = True
+        self._limit_s = END_S if self.ending else BEGIN_S
+        if self.server in _lost_servers or stopping.requested():
+            self._limit_s = LOST_S
+        limits = dict.fromkeys(("connect", "read", "write", "pool"), self._limit_s)
+        request.extensions = {**request.extensions, "timeout": limits}
+
+    def _after(self, response: Any) -> None:
+        self._unanswered = response.status_code >= 500
+        if not self._unanswered:
+            _lost_servers.discard(self.server)
+
+    def _reason(self, error: BaseException) -> str:
+        from httpx import TimeoutException
+
+        while isinstance(error, _NotSent) and error.__context__ is not None:
+            error = error.__context__  # the request before
+        if isinstance(error, TimeoutException):
+            return f"nothing came in {self._limit_s:g} s"
+        return reason_of(error)
+
+
+class _NotSent(Exception):
+    """A request was not sent, because the one before it failed."""
+
+
+def lost() -> bool:
+    """Return True if the server of the flow that runs now, or ran last, did not answer."""
+    return _link is not None and _link.server in _lost_servers
+
+
+def lose(reason: str) -> None:
+    """Say that the server of the flow that runs now does not answer."""
+    if _link is not None:
+        _link.lose(reason)
+
+
+def work_is_over() -> None:
+    """Note that only the end of the flow that runs now is to be reported."""
+    if _link is not None:
+        _link.ending = True
+
+
+def reason_of(error: BaseException) -> str:
+    """Return an error and what caused it as one line."""
+    text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    cause = error.__cause__
+    more = "" if cause is None or str(cause) in text else f" ({type(cause).__name__}: {cause})"
+    return " ".join(f"{text}{more}".split())[:300]
+
+
+def limited_settings() -> dict[Any, Any]:
+    """Return Prefect's settings for a flow run: limits, no retries, no heartbeat.
+
+    A heartbeat's thread would cost a flow a second at its end. A killed run is known by what the
+    store lacks, and closed by the next one.
+    """
+    from prefect import settings
+
+    return {
+        settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None,
+        settings.PREFECT_CLIENT_MAX_RETRIES: 0,
+        settings.PREFECT_API_REQUEST_TIMEOUT: BEGIN_S,
+    }
+
+
+class _Work:
+    """What a flow run does, and what became of it, whatever becomes of its report."""
+
+    def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
+        self._do, self._link = do, link
+        self.began: Callable[[], None] = lambda: None
+        self.begun = False
+        self.result: Any = None
+        self.error: BaseException | None = None
+
+    def do(self, argument: Any) -> Any:
+        """Do it, and keep its result or its error."""
+        self.begun = True
+        self.began()
+        try:
+            self.result = self._do(argument)
+        except BaseException as error:
+            self.error = error
+            raise
+        finally:
+            self._link.ending = True
+        return self.result
+
+    @property
+    def end(self) -> tuple[str, str]:
+        """State and message of its end, as Prefect calls it."""
+        if self.error is None:
+            return "COMPLETED", ""
+        said = f"{type(self.error).__name__}: {self.error}"
+        return ("FAILED" if isinstance(self.error, Exception) else "CRASHED"), said
 
 
 def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any:
     """Run a flow on the user's server, or on the embedded one, which the first flow starts.
 
     Inside a flow that is served it is part of that flow's run, which has an end of its own.
-    A server that is lost, or cannot be started, holds nothing up (`server_calls`).
-    Without heartbeats, because each would cost a flow a second of waiting for their thread; a
-    killed run is known by what the store lacks, and closed by the next one.
+    A server that is lost, or cannot be started, holds nothing up.
 
     Args:
         cluster: where its tasks go that are submitted, instead of threads.
-    """
-    from prefect.context import FlowRunContext, SyncClientContext
-    from prefect.settings import (
-        PREFECT_API_URL,
-        PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
-        temporary_settings,
-    )
 
-    from sliplab.flows.running import run_events
+    Raises:
+        ServerError: there is no server, and a cluster, whose workers report there.
+    """
+    from prefect.context import FlowRunContext
+    from prefect.settings import PREFECT_API_URL, temporary_settings
 
     if FlowRunContext.get() is not None:
         return flow.fn(argument)
-    updates: dict[Any, Any] = {PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
-    server = run_records.server_name(PREFECT_API_URL.value())
-    calls = server_calls.Calls(server, _store)
-    if server == run_records.EMBEDDED:
+    link = ServerLink(run_records.server_name(PREFECT_API_URL.value()))
+    work = _Work(flow.fn, link)
+    with ExitStack() as stack:
         try:
-            updates |= embedded().settings()
-        except ServerError as error:
-            if cluster is not None:  # its workers report there
-                raise
-            updates[PREFECT_API_URL] = server_calls.NOWHERE
-            calls.absent(str(error))
-    with temporary_settings(updates=updates), calls:
-        run_events.install(silent=calls.nobody)
-        if _store is not None:
-            calls.close_dead()
-            flow = flow.with_options(**run_records.hooks(_store, server))
-        if cluster is not None:
-            flow = flow.with_options(task_runner=cluster.runner())
-        context = SyncClientContext()
-        calls.through(context.client)
-        with context:
-            return flow(argument)
+            own = embedded().settings() if link.server == run_records.EMBEDDED else {}
+            stack.enter_context(temporary_settings(updates={**limited_settings(), **own}))
+            client = stack.enter_context(link.client())
+            if _store is not None:
+                run_records.close_dead(_store, link.server, client)
+            flow_run = client.create_flow_run(flow)
+        except Exception as error:
+            if cluster is not None:
+                raise ServerError(
+                    f"the Prefect server {link.server}, to which the workers of --dask report, "
+                    f"does not answer ({reason_of(error)})"
+                ) from error
+            link.lose(str(error) if isinstance(error, ServerError) else error)
+            return _without_server(work, argument)
+        return _reported(flow, flow_run, argument, work, link, cluster)
+
+
+def _reported(
+    flow: Any, flow_run: Any, argument: Any, work: _Work, link: ServerLink, cluster: Cluster | None
+) -> Any:
+    """Do the work as a flow run that the server knows, and keep in the store how it ended."""
+    from prefect import Flow
+    from prefect.flow_engine import run_flow
+
+    def do(argument: Opaque[Any]) -> Any:
+        return work.do(argument)
+
+    store, run_id = _store, str(flow_run.id)
+    if store is not None:
+        work.began = lambda: run_records.begin(store, run_id, flow.name, link.server)
+    told: Any = Flow(
+        do,
+        name=flow.name,
+        version=flow.version,
+        task_runner=None if cluster is None else cluster.runner(),
+        validate_parameters=False,
+        persist_result=False,
+        result_storage=NO_RESULTS,
+    )
+    interrupted: BaseException | None = None
+    delivered = False
+    try:
+        run_flow(told, flow_run=flow_run, parameters={"argument": argument})
+        delivered = True
+    except Exception as error:
+        if not work.begun:
+            link.lose(error)
+            with suppress(BaseException):  # it is kept, and raised below
+                _without_server(work, argument)
+        elif not (delivered := error is work.error):
+            link.lose(error)
+    except BaseException as error:  # Ctrl-C, during the work or while its end was reported
+        interrupted = error
+        delivered = error is work.error
+    if store is not None and work.begun:
+        if not delivered:
+            run_records.owe(store, run_id, *work.end)
+        run_records.end(store, run_id, *work.end, "flow")
+    if work.error is not None:
+        raise work.error
+    if interrupted is not None:
+        raise interrupted
+    return work.result
+
+
+def _without_server(work: _Work, argument: Any) -> Any:
+    """Do the work where no server can be told of it."""
+    from prefect.context import SyncClientContext
+    from prefect.events.clients import NullEventsClient
+    from prefect.events.worker import EventsWorker
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED,
+        temporary_settings,
+    )
+
+    settings = {PREFECT_API_URL: NOWHERE, PREFECT_CLIENT_SERVER_VERSION_CHECK_ENABLED: False}
+    EventsWorker.set_client_override(NullEventsClient)
+    try:
+        with temporary_settings(updates=settings), SyncClientContext():
+            return work.do(argument)
+    finally:
+        EventsWorker.set_client_override(None)
+
+
+def close() -> bool:
+    """Send what Prefect has not sent yet, as a program ends, within `END_S`.
+
+    Returns:
+        False if something is left. Prefect's thread for it would hold up the interpreter's end
+        until the server answers, so the program has to leave without that.
+    """
+    if "prefect.events.worker" not in sys.modules:
+        return True
+    from prefect.events.worker import EventsWorker
+
+    # it says as a warning how much it has left to send
+    logging.getLogger(EventsWorker.__name__).setLevel(logging.ERROR)
+    limit_s = LOST_S if lost() else END_S
+    waited: Any = EventsWorker.drain_all(timeout=limit_s, at_exit=False)
+    _, left = waited
+    if left:
+        for server in _servers.values():
+            server.stop()
+    return not left

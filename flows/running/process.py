@@ -213,9 +213,9 @@ def run_in_child() -> str | None:
     if child == 0:
         # OpenBLAS waits for ever for the memory of a thread that it does not get
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        watched = die_with(parent)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if os.getppid() != parent:
+        if not watched:
             os.kill(os.getpid(), signal.SIGTERM)
         return None
     while True:  # as long as the child runs
@@ -235,6 +235,16 @@ def run_in_child() -> str | None:
     return (
         f"a library crashed ({name}), as it does without enough memory{given}: {_RAISE}, {_GO_ON}"
     )
+
+
+def die_with(parent: int) -> bool:
+    """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
+
+    Returns:
+        False if that one has ended already.
+    """
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    return os.getppid() == parent
 
 
 THRESHOLDS = (50_000, 20, 100)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -63,7 +63,7 @@ def end(store: Path, run: str, state: str, message: str, by: str) -> bool:
 
     Args:
         state: as Prefect calls it: ``COMPLETED``, ``CANCELLED``, ``FAILED``, ``CRASHED``.
-        by: who says so: ``flow``, ``hook``, or ``next start`` of what a killed process left.
+        by: who says so: ``flow``, ``service``, or ``next start`` of what a killed process left.
     """
     folder = _folder(store)
     if not (folder / f"{run}.json").exists():
@@ -76,6 +76,12 @@ def owe(store: Path, run: str, state: str, message: str) -> None:
     """Keep how a flow run ended for a server that did not answer; `close_dead` reports it."""
     said = {"state": state, "message": message, "when": now()}
     write_new_json(_folder(store) / f"{run}.owed.json", said)
+
+
+def owe_end(store: Path, run: str) -> None:
+    """Keep the end that a flow run has here for a server that did not answer."""
+    said = read_json(_folder(store) / f"{run}.end.json")
+    owe(store, run, said["state"], said["message"])
 
 
 def suspended(store: Path, run: str) -> None:
@@ -96,10 +102,13 @@ def open_runs(store: Path) -> list[Json]:
     return found
 
 
-def close_dead(store: Path, server: str) -> list[Json]:
+def close_dead(store: Path, server: str, client: Any = None) -> list[Json]:
     """Close what killed processes of this machine left open on `server`, and report owed ends.
 
     Prefect is told first: a program that dies in between does both again.
+
+    Args:
+        client: Prefect's, a synchronous one; a new one by default.
 
     Returns:
         The runs that were closed because their process was killed.
@@ -118,7 +127,7 @@ def close_dead(store: Path, server: str) -> list[Json]:
     sweep_temporary(_folder(store))
     from prefect.client.orchestration import get_client
 
-    with get_client(sync_client=True) as client:
+    with nullcontext(client) if client else get_client(sync_client=True) as client:
         for path, run in owed:
             said = read_json(path)
             _report(client, run, said["state"], said["message"])
@@ -152,19 +161,6 @@ def _report(client: Any, run: str, state: str, message: str) -> None:
         if known is None or not known.is_final():
             ended: Any = State(type=StateType(state), message=message)
             client.set_flow_run_state(run, ended, force=True)
-
-
-def hooks(store: Path, server: str) -> dict[str, list[Any]]:
-    """Hooks for a flow that runs in this process: its begin and its end are kept."""
-
-    def began(flow: Any, flow_run: Any, state: Any) -> None:
-        begin(store, str(flow_run.id), flow.name, server)
-
-    def ended(flow: Any, flow_run: Any, state: Any) -> None:
-        end(store, str(flow_run.id), state.type.value, state.message or "", "hook")
-
-    last = ("on_completion", "on_failure", "on_cancellation", "on_crashed")
-    return {"on_running": [began], **{name: [ended] for name in last}}
 
 
 def _folder(store: Path) -> Path:

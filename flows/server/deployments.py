@@ -19,9 +19,8 @@ from sliplab.flows.collecting import requests
 from sliplab.flows.collecting.requests import CampaignStopped
 from sliplab.flows.collecting.session import WindowOver
 from sliplab.flows.planning.run_request import RunRequest, SessionMetadata, check_disk, make_request
-from sliplab.flows.running import console, run_records, server_calls, stopping
-from sliplab.flows.running.embedded_server import die_with
-from sliplab.flows.server.page_server import ask_on
+from sliplab.flows.running import console, orchestration, run_records, stopping
+from sliplab.flows.running.process import die_with
 from sliplab.flows.server.schedules import (
     Ask,
     Chain,
@@ -58,17 +57,13 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
         The state in which the run ends.
     """
     from prefect.context import FlowRunContext
+    from prefect.exceptions import Pause
     from prefect.states import Cancelled, Completed, Failed
-
-    from sliplab.flows.running import run_events
 
     context = FlowRunContext.get()
     if context is None or context.flow_run is None or context.flow is None:
         raise RuntimeError("is no flow run")
     run, here, name = context.flow_run, service(), context.flow.name
-    server_calls.Calls(here.server, here.folder, run).through(context.client)
-    run_events.bound_exit()
-    ask_on()
     run_records.begin(here.folder, str(run.id), name, here.server, here.name)
     state: Any
     try:
@@ -88,27 +83,14 @@ def run_of(work: Callable[[Service, Any], str]) -> Any:
             state = Failed(message=_words(error))
             if not isinstance(error, _EXPECTED):
                 console.messages.print_exception(max_frames=8)
-    except BaseException as signal:
-        if type(signal).__name__ == "Pause":  # Prefect's page: leave the rig, go on when resumed
-            run_records.suspended(here.folder, str(run.id))
+    except Pause:  # Prefect's page: leave the rig, go on when resumed
+        run_records.suspended(here.folder, str(run.id))
         raise
     with suppress(OSError):
         run_records.end(here.folder, str(run.id), state.type.value, state.message or "", "flow")
     console.say(f"{name} {run.name}: {state.type.value}: {state.message}")
-    if os.getpid() != here.pid and os.getppid() != here.pid and here.server == run_records.EMBEDDED:
-        os._exit(console.FAILED)  # the server went with the service: nobody is left to be told
+    orchestration.work_is_over()
     return state
-
-
-def ended(flow: Any, flow_run: Any, state: Any) -> None:
-    """Prefect's hook for every end, also of runs whose process could not say anything any more."""
-    here = service()
-    run_records.end(here.folder, str(flow_run.id), state.type.value, state.message or "", "hook")
-
-
-HOOKS: dict[str, list[Any]] = {
-    name: [ended] for name in ("on_completion", "on_failure", "on_cancellation", "on_crashed")
-}
 
 
 def until_of(wanted: OnRig, run: Any) -> float | None:
@@ -169,7 +151,9 @@ def _words(error: Exception) -> str:
 
 
 STEP, EVALUATE, STUDY, ASK = Step(), Evaluate(), Study(), Ask()
-served: Callable[..., Any] = partial(flow, persist_result=False, **HOOKS)
+served: Callable[..., Any] = partial(
+    flow, persist_result=False, result_storage=orchestration.NO_RESULTS
+)
 
 
 @served(name="collect")

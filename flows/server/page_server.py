@@ -1,22 +1,32 @@
-"""A service outlives its Prefect server: what runs goes on, and its end is reported afterwards.
+"""The Prefect server of a service: its page, its password, and what is done when it is lost.
 
-Prefect's runner gives up after three requests without an answer, and what it runs ends with it.
-Here it goes on asking; a server of our own that ended, or does not answer, is started anew at its
-port; and once a server answers again it is told what ended meanwhile.
+A service outlives its server. A server of our own that ended, or does not answer, is started anew
+at its port; once a server answers again it is told what ended meanwhile.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+import os
+import re
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import ProxyHandler, build_opener
 
 from sliplab.flows.running import console, run_records
-from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError
+from sliplab.flows.running.embedded_server import EmbeddedServer, ServerError, new_password
+from sliplab.protocols import InputError
+from sliplab.storage.files import write_bytes
 
+PASSWORD = "page-password"
+"""The file in Prefect's home that has the password of the service's own page."""
+_PASSWORD = r"[!-~]{30,200}"
+ANSWER_S = 10.0
+"""How long a server is waited for when it is asked whether it has a password."""
 WATCH_S = 5.0
 """How often the server is asked whether it is well, and how long its answer is waited for."""
 MISSES = 3
@@ -84,38 +94,88 @@ async def _answers() -> bool:
         return False
 
 
-def ask_on() -> None:
-    """Have Prefect's runner and its runs ask on while their server does not answer.
+@contextmanager
+def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
+    """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
 
-    Its second way to learn of a cancelled run, used once its connection for events was
-    lost, is refused by the server (422). That is no reason to print a traceback: `stop/NAME` acts.
+    Ours asks for a password, which the processes of the runs find in their environment and people
+    in a file of Prefect's home that only this user can read.
+
+    Raises:
+        ServerError: ours did not start; its port may be taken.
+        InputError: the password cannot be kept where only this user can read it, or the server at
+            PREFECT_API_URL asks for none.
     """
-    from httpx import HTTPStatusError, TransportError
-    from prefect._internal import observers
-    from prefect.runner import _scheduled_run_poller
-    from prefect.utilities.services import critical_service_loop
+    from prefect.settings import PREFECT_API_URL, temporary_settings
 
-    def patient(least: int) -> Any:
-        """Prefect's loop, which goes on after an answer of status `least` or more, or none."""
+    url = PREFECT_API_URL.value()
+    if url is not None:
+        refuse_open(url)
+        yield url, None
+        return
+    home = Path(os.environ["PREFECT_HOME"])
+    page = PageServer(home, port, page_password(home))
+    before = dict(os.environ)
+    try:
+        settings = page.server.settings()
+        os.environ.update({setting.name: value for setting, value in settings.items()})
+        with temporary_settings(updates=settings):
+            console.say(f"the page's password is in {home / PASSWORD}, which you alone can read")
+            yield page.server.url, page
+    finally:
+        for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
+            os.environ.pop(name, None)
+            os.environ.update({name: before[name]} if name in before else {})
+        page.server.stop()
 
-        async def loop(workload: Callable[[], Awaitable[Any]], **options: Any) -> None:
-            async def once() -> None:
-                with suppress(TransportError):
-                    try:
-                        await workload()
-                    except HTTPStatusError as error:
-                        if error.response.status_code < least:
-                            raise
 
-            await critical_service_loop(once, **options)
+def refuse_open(url: str) -> None:
+    """Check that a Prefect server asks for a password; one that does not answer is not looked at.
 
-        return loop
+    Raises:
+        InputError: it does not, and whoever reaches it can move the arm.
+    """
+    address = run_records.server_name(url)
+    try:
+        # a proxy of the environment would refuse the loopback, as if it were a password
+        opener = build_opener(ProxyHandler({}))
+        with opener.open(f"{address}{urlsplit(url).path}/admin/version", timeout=ANSWER_S):
+            pass
+    except OSError:  # 401 is one, too
+        return
+    raise InputError(
+        "PREFECT_API_URL", "", address,
+        "asks for no password, so that any web page in a browser that reaches it can move the arm; "
+        "set PREFECT_SERVER_API_AUTH_STRING for the server and PREFECT_API_AUTH_STRING here",
+    )  # fmt: skip
 
-    async def cancelled(workload: Callable[[], Awaitable[Any]], **options: Any) -> None:
-        with suppress(asyncio.CancelledError):  # the end of the service; whoever asks takes no such
-            await patient(400)(workload, **options)
 
-    poller: Any = _scheduled_run_poller
-    observer: Any = observers
-    poller.critical_service_loop = patient(500)
-    observer.critical_service_loop = cancelled
+def page_password(home: Path) -> str:
+    """The password of a service's page, kept from one start to the next.
+
+    Raises:
+        InputError: it cannot be kept where only this user can read it.
+    """
+    path = home / PASSWORD
+    with suppress(OSError, UnicodeDecodeError):
+        if _private(path) and re.fullmatch(_PASSWORD, kept := path.read_text().strip()):
+            return kept
+    password = new_password()
+    try:
+        write_bytes(path, f"{password}\n".encode(), mode=0o600)
+        private = _private(path)
+    except OSError as error:
+        raise InputError(path, "", None, f"cannot be written: {error.strerror}") from None
+    if not private:
+        path.unlink()
+        raise InputError(
+            path, "", None,
+            "can be read by other users on this file system; name another folder in PREFECT_HOME",
+        )  # fmt: skip
+    return password
+
+
+def _private(path: Path) -> bool:
+    found = path.lstat()
+    alone = stat.S_ISREG(found.st_mode) and not found.st_mode & 0o077
+    return alone and found.st_uid == os.getuid()

@@ -1,134 +1,31 @@
-"""`sliplab serve`: one program registers the deployments of one rig and runs what is asked for.
-
-Prefect's runner takes a single run at a time, because a rig is one thing. Each is a process of its
-own, which stops its arm and ends when this program ends, however that happens. Pause, resume and
-stop are carried past it (`flows.server.control_runs`).
-"""
+"""`sliplab serve`: one program registers the deployments of one rig and runs what is asked for."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-import re
 import signal
-import stat
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
-from urllib.request import ProxyHandler, build_opener
+from uuid import UUID
 
 from sliplab import protocols
 from sliplab.flows.running import console, run_records
-from sliplab.flows.running.embedded_server import new_password
-from sliplab.flows.server.control_runs import answer_page
-from sliplab.flows.server.page_server import PageServer, ask_on, watch
+from sliplab.flows.server.page_server import ANSWER_S, PageServer, page_server, watch
+from sliplab.flows.server.runs import ServedRuns
 from sliplab.flows.server.schedules import Scheduled
 from sliplab.flows.server.service import Service
 from sliplab.protocols import InputError
-from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.lock import exclusive
 from sliplab.storage.trials.store import Store
 
 LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
-PASSWORD = "page-password"
-"""The file in Prefect's home that has the password of the service's own page."""
-_PASSWORD = r"[!-~]{30,200}"
-ANSWER_S = 10.0
-"""How long a server is waited for when it is asked whether it has a password."""
-CONTROL_POLL_S = 1.0
-"""How often the page is asked for pause, resume and stop."""
-
-
-@contextmanager
-def page_server(port: int) -> Iterator[tuple[str, PageServer | None]]:
-    """The address of Prefect's API while the block runs: PREFECT_API_URL, or a server of ours.
-
-    Ours asks for a password, which the processes of the runs find in their environment and people
-    in a file of Prefect's home that only this user can read.
-
-    Raises:
-        ServerError: ours did not start; its port may be taken.
-        InputError: the password cannot be kept where only this user can read it, or the server at
-            PREFECT_API_URL asks for none.
-    """
-    from prefect.settings import PREFECT_API_URL, temporary_settings
-
-    url = PREFECT_API_URL.value()
-    if url is not None:
-        refuse_open(url)
-        yield url, None
-        return
-    home = Path(os.environ["PREFECT_HOME"])
-    page = PageServer(home, port, page_password(home))
-    before = dict(os.environ)
-    try:
-        settings = page.server.settings()
-        os.environ.update({setting.name: value for setting, value in settings.items()})
-        with temporary_settings(updates=settings):
-            console.say(f"the page's password is in {home / PASSWORD}, which you alone can read")
-            yield page.server.url, page
-    finally:
-        for name in ("PREFECT_API_URL", "PREFECT_API_AUTH_STRING"):
-            os.environ.pop(name, None)
-            os.environ.update({name: before[name]} if name in before else {})
-        page.server.stop()
-
-
-def refuse_open(url: str) -> None:
-    """Check that a Prefect server asks for a password; one that does not answer is not looked at.
-
-    Raises:
-        InputError: it does not, and whoever reaches it can move the arm.
-    """
-    address = run_records.server_name(url)
-    try:
-        # a proxy of the environment would refuse the loopback, as if it were a password
-        opener = build_opener(ProxyHandler({}))
-        with opener.open(f"{address}{urlsplit(url).path}/admin/version", timeout=ANSWER_S):
-            pass
-    except OSError:  # 401 is one, too
-        return
-    raise InputError(
-        "PREFECT_API_URL", "", address,
-        "asks for no password, so that any web page in a browser that reaches it can move the arm; "
-        "set PREFECT_SERVER_API_AUTH_STRING for the server and PREFECT_API_AUTH_STRING here",
-    )  # fmt: skip
-
-
-def page_password(home: Path) -> str:
-    """The password of a service's page, kept from one start to the next.
-
-    Raises:
-        InputError: it cannot be kept where only this user can read it.
-    """
-    path = home / PASSWORD
-    with suppress(OSError, UnicodeDecodeError):
-        if _private(path) and re.fullmatch(_PASSWORD, kept := path.read_text().strip()):
-            return kept
-    password = new_password()
-    try:
-        write_bytes(path, f"{password}\n".encode(), mode=0o600)
-        private = _private(path)
-    except OSError as error:
-        raise InputError(path, "", None, f"cannot be written: {error.strerror}") from None
-    if not private:
-        path.unlink()
-        raise InputError(
-            path, "", None,
-            "can be read by other users on this file system; name another folder in PREFECT_HOME",
-        )  # fmt: skip
-    return password
-
-
-def _private(path: Path) -> bool:
-    found = path.lstat()
-    alone = stat.S_ISREG(found.st_mode) and not found.st_mode & 0o077
-    return alone and found.st_uid == os.getuid()
+LOOK_S = 1.0
+"""How often the page is asked for runs at least: a word to the arm must not wait."""
 
 
 def serve(
@@ -156,76 +53,59 @@ def serve(
         ServerError: the embedded server did not start.
         InputError: another program serves another store under this name.
     """
-    from prefect.settings import PREFECT_API_URL
+    from prefect.settings import (
+        PREFECT_API_REQUEST_TIMEOUT,
+        PREFECT_API_URL,
+        PREFECT_CLIENT_MAX_RETRIES,
+        temporary_settings,
+    )
 
     ours = PREFECT_API_URL.value() is None
+    # a server that does not answer is asked again at the next look
+    limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
     with ExitStack() as stack:
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
         url, page = stack.enter_context(page_server(port))
+        stack.enter_context(temporary_settings(updates=limits))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
-        Service(
-            str(store.folder.resolve()), rig, name, server, os.getpid(), protocols
-        ).export_environment()
+        here = Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols)
+        here.export_environment()
         for item in run_records.close_dead(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
-        looking = partial(watch, page, store.folder, server)
-        asyncio.run(_serve(store, rig, name, schedules, url, poll_s, looking))
+        asyncio.run(_serve(here, schedules, url, page, poll_s))
 
 
 async def _serve(
-    store: Store,
-    rig: str,
-    name: str,
-    schedules: Sequence[Scheduled],
-    url: str,
-    poll_s: float,
-    looking: Callable[[asyncio.Event], Coroutine[Any, Any, None]],
+    here: Service, schedules: Sequence[Scheduled], url: str, page: PageServer | None, poll_s: float
 ) -> None:
-    from prefect.runner import Runner
-
     from sliplab.flows.server.deployments import CONTROL, ON_RIG
 
     stopped = asyncio.Event()
-    loop = asyncio.get_running_loop()
-
-    class Ours(Runner):
-        """Prefect's, with SIGTERM for the whole program."""
-
-        def handle_sigterm(self, *args: Any, **kwargs: Any) -> None:
-            loop.call_soon_threadsafe(stopped.set)
-
-    ask_on()
-    rig_runner = Ours(f"{name} rig", query_seconds=poll_s, limit=1, pause_on_shutdown=False)
-    control: dict[Any, Any] = {}
+    on_rig: dict[UUID, Any] = {}
+    control: dict[UUID, Any] = {}
     for flow in (*ON_RIG, *CONTROL):
-        await _refuse_another(flow.name, name, store)
-        about = {"tags": _tags(store, rig), "description": flow.description}
-        if flow in ON_RIG:
-            when = _prefects([item for item in schedules if item.flow == flow.name])
-            await rig_runner.aadd_flow(flow, name, schedules=when, **about)
-        else:
-            made = await flow.ato_deployment(name, **about)
-            control[await made.aapply()] = flow
-    await _close_stranded(name, [flow.name for flow in (*ON_RIG, *CONTROL)], store)
+        await _refuse_another(flow.name, here.name, here.folder)
+        when = _prefects([item for item in schedules if item.flow == flow.name])
+        made = await flow.ato_deployment(
+            here.name, schedules=when, tags=_tags(here.folder, here.rig),
+            description=flow.description,
+        )  # fmt: skip
+        (on_rig if flow in ON_RIG else control)[await made.aapply()] = flow
+    await _close_stranded(here.name, [flow.name for flow in (*ON_RIG, *CONTROL)], here.folder)
+    loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    running = asyncio.create_task(rig_runner.start())
-    answering = asyncio.create_task(answer_page(control, min(poll_s, CONTROL_POLL_S), stopped))
+    served = ServedRuns(here.folder, here.server, on_rig, control)
+    carrying_out = asyncio.create_task(served.carry_out(min(poll_s, LOOK_S), stopped))
+    watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     ending = asyncio.create_task(stopped.wait())
-    watching = asyncio.create_task(looking(stopped))
-    console.say(f"serving {store.folder} on the rig {rig}: deployments */{name}")
+    console.say(f"serving {here.folder} on the rig {here.rig}: deployments */{here.name}")
     console.say(f"Prefect's page: {run_records.server_name(url)}; Ctrl-C ends")
-    await asyncio.wait([ending, running, answering], return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait([ending, carrying_out], return_when=asyncio.FIRST_COMPLETED)
     console.say("ending: what runs stops, arm first")
     stopped.set()
-    if rig_runner.started:
-        await rig_runner.astop()
-    else:
-        running.cancel()  # one that is still starting cannot be stopped otherwise
-    for outcome in await asyncio.gather(
-        running, answering, ending, watching, return_exceptions=True
-    ):
+    for outcome in await asyncio.gather(carrying_out, watching, ending, return_exceptions=True):
         if isinstance(outcome, Exception):
             raise outcome
 
@@ -240,8 +120,8 @@ def _protocols(folders: Sequence[Path], schedules: Sequence[Scheduled]) -> tuple
     return tuple(str(path) for path in found if path != path.parent)
 
 
-def _tags(store: Store, rig: str) -> list[str]:
-    return [f"rig:{Path(rig).stem}", f"store:{store.folder.resolve()}"]
+def _tags(store: Path, rig: str) -> list[str]:
+    return [f"rig:{Path(rig).stem}", f"store:{store.resolve()}"]
 
 
 def _prefects(schedules: list[Scheduled]) -> list[Any]:
@@ -259,7 +139,7 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
     ]
 
 
-async def _refuse_another(flow: str, name: str, store: Store) -> None:
+async def _refuse_another(flow: str, name: str, store: Path) -> None:
     """Two programs under one name would take each other's runs.
 
     Raises:
@@ -273,7 +153,7 @@ async def _refuse_another(flow: str, name: str, store: Store) -> None:
             there = await client.read_deployment_by_name(f"{flow}/{name}")
         except ObjectNotFound:
             return
-    mine = f"store:{store.folder.resolve()}"
+    mine = f"store:{store.resolve()}"
     others = [tag for tag in there.tags if tag.startswith("store:") and tag != mine]
     if others and there.status is not None and there.status.value == "READY":
         raise InputError(
@@ -281,7 +161,7 @@ async def _refuse_another(flow: str, name: str, store: Store) -> None:
         )
 
 
-async def _close_stranded(name: str, flows: list[str], store: Store) -> None:
+async def _close_stranded(name: str, flows: list[str], store: Path) -> None:
     """Close runs that a service before this one had taken and that no process has any more.
 
     A run whose process died has been closed by its record; this is about those that were killed
@@ -302,7 +182,7 @@ async def _close_stranded(name: str, flows: list[str], store: Store) -> None:
     from prefect.states import Crashed
 
     taken = [StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
-    alive = {item["run"] for item in run_records.open_runs(store.folder)}
+    alive = {item["run"] for item in run_records.open_runs(store)}
     async with get_client() as client:
         runs = await client.read_flow_runs(
             flow_filter=FlowFilter(name=FlowFilterName(any_=flows)),

@@ -256,7 +256,9 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     store = Store.open(service.folder)
 
     async def register() -> None:
-        made = await collect.ato_deployment("here", schedules=when, tags=serve._tags(store, "r"))
+        made = await collect.ato_deployment(
+            "here", schedules=when, tags=serve._tags(store.folder, "r")
+        )
         await made.aapply()
 
     asyncio.run(register())
@@ -283,10 +285,10 @@ def test_the_server_refuses_wrong_parameters_and_makes_scheduled_runs(
     assert runs[0]["auto_scheduled"]
     assert runs[0]["parameters"] == {"wanted": {"protocol": "p.yaml", "until": "06:00"}}
 
-    asyncio.run(serve._refuse_another("collect", "here", store))  # it is ours
+    asyncio.run(serve._refuse_another("collect", "here", store.folder))  # it is ours
     page.call("/deployments/get_scheduled_flow_runs", {"deployment_ids": [there["id"]]})
     with pytest.raises(InputError, match=r"--name = here: is served for .*store; give another"):
-        asyncio.run(serve._refuse_another("collect", "here", Store.create(tmp_path / "other")))
+        asyncio.run(serve._refuse_another("collect", "here", tmp_path / "other"))
 
 
 def test_what_a_killed_service_had_taken_is_closed(
@@ -307,7 +309,7 @@ def test_what_a_killed_service_had_taken_is_closed(
         for run in (taken, ours):
             client.set_flow_run_state(run, Pending(), force=True)
     run_records.begin(service.folder, ours, "label", "embedded")  # by a process that is alive
-    asyncio.run(serve._close_stranded("stranded", ["label"], store))
+    asyncio.run(serve._close_stranded("stranded", ["label"], store.folder))
     assert page.state(taken)["type"] == "CRASHED"
     assert "was killed" in page.state(taken)["message"]
     assert [page.state(run)["type"] for run in (ours, waiting)] == ["PENDING", "SCHEDULED"]

@@ -18,7 +18,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from sliplab.flows.server import serve
+from sliplab.flows.server import page_server
 from sliplab.protocols import InputError
 from sliplab.storage.trials.store import Store
 from tests.conftest import ROOT
@@ -215,11 +215,11 @@ def test_a_run_is_answered_nothing_of_files_elsewhere(service: Service) -> None:
 
 
 def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Path) -> None:
-    serve.refuse_open(service.page.url)
+    page_server.refuse_open(service.page.url)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    serve.refuse_open(f"http://127.0.0.1:{port}/api")  # nobody there: Prefect says so
+    page_server.refuse_open(f"http://127.0.0.1:{port}/api")  # nobody there: Prefect says so
     own = {"PREFECT_HOME": str(tmp_path), "PREFECT__SERVER_EPHEMERAL": "1"}
     factory = ("--factory", "prefect.server.api.server:create_app")
     process = subprocess.Popen(
@@ -230,7 +230,7 @@ def test_a_permanent_server_needs_a_password_too(service: Service, tmp_path: Pat
         health = f"http://127.0.0.1:{port}/api/health"
         until("an open server", lambda: process.poll() is not None or _answers(health))
         with pytest.raises(InputError, match=r"PREFECT_API_URL = .* asks for no password"):
-            serve.refuse_open(f"http://anna:secret@127.0.0.1:{port}/api")
+            page_server.refuse_open(f"http://anna:secret@127.0.0.1:{port}/api")
     finally:
         process.kill()
         process.wait(30)
@@ -246,9 +246,9 @@ def _answers(url: str) -> bool:
 
 @pytest.mark.parametrize("before", ["readable", "link", "empty", "folder"])
 def test_a_password_that_others_could_know_is_made_anew(before: str, tmp_path: Path) -> None:
-    path = tmp_path / serve.PASSWORD
-    first = serve.page_password(tmp_path)
-    assert serve.page_password(tmp_path) == first
+    path = tmp_path / page_server.PASSWORD
+    first = page_server.page_password(tmp_path)
+    assert page_server.page_password(tmp_path) == first
     if before == "readable":
         path.chmod(0o640)
     elif before == "link":
@@ -260,9 +260,9 @@ def test_a_password_that_others_could_know_is_made_anew(before: str, tmp_path: P
         path.unlink()
         path.mkdir()
         with pytest.raises(InputError, match="cannot be written"):
-            serve.page_password(tmp_path)
+            page_server.page_password(tmp_path)
         return
-    second = serve.page_password(tmp_path)
+    second = page_server.page_password(tmp_path)
     assert second != first
     assert (path.read_text().strip(), path.is_symlink()) == (second, False)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
