@@ -86,7 +86,7 @@ def _flows() -> Any:
 
 
 def _compare(trials: int, runs: int) -> Figures:
-    from sliplab.flows.collect import MOCK_BATCH
+    from sliplab.flows.collect import BATCH
 
     collect, empty = _flows()
     every = range(trials)
@@ -108,7 +108,7 @@ def _compare(trials: int, runs: int) -> Figures:
     taken = alternate(
         runs,
         loop=loop,
-        batched=lambda: through_prefect("batched", MOCK_BATCH),
+        batched=lambda: through_prefect("batched", BATCH),
         behind_batched=alone,
         per_trial=lambda: through_prefect("per_trial", 1),
         behind_per_trial=alone,

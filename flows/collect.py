@@ -1,11 +1,12 @@
 """Collection: takes the trials that the store lacks, on one rig, under one protocol.
 
-The truth about what is done is the store; Prefect sees a flow a campaign and a task a trial on a
-real rig, a task a batch on a mock rig (where a trial takes less time than a task costs).
+The truth about what is done is the store. Prefect sees a flow a campaign and a task a batch of
+trials: on a real rig that is one trial, on a mock rig, where a task costs as much as one, many.
 """
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from prefect import flow, task
@@ -23,14 +24,22 @@ from sliplab.protocols import Trial
 from sliplab.storage.trials import control
 from sliplab.storage.trials.store import Store
 
-MOCK_BATCH = 25
+BATCH = 25
+"""Most trials in a task."""
+BATCH_S = 5.0
+"""After so long a task begins no further trial."""
 
 
 @task(name="trials", cache_policy=NO_CACHE, persist_result=False)
 def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
-    """Take some trials; returns how many."""
-    session.content.take(trials.content)
-    return len(trials.content)
+    """Take trials in their order, `BATCH` at most, until `BATCH_S` are over; return how many."""
+    began, count = time.monotonic(), 0
+    for trial in trials.content[:BATCH]:
+        session.content.take([trial])
+        count += 1
+        if time.monotonic() - began >= BATCH_S:
+            break
+    return count
 
 
 @flow(name="collect", validate_parameters=False, persist_result=False)
@@ -57,10 +66,10 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
             session.on_trial, work.gate.on_pause = on_trial_done, left.pause
             with stopping.signals():  # Prefect has handlers of its own inside a flow
                 session.rig.connect()
-                size = MOCK_BATCH if wanted.rig.in_virtual_time else 1
                 while trials:
-                    for start in range(0, len(trials), size):
-                        take_trials(Opaque(session), Opaque(trials[start : start + size]))
+                    taken = 0
+                    while taken < len(trials):
+                        taken += take_trials(Opaque(session), Opaque(trials[taken:]))
                     trials = work.gate.more() if wanted.most is None else []
                     bar.extend(len(trials))
                     page.more(len(trials))
