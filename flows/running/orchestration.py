@@ -133,8 +133,9 @@ def private() -> bool:
 class ServerLink:
     """The connection of one flow run to Prefect's server: limits, and whether it answers.
 
-    Each request passes here (httpx's event hooks) and gets a limit. After one that failed no other
-    is sent, so a lost server costs a run one limit at its begin and one at its end.
+    Each request passes here (httpx's event hooks) and gets a limit. One that failed is tried once
+    more, because SQLite may be busy; after that no other is sent. So a lost server costs a run one
+    limit at its begin and one at its end.
 
     Args:
         server: as `run_records.server_name` calls it.
@@ -147,6 +148,7 @@ class ServerLink:
         """The work is over, and only its end is to be reported."""
         self._unanswered = False
         """The last request had no answer, or that of a broken server."""
+        self._request: Any = None
         self._limit_s = BEGIN_S
         _link = self
 
@@ -171,13 +173,15 @@ class ServerLink:
             )
 
     def _before(self, request: Any) -> None:
-        if self._unanswered:
+        again = request is self._request
+        if self._unanswered and not again:
             raise _NotSent
-        self._unanswered = True
-        self._limit_s = END_S if self.ending else BEGIN_S
-        if self.server in _lost_servers or stopping.requested():
-            self._limit_s = LOST_S
-        limits = dict.fromkeys(("connect", "read", "write", "pool"), self._limit_s)
+        self._unanswered, self._request = True, request
+        if again or self.server in _lost_servers or stopping.requested():
+            limit_s = LOST_S
+        else:
+            self._limit_s = limit_s = END_S if self.ending else BEGIN_S
+        limits = dict.fromkeys(("connect", "read", "write", "pool"), limit_s)
         request.extensions = {**request.extensions, "timeout": limits}
 
     def _after(self, response: Any) -> None:
@@ -225,7 +229,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def limited_settings() -> dict[Any, Any]:
-    """Return Prefect's settings for a flow run: limits, no retries, no heartbeat.
+    """Return Prefect's settings for a flow run: limits, one retry, no heartbeat.
 
     A heartbeat's thread would cost a flow a second at its end. A killed run is known by what the
     store lacks, and closed by the next one.
@@ -234,7 +238,7 @@ def limited_settings() -> dict[Any, Any]:
 
     return {
         settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None,
-        settings.PREFECT_CLIENT_MAX_RETRIES: 0,
+        settings.PREFECT_CLIENT_MAX_RETRIES: 1,
         settings.PREFECT_API_REQUEST_TIMEOUT: BEGIN_S,
     }
 

@@ -78,10 +78,15 @@ def owe(store: Path, run: str, state: str, message: str) -> None:
     write_new_json(_folder(store) / f"{run}.owed.json", said)
 
 
-def owe_end(store: Path, run: str) -> None:
-    """Keep the end that a flow run has here for a server that did not answer."""
-    said = read_json(_folder(store) / f"{run}.end.json")
-    owe(store, run, said["state"], said["message"])
+def end_of(store: Path, run: str) -> Json | None:
+    """Return how a flow run ended, ``state`` and ``message``; None if that is not known."""
+    path = _folder(store) / f"{run}.end.json"
+    return read_json(path) if path.exists() else None
+
+
+def delivered(store: Path, run: str) -> None:
+    """Note that the server knows how a flow run ended."""
+    (_folder(store) / f"{run}.owed.json").unlink(missing_ok=True)
 
 
 def suspended(store: Path, run: str) -> None:

@@ -36,15 +36,15 @@ class ServedRuns:
     """The runs of one service.
 
     Args:
-        store: its folder; server: as `run_records.server_name` calls it.
+        store: its folder.
         on_rig: the flow of each deployment whose runs go to a process, one at a time.
         control: the flow of each deployment whose runs go to a thread.
     """
 
     def __init__(
-        self, store: Path, server: str, on_rig: Mapping[UUID, Any], control: Mapping[UUID, Any]
+        self, store: Path, on_rig: Mapping[UUID, Any], control: Mapping[UUID, Any]
     ) -> None:
-        self._store, self._server = store, server
+        self._store = store
         self._on_rig, self._control = on_rig, control
         self._run: Any = None
         self._process: asyncio.subprocess.Process | None = None
@@ -127,20 +127,20 @@ class ServedRuns:
 
     async def _close(self, client: Any, *, cancelled: bool) -> None:
         """Close a run whose process ended without the server knowing how it ended."""
+        from prefect.client.schemas.objects import State, StateType
         from prefect.states import Cancelled, Crashed
 
+        assert self._process is not None
         run = str(self._run.id)
-        if cancelled:
-            state: Any = Cancelled(message="stopped before it had begun")
+        if (kept := run_records.end_of(self._store, run)) is not None:
+            state: Any = State(type=StateType(kept["state"]), message=kept["message"])
+        elif cancelled:
+            state = Cancelled(message="stopped before it had begun")
         else:
-            # its process may have kept how it ended, or have left a begin without an end
-            await asyncio.to_thread(run_records.close_dead, self._store, self._server)
-            if (await client.read_flow_run(self._run.id)).state.is_final():
-                return
-            assert self._process is not None
-            state = Crashed(message=f"its process ended with exit code {self._process.returncode}")
-        run_records.end(self._store, run, state.type.value, state.message, "service")
+            state = Crashed(message=f"its process was killed ({self._process.returncode})")
         await client.set_flow_run_state(self._run.id, state, force=True)
+        run_records.end(self._store, run, state.type.value, state.message, "service")
+        run_records.delivered(self._store, run)
 
     async def _stop(self) -> None:
         """End what runs; its process says itself how it ended."""
@@ -181,7 +181,8 @@ def _carry_out(run_id: str, flow_name: str) -> None:
             pass  # the server said so
         except Exception as error:
             link.lose(error)
-            run_records.owe_end(here.folder, run_id)
+            if (kept := run_records.end_of(here.folder, run_id)) is not None:
+                run_records.owe(here.folder, run_id, kept["state"], kept["message"])
     if not orchestration.close():
         os._exit(0)
 

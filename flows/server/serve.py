@@ -53,20 +53,12 @@ def serve(
         ServerError: the embedded server did not start.
         InputError: another program serves another store under this name.
     """
-    from prefect.settings import (
-        PREFECT_API_REQUEST_TIMEOUT,
-        PREFECT_API_URL,
-        PREFECT_CLIENT_MAX_RETRIES,
-        temporary_settings,
-    )
+    from prefect.settings import PREFECT_API_URL
 
     ours = PREFECT_API_URL.value() is None
-    # a server that does not answer is asked again at the next look
-    limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
     with ExitStack() as stack:
         stack.enter_context(exclusive(store.folder / LOCK, f"the service of {store.folder}"))
         url, page = stack.enter_context(page_server(port))
-        stack.enter_context(temporary_settings(updates=limits))
         server = run_records.EMBEDDED if ours else run_records.server_name(url)
         protocols = _protocols(folders, schedules)
         here = Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols)
@@ -79,6 +71,12 @@ def serve(
 async def _serve(
     here: Service, schedules: Sequence[Scheduled], url: str, page: PageServer | None, poll_s: float
 ) -> None:
+    from prefect.settings import (
+        PREFECT_API_REQUEST_TIMEOUT,
+        PREFECT_CLIENT_MAX_RETRIES,
+        temporary_settings,
+    )
+
     from sliplab.flows.server.deployments import CONTROL, ON_RIG
 
     stopped = asyncio.Event()
@@ -96,8 +94,11 @@ async def _serve(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    served = ServedRuns(here.folder, here.server, on_rig, control)
-    carrying_out = asyncio.create_task(served.carry_out(min(poll_s, LOOK_S), stopped))
+    served = ServedRuns(here.folder, on_rig, control)
+    # a server that does not answer is asked again at the next look
+    limits = {PREFECT_API_REQUEST_TIMEOUT: ANSWER_S, PREFECT_CLIENT_MAX_RETRIES: 0}
+    with temporary_settings(updates=limits):
+        carrying_out = asyncio.create_task(served.carry_out(min(poll_s, LOOK_S), stopped))
     watching = asyncio.create_task(watch(page, here.folder, here.server, stopped))
     ending = asyncio.create_task(stopped.wait())
     console.say(f"serving {here.folder} on the rig {here.rig}: deployments */{here.name}")
