@@ -68,11 +68,10 @@ def test_labels_of_tracks_are_checked_with_video(
     assert check_labels(run_request, 2)["done"] == 2
     found = read_check(Store.open(run_request.store))
     assert found is not None
-    assert (found["trials"], found["simulated"]) == (2, True)
-    assert found["rules_ms"]["paper"]["incipient"]["n"] == 2
-    assert (
-        found["rules_ms"]["paper"]["incipient"]["max_abs"] < 25.0
-    )  # the true onset to within 2.5 frames
+    assert (found.trials, found.simulated) == (2, True)
+    incipient = found.model_dump(mode="json")["rules_ms"]["paper"]["incipient"]
+    assert incipient["n"] == 2
+    assert incipient["max_abs"] < 25.0  # the true onset to within 2.5 frames
     (first, second) = (
         Store.open(check_folder(run_request)).campaign(run_request.campaign).committed()
     )
