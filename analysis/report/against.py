@@ -99,7 +99,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Setting:
-    """What made the two reports, where it differs."""
+    """One setting, hash, seed or version in which two reports differ."""
 
     what: str
     here: Any

@@ -27,12 +27,12 @@ WEAR = {
     "hold_events_per_s": ("event rate in the hold", "events in the hold\n(1/s)"),
     "first_slip_ms": ("time to the first slip", "motion to first slip\n(ms)"),
 }
-"""What is compared of reference trials: in words, and its axis."""
+"""Compared figures of reference trials: title, and label of the axis."""
 
 
 @dataclass(frozen=True)
 class CollectedSection(Content):
-    """What there is of what was planned.
+    """Committed trials beside the plans.
 
     Attributes:
         source: what was kept of the outside camera, in words.

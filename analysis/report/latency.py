@@ -86,7 +86,7 @@ class LatencySection(Content):
 
     @property
     def others(self) -> list[tuple[int, str]]:
-        """How many trials were not detected first, by cause."""
+        """Trials that were not detected first: number and cause."""
         counts = [(self.numbers.accounted.of(name), WORDS[name]) for name in OUTCOMES[1:]]
         return [(count, words) for count, words in counts if count]
 

@@ -46,7 +46,7 @@ COMMANDS = {
     "labels_truth": "python -m benchmarks labels_truth --json > {file}",
     "detector": "sliplab tradeoff --detector {store}",
 }
-"""How each is made."""
+"""The command that makes each."""
 
 
 def read_programs(store: Store) -> dict[str, Json]:
@@ -311,7 +311,7 @@ FIGURES = {
     ("work", "us_per_s"): ("work (µs/s)", 1.0, 0),
     ("work", "synaptic_operations_per_s"): ("synaptic operations (million/s)", 1e-6, 2),
 }
-"""What is read of each row of the detector's search: a list over seeds; heading, factor, digits."""
+"""Figures of each row of the detector's search, lists over seeds: heading, factor, digits."""
 MOST = 25
 """Rows of the front that are listed."""
 

@@ -1,4 +1,4 @@
-"""What the paper published, so that each figure of a report can stand beside it.
+"""Published figures of the paper, which stand beside those of a report.
 
 Lu, Deng, Redmond, Psomopoulou and Ward-Cherrier, "A Neuromorphic Incipient Slip Detection System
 using Papillae Morphology". All of it was measured on the authors' own robot and skin; a figure of a

@@ -37,7 +37,7 @@ from sliplab.storage.schema.summary import SeedsUsed, Summary
 
 @dataclass(frozen=True)
 class Shown:
-    """What the page shows beside the summary's numbers.
+    """Material of the page beside the summary's numbers.
 
     Attributes:
         example: the trial that is looked at, with its `counts` and `end_ns`.

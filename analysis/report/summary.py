@@ -44,12 +44,12 @@ _WINDOWS = (
     "accuracy", "confusion", "precision", "recall", "baselines", "samples", "interval", "seeds",
     "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
 )  # fmt: skip
-"""What the summary takes over from the evaluation's windows as it is; docs/metrics.md."""
+"""Keys that the summary takes over from the evaluation's windows; docs/metrics.md."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a summary is made of.
+    """Results of earlier steps that a summary is made of.
 
     Attributes:
         settings: of training.

@@ -212,7 +212,7 @@ def _in_order(rows: Mapping[str, Share]) -> list[tuple[str, Share]]:
 
 @dataclass(frozen=True)
 class LeadSection(Content):
-    """What a lead in spikes means."""
+    """Share of right windows by the winner's lead in spikes."""
 
     template: ClassVar[str] = "lead.html"
     calibration: Calibration
@@ -258,7 +258,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class WorkSection(Content):
-    """What spiking buys, and what it costs.
+    """Computation of the network, and its accuracy beside the best other method.
 
     Attributes:
         seeds: of the spiking network.

@@ -130,7 +130,7 @@ class DetectionRule(Part):
     smoothing: Int
     margin: Number
     choose: str = "protocol"
-    """What chose them: `protocol`, `validation` or `test`."""
+    """Source of both: `protocol`, `validation` or `test`."""
 
 
 class Network(Part):
@@ -180,7 +180,7 @@ class TrialOutcome(Part):
     latency_gross_ms: Known
     lead_ms: Known
     late_incipient_ms: Known = None
-    """How far a late detection came after its event."""
+    """Delay of a late detection after its event."""
     late_gross_ms: Known = None
 
 
@@ -255,7 +255,7 @@ class Holdout(Part):
 
 
 class Sync(Part):
-    """How devices were timed; uncertainties are of the worst trial, in microseconds."""
+    """Grades of the devices' clocks; uncertainties are of the worst trial, in microseconds."""
 
     grade: str | None
     """Of the frames, or of the arm."""

@@ -107,7 +107,7 @@ def references(
     *,
     simulated: bool,
 ) -> str:
-    """What reference trials measured, over the campaign: a panel each, SVG.
+    """Figures of reference trials over the campaign: a panel each, SVG.
 
     Args:
         numbers: places in the plan, from 1.

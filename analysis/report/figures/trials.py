@@ -123,7 +123,7 @@ def label_uncertainty(
     *,
     simulated: bool,
 ) -> str:
-    """How far labels are from the truth, and how sure they are of themselves; cumulated, SVG.
+    """Distances of labels from the truth, and widths of their intervals; cumulated, SVG.
 
     Args:
         errors: distances in ms by rule and onset; empty where no truth is known.
