@@ -12,12 +12,11 @@ from typing import Any
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from sliplab.flows.collecting.remaining import Remaining
+from sliplab.flows.collecting.progress import shown
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
 from sliplab.flows.collecting.session import Session, refresh, run_session
-from sliplab.flows.collecting.showing import shown
 from sliplab.flows.planning.run_request import RunRequest, check_disk
-from sliplab.flows.running import console, stopping
+from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols import Trial
@@ -47,33 +46,21 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
     """Take the trials of a run request that its store lacks."""
     wanted = run_request.content
     with (
-        shown(wanted) as page,
+        shown(wanted) as progress,
         run_session(wanted) as work,
         timed(Store(wanted.store), f"collect {wanted.campaign}"),
     ):
         session, trials = work.session, work.trials
-        simulated = "simulated " if wanted.rig.simulated else ""
-        page.begin(len(trials))
-        left = Remaining(wanted.plan, trials, real_time=not wanted.rig.in_virtual_time)
-        title = f"collect {wanted.campaign} ({simulated}trials)"
-        with console.bar(title, len(trials), str(left)) as bar:
-
-            def on_trial_done(trial: Trial, outcome: str) -> None:
-                left.done(trial)
-                page.on_trial_done(trial, outcome)
-                bar.advance(1, f"{trial.id} {outcome}", str(left))
-
-            session.on_trial, work.gate.on_pause = on_trial_done, left.pause
-            with stopping.signals():  # Prefect has handlers of its own inside a flow
-                session.rig.connect()
-                while trials:
-                    taken = 0
-                    while taken < len(trials):
-                        taken += take_trials(Opaque(session), Opaque(trials[taken:]))
-                    trials = work.gate.more() if wanted.most is None else []
-                    bar.extend(len(trials))
-                    page.more(len(trials))
-                    left.add(trials)
+        session.on_trial, work.gate.on_pause = progress.on_trial_done, progress.on_pause
+        # Prefect has handlers of its own inside a flow
+        with progress.begin(trials), stopping.signals():
+            session.rig.connect()
+            while trials:
+                taken = 0
+                while taken < len(trials):
+                    taken += take_trials(Opaque(session), Opaque(trials[taken:]))
+                trials = work.gate.more() if wanted.most is None else []
+                progress.add(trials)
         return {
             **wanted.counts(session.campaign),
             "taken": session.taken,

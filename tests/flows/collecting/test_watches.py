@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from sliplab.analysis.quality import hold_rate
-from sliplab.flows.collecting.remaining import Remaining
+from sliplab.flows.collecting.progress import Remaining
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out
 from sliplab.flows.collecting.session import Session, TrialGate
 from sliplab.flows.collecting.watches import DiskWatch, ReferenceWatch

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sliplab.flows.collecting import showing
+from sliplab.flows.collecting.progress import sign_rig
 from sliplab.flows.collecting.session import WindowOver
 from sliplab.flows.planning.run_request import make_request
 from sliplab.flows.running import orchestration, run_records
@@ -79,7 +79,7 @@ def test_a_collection_ends_with_a_record_and_shows_itself(
     from sliplab.flows.server.deployments import collect
 
     with get_client(sync_client=True) as client:
-        showing.sign_rig(client, "rehearsal", True)  # as a killed program left it
+        sign_rig(client, "rehearsal", True)  # as a killed program left it
         state = collect(Collect(protocol=protocol, trials=3), return_state=True)
         limit = client.read_global_concurrency_limit_by_name("rig rehearsal")
     assert state.type.value == "COMPLETED"

@@ -1,8 +1,8 @@
-"""What Prefect's page shows of a collection: progress, trials by outcome, a picture, the rig.
+"""Progress of a collection: time left, the console's bar, and Prefect's page.
 
-A thread of its own tells the server, every few seconds at most, so that neither a batch of quick
-trials nor a slow server holds a trial up. What cannot be shown is left out: a page is a view, and
-the store has it all.
+A thread of its own reports to the server, every few seconds at most, so that neither a batch of
+quick trials nor a slow server delays a trial. What cannot be reported is left out: the page is a
+view, and the store has it all.
 """
 
 from __future__ import annotations
@@ -10,59 +10,136 @@ from __future__ import annotations
 import base64
 import contextvars
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 from uuid import UUID
 
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.running import orchestration, stopping
-from sliplab.protocols import Trial
+from sliplab.flows.running import console, orchestration, stopping
+from sliplab.protocols import Plan, Trial
 from sliplab.protocols.hashing import hash_text
 from sliplab.storage.streams import Json
 from sliplab.storage.trials.store import Store, StoreError
 
 PERIOD_S = 5.0
 END_LIMIT_S = 10.0
-"""How long the end of a collection waits for its page, while the server answers."""
+"""Longest wait for the last report at the end of a collection, s."""
 STOP_LIMIT_S = 0.5
-"""How long it does when a stop was requested."""
+"""The same after a stop was requested, s."""
 ANSWER_S = 5.0
-"""How long one answer of the server is waited for."""
+"""Longest wait for one answer of the server, s."""
 LOST_AFTER = 3
-"""So many periods without an answer, and the server is called lost."""
+"""After so many reports without an answer the server counts as lost."""
 MOST_POINTS = 300
 
 
-class Show:
-    """What a collection tells while it runs; all of it returns at once."""
+class Remaining:
+    """Estimates the time left: the planned time left times the ratio of actual to planned so far.
 
-    def __init__(self, start: Callable[[], None] = lambda: None) -> None:
+    Trials are not counted, because a slow slide takes many times as long as a fast one.
+
+    Args:
+        real_time: True if trials take at least their planned time; then there is an estimate before
+            the first one is done.
+        clock: returns seconds of a monotonic clock.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        trials: Sequence[Trial],
+        *,
+        real_time: bool,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._plan, self._clock, self._real_time = plan, clock, real_time
+        self._left = sum(plan.seconds(trial) for trial in trials)
+        self._planned_done = 0.0
+        self._began = clock()
+
+    def add(self, trials: Sequence[Trial]) -> None:
+        """Add trials to take."""
+        self._left += sum(self._plan.seconds(trial) for trial in trials)
+
+    def done(self, trial: Trial) -> None:
+        """Note that a trial is over, whatever its outcome."""
+        self._left -= self._plan.seconds(trial)
+        self._planned_done += self._plan.seconds(trial)
+
+    def pause(self, seconds: float) -> None:
+        """Leave out the time of a pause."""
+        self._began += seconds
+
+    @property
+    def seconds(self) -> float | None:
+        """Estimated seconds left; None while nothing is known."""
+        if self._planned_done:
+            return self._left * (self._clock() - self._began) / self._planned_done
+        return self._left if self._real_time else None
+
+    def __str__(self) -> str:
+        seconds = self.seconds
+        return "" if seconds is None else f"{console.duration(max(seconds, 0.0))} left"
+
+
+class Progress:
+    """Progress of one collection: trials by outcome, and the time left.
+
+    It is shown as a bar on the console, and read by the thread that reports to Prefect's page.
+
+    Args:
+        on_begin: called when the rig is ours and trials are about to be taken.
+    """
+
+    def __init__(self, run_request: RunRequest, on_begin: Callable[[], None]) -> None:
+        self._run_request, self._on_begin = run_request, on_begin
         self._total = self._done = 0
         self.outcomes: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._start = start
+        self._bar: console.Bar
+        self._left: Remaining
 
-    def begin(self, count: int) -> None:
-        """The rig is ours, and so many trials are to be taken."""
-        self.more(count)
-        self._start()
+    @contextmanager
+    def begin(self, trials: Sequence[Trial]) -> Iterator[None]:
+        """Show the progress of taking `trials` while the block runs."""
+        rig = self._run_request.rig
+        self._total = len(trials)
+        self._on_begin()
+        self._left = Remaining(self._run_request.plan, trials, real_time=not rig.in_virtual_time)
+        simulated = "simulated " if rig.simulated else ""
+        title = f"collect {self._run_request.campaign} ({simulated}trials)"
+        with console.bar(title, len(trials), str(self._left)) as self._bar:
+            yield
 
-    def more(self, count: int) -> None:
-        """So many trials are to be taken besides."""
+    def add(self, trials: Sequence[Trial]) -> None:
+        """Add trials that are to be taken as well."""
         with self._lock:
-            self._total += count
+            self._total += len(trials)
+        self._left.add(trials)
+        self._bar.extend(len(trials))
 
     def on_trial_done(self, trial: Trial, outcome: str) -> None:
-        """Count a trial that is over."""
+        """Count a trial that is over.
+
+        Raises:
+            KeyboardInterrupt: somebody asked the program to stop.
+        """
         with self._lock:
             self._done += 1
             self.outcomes[outcome] += 1
+        self._left.done(trial)
+        self._bar.advance(1, f"{trial.id} {outcome}", str(self._left))
+
+    def on_pause(self, seconds: float) -> None:
+        """Leave the time of a pause out of the estimate."""
+        self._left.pause(seconds)
 
     @property
-    def progress(self) -> tuple[float, str]:
-        """Percent, and in words."""
+    def summary(self) -> tuple[float, str]:
+        """Percent of the trials that are done, and a text."""
         with self._lock:
             share = 100.0 * self._done / self._total if self._total else 0.0
             words = ", ".join(f"{n} {what}" for what, n in sorted(self.outcomes.items()))
@@ -70,35 +147,35 @@ class Show:
 
 
 @contextmanager
-def shown(run_request: RunRequest) -> Iterator[Show]:
-    """Show a collection on the page of the flow run round it while the block runs."""
+def shown(run_request: RunRequest) -> Iterator[Progress]:
+    """Yield the progress of a collection, and report it to the page of the flow run around it."""
     from prefect.context import FlowRunContext
 
     context = FlowRunContext.get()
     if context is None or context.flow_run is None:
-        yield Show()
+        yield Progress(run_request, lambda: None)
         return
     page = _Page(run_request, context.flow_run.id)
     try:
-        yield page.show
+        yield page.progress
     finally:
         page.end()
 
 
 class _Page:
-    """The thread that reports progress to the server."""
+    """Reports the progress to Prefect's server, in a thread."""
 
     def __init__(self, run_request: RunRequest, run: UUID) -> None:
         self._run_request, self._run = run_request, run
         self._over = threading.Event()
-        self._progress: Any = None
+        self._artifact: Any = None
         self._misses = 0
         self._public = not orchestration.private()
         settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
         self._thread = threading.Thread(
             target=settings.run, args=(self._report_until_end,), name="page", daemon=True
         )
-        self.show = Show(self._thread.start)
+        self.progress = Progress(run_request, self._thread.start)
 
     def end(self) -> None:
         """Send the last report; wait for it, up to a limit."""
@@ -120,7 +197,7 @@ class _Page:
             self._answered(self._rig, client, True)
             before = None
             while not self._over.wait(PERIOD_S):
-                if (now := self.show.progress) != before and self._answered(
+                if (now := self.progress.summary) != before and self._answered(
                     self._report_progress, client
                 ):
                     before = now
@@ -136,7 +213,7 @@ class _Page:
                     continue
 
     def _answered(self, report: Callable[..., None], *about: Any) -> bool:
-        """Whether the server took it; without an answer again and again it is lost."""
+        """Return whether the server took a report; after `LOST_AFTER` failures it is lost."""
         try:
             report(*about)
         except Exception as error:
@@ -148,24 +225,24 @@ class _Page:
         return True
 
     def _rig(self, client: Any, busy: bool) -> None:
-        """The concurrency limit of the rig's name: a sign on its door, and not its lock."""
+        """Show on a public server whether the rig is in use; the lock is elsewhere."""
         if self._public:
             sign_rig(client, self._run_request.rig.name, busy)
 
     def _report_progress(self, client: Any) -> None:
         from prefect.client.schemas.actions import ArtifactUpdate
 
-        percent, words = self.show.progress
-        if self._progress is None:
-            self._progress = self._make(client, "progress", percent, words).id
+        percent, words = self.progress.summary
+        if self._artifact is None:
+            self._artifact = self._make(client, "progress", percent, words).id
         else:
-            client.update_artifact(self._progress, ArtifactUpdate(data=percent, description=words))
+            client.update_artifact(self._artifact, ArtifactUpdate(data=percent, description=words))
 
     def _report_table(self, client: Any) -> None:
         import json
 
         campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
-        rows = outcome_rows(self._run_request.counts(campaign), self.show.outcomes)
+        rows = outcome_rows(self._run_request.counts(campaign), self.progress.outcomes)
         self._make(client, "table", json.dumps(rows), self._title("trials by outcome"))
 
     def _report_figure(self, client: Any) -> None:
@@ -178,7 +255,7 @@ class _Page:
             self._make(client, "image", data, self._title("events a second of each trial"))
 
     def _rates(self) -> tuple[list[int], list[float]]:
-        """Places in the plan from 1, and events a second, of trials evenly spread over it."""
+        """Return plan numbers from 1, and events per second, of evenly spread trials."""
         campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
         there = campaign.committed()
         wanted = [(n, t) for n, t in enumerate(self._run_request.plan, 1) if t.id in there]
@@ -209,7 +286,7 @@ class _Page:
 
 
 def outcome_rows(counts: Json, here: Counter[str]) -> list[Json]:
-    """The table of trials by outcome: how many in this run, and in the whole campaign."""
+    """Return the table of trials by outcome: in this run, and in the whole campaign."""
     return [
         {"outcome": "planned", "this run": "", "campaign": counts["planned"]},
         {"outcome": "committed", "this run": here["committed"], "campaign": counts["committed"]},
@@ -221,7 +298,7 @@ def outcome_rows(counts: Json, here: Counter[str]) -> list[Json]:
 
 
 def artifact_key(campaign: str, kind: str) -> str:
-    """Prefect takes letters a-z, digits and dashes only; what that loses, a hash tells apart."""
+    """Return a key of a-z, digits and dashes, as Prefect wants it; a hash keeps it unique."""
     plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in campaign.lower())
     if plain != campaign:
         plain += f"-{hash_text(campaign)[:6]}"
