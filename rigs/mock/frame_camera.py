@@ -23,11 +23,11 @@ from sliplab.rigs.mock.settings import MockSettings
 from sliplab.rigs.mock.sync import ClockReader, FreeRun, Ticks
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.frames import (
+    ExposurePath,
     Exposures,
     FrameOptics,
     PlateView,
     Reflections,
-    Way,
     expose,
 )
 from sliplab.rigs.scene.lens import BoardCamera, BoardPlace, BoardPrint, draw_board
@@ -304,7 +304,7 @@ class FrameFaults:
         for papilla, when in hidden:
             _put_away(papilla, tips_mm, plate_mm, when)
             for index in ways.keys() & set(np.flatnonzero(when).tolist()):
-                way = Way(ways[index].tips_mm.copy(), ways[index].plate_mm.copy())
+                way = ExposurePath(ways[index].tips_mm.copy(), ways[index].plate_mm.copy())
                 _put_away(papilla, way.tips_mm, way.plate_mm, slice(None))
                 ways[index] = way
         return Exposures(tips_mm, plate_mm, ways)

@@ -1,12 +1,12 @@
-"""When the rim of a moving disc crosses one pixel's next thresholds, however the disc moves.
+"""Crossings of one pixel's next thresholds by the rim of a moving disc, however the disc moves.
 
 For pixels whose distance is not known to be monotone on a whole segment; `pixels` has the others.
 
-g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a piece
+g(t) = |x - c(t)| - r(t) is the pixel's distance from the rim. Every root is looked for on a part
 of time on which g is proven to be monotone: its rate lies between bounds from the control points
 of the path's derivative (a Bezier curve stays in their hull) and from how far the direction to
 the pixel can turn. Where the sign of the rate is not certain, the same bounds say how far g may
-lie beyond both ends of the piece; if that reaches no threshold the piece is done, else it is
+lie beyond both ends of the part; if that reaches no threshold the part is done, else it is
 halved. So a reversal is found however short it is, and a tangent pixel has two crossings or none.
 """
 
@@ -51,9 +51,9 @@ def distance_at(x, y, t, k, since, inverse, curve):  # type: ignore[no-untyped-d
     return away - r, -(dx * vx + dy * vy) - growth * away, away
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def turning(share):  # type: ignore[no-untyped-def]
-    """How far a unit vector may turn whose end moves by a `share` of its distance.
+    """Bound the turn of a unit vector whose end moves by a `share` of its distance.
 
     |u - u'| <= 2 |e - e'| / (|e| + |e'|) (Dunkl and Williams 1964), and never above 2.
     """
@@ -62,7 +62,7 @@ def turning(share):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def may_reach(ga, gb, slowest, fastest, length, on, off, reach):  # type: ignore[no-untyped-def]
-    """Whether a distance from ga to gb in `length` ns can meet a threshold in between.
+    """Tell if a distance from ga to gb in `length` ns can meet a threshold in between.
 
     Its rate lies between `slowest` <= 0 and `fastest` >= 0: both lines from each end bound it.
     """
@@ -122,9 +122,19 @@ def _part_rates(x, y, sa, sb, k, h, curve):  # type: ignore[no-untyped-def]
     return low - turn, high + turn
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def time_between(s, length, scale_a, scale_b):  # type: ignore[no-untyped-def]
+    """Time, ns, at a share `s` of the distance that a monotone segment covers in `length` ns.
+
+    The cubic through both ends; `scale_a`, `scale_b`: its slopes there, ns.
+    """
+    u = 1.0 - s
+    return s * (s * (3.0 - 2.0 * s) * length + u * (u * scale_a - s * scale_b))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, curve):  # type: ignore[no-untyped-def]
-    """When a distance that falls (or rises) from `low` to `high` is `target`: a root in a bracket.
+    """Find when a distance that falls (or rises) is `target`, between the times `low` and `high`.
 
     Args:
         t, k: a first guess, ns after the block's begin, and a step near it.
@@ -150,11 +160,11 @@ def solve(x, y, target, falling, low, high, t, k, fine, since, until, inverse, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def events_of_piece(  # type: ignore[no-untyped-def]
+def events_of_segment(  # type: ignore[no-untyped-def]
     x, y, on, off, last_one, level, step, ga, segment, base, begin, final, since, until, inverse,
     curve, tree, contrast, edge, head, stack, out, n,
 ):  # fmt: skip
-    """Events of one pixel on a piece of a block, however its distance goes.
+    """Events of one pixel on a segment of a block, however its distance goes.
 
     Args:
         on, off, last_one, level: the pixel's state, see `edges`; step: its threshold.
@@ -239,8 +249,7 @@ def events_of_piece(  # type: ignore[no-untyped-def]
         while (target >= gb) if falling else (target <= gb):
             if (target < ga) if falling else (target > ga):
                 s = (target - ga) / rise
-                u = 1.0 - s
-                t = a + s * (s * (3.0 - 2.0 * s) * (b - a) + u * (u * scale_a - s * scale_b))
+                t = a + time_between(s, b - a, scale_a, scale_b)
                 t = min(max(t, begun), b)
                 begun = solve(
                     x,

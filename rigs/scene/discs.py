@@ -13,7 +13,7 @@ from numba import njit
 SHIFTS = 128
 """A noise tile is this much wider than anything drawn from it: there are so many shifts."""
 MARGIN_PX = 6.0
-"""How far noise is drawn beyond a disc's rim."""
+"""Margin of the noise beyond a disc's rim."""
 HALF_DIAGONAL = 0.7072
 """Of a pixel: how far from its centre a rim can still cut it."""
 
@@ -28,14 +28,14 @@ def _mix(value):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _shift(frame_key, index):  # type: ignore[no-untyped-def]
-    """Where in the noise tile a piece of a picture begins: row and column, 0 to 127."""
+    """Place in the noise tile at which a patch of a picture begins: row and column, 0 to 127."""
     turn = _mix(frame_key + np.uint64(index))
     return int(turn & np.uint64(127)), int((turn >> np.uint64(8)) & np.uint64(127))
 
 
 @njit(cache=True, nogil=True)
 def add_noise(image, noise, frame_key):  # type: ignore[no-untyped-def]
-    """Add a shifted piece of the tile `noise` (int8, (h, w), repeated) to `image` in place."""
+    """Add a shifted patch of the tile `noise` (int8, (h, w), repeated) to `image` in place."""
     down, along = _shift(frame_key, 0)
     height, width = noise.shape
     for y in range(image.shape[0]):

@@ -11,12 +11,12 @@ import numpy as np
 from numba import njit
 
 CUT = 5.0
-"""Where the logistic edge ends, in units of its scale."""
+"""End of the logistic edge, in units of its scale."""
 ON, OFF, LAST, LEVEL = 0, 1, 2, 3
 """Columns of a pixel's state: rim distance (px) of its next positive and negative event and of
 its last one, and its reference level of log intensity."""
 TAIL = 1.0 / (1.0 + np.exp(CUT))
-"""What the logistic has left where the edge ends."""
+"""Value of the logistic where the edge ends."""
 FAR = 1e6
 """Stands for a rim distance that is never reached, px."""
 

@@ -12,7 +12,7 @@ Discs must not come so near to each other that their edges overlap.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,7 +58,15 @@ from sliplab.rigs.scene.pixels import (
 )
 from sliplab.rigs.scene.randomness import generator
 from sliplab.rigs.scene.readout import NEVER_NS, Scans, larger, read_each, read_scans
-from sliplab.rigs.scene.rim_pixels import REACH_PX, make_list, may_fire, near_rim, reaches, renew
+from sliplab.rigs.scene.rim_pixels import (
+    REACH_PX,
+    make_list,
+    may_fire,
+    near_rim,
+    no_lists,
+    reaches,
+    renew,
+)
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -118,6 +126,36 @@ class EventOptics:
         return min(self.scan_us * 1e3, self.period_ns) / self.width
 
 
+class Camera(NamedTuple):
+    """Settings of the camera that the kernel takes; fields as in `EventOptics`."""
+
+    block_ns: int
+    chord: bool
+    """Straight lines between rows in place of cubics."""
+    contrast: float
+    edge: float
+    refractory_ns: int
+    period_ns: int
+    column_ns: float
+    lowest: float
+    """The lowest threshold of all."""
+    leak_below: float
+    """Of `noise.NoiseRates`."""
+
+
+class Pixels(NamedTuple):
+    """State of the pixels of an array."""
+
+    threshold: F64
+    """(height, width)."""
+    state: F64
+    """See `rigs.scene.edges`, (height, width, 4)."""
+    fired: I64
+    """Time at which each last fired, true ns, (height, width)."""
+    seen: F64
+    """Rectangles in which markers have been, see `edges.darken`, (n, 4)."""
+
+
 class MarkerSensor:
     """The pixels' state, and the markers of n papillae in the image."""
 
@@ -128,7 +166,6 @@ class MarkerSensor:
         self.threshold: F64 = _between_pixels(
             seed, "thresholds", shape, optics.threshold, optics.threshold_sigma
         )
-        self._lowest = float(self.threshold.min())
         # a reference that leaks makes its positive events itself
         rate_hz, leaks = optics.noise_hz, optics.leak_share
         if optics.leak == "reference":
@@ -139,22 +176,23 @@ class MarkerSensor:
         )  # fmt: skip
         self._circuit = self._new_circuit(seed) if optics.has_circuit else no_circuit()
         self._started = True
-        self._leak_below = self._noise.leak_below
         middle = 0.5 * (optics.width - 1), 0.5 * (optics.height - 1)
         self._projection = (
             float(optics.px_per_mm), float(optics.shift_mm_per_n), float(optics.growth_mm_per_n),
             float(optics.radius_mm), *middle,
         )  # fmt: skip
-        # what the kernel is told in every call; floats also where a setting was written as whole
-        self._fixed = (
+        # floats also where a setting was written as whole
+        self._camera = Camera(
             optics.block_ns, optics.path == "chord", float(optics.contrast), float(optics.edge_px),
             round(optics.refractory_us * 1e3), optics.period_ns, optics.column_ns,
+            float(self.threshold.min()), self._noise.leak_below,
         )  # fmt: skip
         self._dark: F64 = dark_pixels(self.threshold, optics.contrast, optics.edge_px)
-        self._state = self._dark.copy()
-        self._seen: F64 = np.tile([np.inf, -np.inf, np.inf, -np.inf], (len(self._layout_mm), 1))
-        self._fired_ns = np.empty(shape, np.int64)
-        self._lists = _empty_lists(len(self._layout_mm), 0)
+        self._pixels = Pixels(
+            self.threshold, self._dark.copy(), np.empty(shape, np.int64),
+            np.tile([np.inf, -np.inf, np.inf, -np.inf], (len(self._layout_mm), 1)),
+        )  # fmt: skip
+        self._lists = no_lists(len(self._layout_mm), 0)
         self._pending = np.empty(0, np.int64)
         self._phase_ns = 0
         self._trial = 0
@@ -200,25 +238,26 @@ class MarkerSensor:
         optics = self.optics
         self._trial, self._bins = seed, {}
         discs = np.ascontiguousarray(self.path(load[None])[:, :, 0])
-        darken(self._seen, self._dark, self._state)
+        darken(self._pixels.seen, self._dark, self._pixels.state)
         see_discs(
-            discs, optics.contrast, optics.edge_px, self.threshold, self._state, self._seen
+            discs, optics.contrast, optics.edge_px, self.threshold, self._pixels.state,
+            self._pixels.seen,
         )  # fmt: skip
         if optics.has_circuit:
             # a camera that has been running for long: its pixels are somewhere between two leaks
             phase = generator(seed, "leak phases").random(self.threshold.shape)
             see_image(self._circuit, discs, optics.contrast, optics.edge_px, phase)
             self._started = False
-        self._fired_ns[:] = NEVER_NS
+        self._pixels.fired[:] = NEVER_NS
         self._pending = np.empty(0, np.int64)
         if optics.period_ns:
             self._phase_ns = int(generator(seed, "read-out").integers(optics.period_ns))
         # room for rims half as wide again; where that is not enough, trace does without lists
         band = CUT * optics.edge_px + REACH_PX + 1.0
         slots = int(4.0 * np.pi * band * (1.5 * float(discs[:, 2].max()) + band)) // 8 * 8
-        if self._lists[-1].shape[1] < slots:
-            self._lists = _empty_lists(len(discs), slots)
-        self._lists[0][:] = 0.0
+        if self._lists.place.shape[1] < slots:
+            self._lists = no_lists(len(discs), slots)
+        self._lists.origin[:] = 0.0
 
     def sense(self, loads: F64, t_ns: I64) -> Events:
         """Events between the first and the last row of `loads`, in order of time.
@@ -237,10 +276,9 @@ class MarkerSensor:
             start_cells(self._circuit, int(t_ns[0]))
             self._started = True
         when, x, y, p, self._pending = trace(
-            np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, *self._fixed,
-            self._phase_ns, self._lowest, self.threshold, self._state, self._fired_ns, self._seen,
-            *self._lists, self._pending, *self._candidates(int(t_ns[0]), int(t_ns[-1])),
-            self._leak_below, self._circuit,
+            np.ascontiguousarray(loads), self._layout_mm, self._projection, t_ns, self._camera,
+            self._phase_ns, self._pixels, self._lists, self._circuit,
+            self._candidates(int(t_ns[0]), int(t_ns[-1])), self._pending,
         )  # fmt: skip
         return when, x, y, p
 
@@ -256,10 +294,9 @@ class MarkerSensor:
         }
         if first == last:
             return self._bins[first]
-        t_ns, place, lot = (
-            np.concatenate(column) for column in zip(*self._bins.values(), strict=True)
+        return Candidates(
+            *(np.concatenate(column) for column in zip(*self._bins.values(), strict=True))
         )
-        return t_ns, place, lot
 
 
 def _between_pixels(seed: int, name: str, shape: tuple[int, int], mean: float, sigma: float) -> F64:
@@ -267,14 +304,6 @@ def _between_pixels(seed: int, name: str, shape: tuple[int, int], mean: float, s
     spread = np.clip(generator(seed, name).standard_normal(shape), -3.0, 3.0)
     result: F64 = np.maximum(mean + sigma * spread, 0.1 * mean)
     return result
-
-
-def _empty_lists(markers: int, slots: int) -> tuple[npt.NDArray[np.generic], ...]:
-    """See `rigs.scene.rim_pixels`: origin, aim, place."""
-    return (
-        np.zeros((markers, 5)), np.empty((markers, 5, slots), np.float32),
-        np.empty((markers, slots), np.int32),
-    )  # fmt: skip
 
 
 SPAN_NS = 96_000_000
@@ -305,30 +334,34 @@ def find_blocks(row_ns, begin, block_ns, first):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def trace(  # type: ignore[no-untyped-def]
-    loads, layout_mm, projection, row_ns, block_ns, chord, contrast, edge, refractory_ns, period_ns,
-    column_ns, phase_ns, lowest, threshold, state, fired, seen, origin, aim, place, pending,
-    noise_t, noise_place, noise_lot, leak_below, circuit,
+    loads, layout_mm, projection, row_ns, camera, phase_ns, of_pixels, lists, circuit, noise,
+    pending,
 ):  # fmt: skip
     """Signal and noise under `loads`, as the camera hands them over.
+
+    In a block each marker's path is fitted and cut into segments, the pixels that may fire are
+    picked from its list, and tiles of them go through the segments. Noise is added, and the block
+    is read out. Blocks lie on a grid of true time and nothing looks past their borders.
 
     Args:
         loads, layout_mm, projection: see `marker_path.markers_in_image`.
         row_ns: true times of the rows, (m,); one lies on each border of a block in between.
-        chord: straight lines between rows in place of cubics.
-        period_ns, column_ns, phase_ns: see `readout.Scans`.
-        lowest: the lowest threshold of all.
-        threshold, fired: (height, width); state: (height, width, 4), written.
-        seen: rectangles in which markers have been, see `edges.darken`; widened.
-        origin, aim, place: the lists of `rim_pixels`, written.
+        camera: `Camera`; phase_ns: of `readout.Scans`.
+        of_pixels, lists: `Pixels` and `RimLists`, written.
+        circuit: pixels of `circuit`, which do all signal events where there are any.
+        noise: `noise.Candidates`, at least those of this time.
         pending: packed events of scans that were not complete, ns after `row_ns[0]`, less a period
             and the time to read all columns.
-        noise_t, noise_place, noise_lot: of `noise.candidates`, at least those of this time.
-        leak_below: of `noise.NoiseRates`.
-        circuit: pixels of `circuit`, which do all signal events where there are any.
 
     Returns:
         time (ns, int64), column, row (uint16), polarity (uint8), each (k,), and what is pending.
     """
+    # numba counts references at each access to an array inside a tuple: once, and not in the loops
+    threshold, state, fired, seen = of_pixels
+    origin, aim, place = lists
+    noise_t = noise.t_ns
+    chord, contrast, edge = camera.chord, camera.contrast, camera.edge
+    period_ns, column_ns = camera.period_ns, camera.column_ns
     path = markers_in_image(loads, layout_mm, projection)
     total, height, width = row_ns.shape[0], threshold.shape[0], threshold.shape[1]
     rows, inverse = np.empty(total), np.empty(total)
@@ -357,7 +390,7 @@ def trace(  # type: ignore[no-untyped-def]
     noise_at = np.searchsorted(noise_t, row_ns[0])
     events[:waiting] = pending
     while begin < total - 1:
-        blocks = find_blocks(row_ns, begin, block_ns, first)
+        blocks = find_blocks(row_ns, begin, camera.block_ns, first)
         last = first[blocks]
         stop = begin + last
         base_ns, end_ns = row_ns[begin] - lead_ns, row_ns[stop]
@@ -369,8 +402,8 @@ def trace(  # type: ignore[no-untyped-def]
             events, other = larger(events, capacity), np.empty(capacity, np.int64)
         for block in range(blocks):
             noise_at, n = noise_events(
-                noise_t, noise_place, noise_lot, noise_at, row_ns[begin + first[block + 1]],
-                base_ns, leak_below, contrast, edge, path[:, :, begin + first[block]], events, n,
+                noise, noise_at, row_ns[begin + first[block + 1]], base_ns, camera.leak_below,
+                contrast, edge, path[:, :, begin + first[block]], events, n,
             )  # fmt: skip
         for block in range(blocks):
             a, b = first[block], first[block + 1]
@@ -429,7 +462,7 @@ def trace(  # type: ignore[no-untyped-def]
                     if count > pixels.shape[0]:
                         pixels, gaps = np.empty(2 * count, np.int64), np.empty(2 * count)
                         near_rim(x, y, r, band, height, width, pixels)
-                most = n + count * (int(steepest * whole / lowest) + 2)
+                most = n + count * (int(steepest * whole / camera.lowest) + 2)
                 if most > capacity:
                     capacity = 2 * most
                     events, other = larger(events, capacity), np.empty(capacity, np.int64)
@@ -449,15 +482,15 @@ def trace(  # type: ignore[no-untyped-def]
             xs, ys = larger(xs, room), larger(ys, room)
         if period_ns > 0:
             kept, waiting = read_scans(
-                events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns, refractory_ns,
-                fired, t_ns, xs, ys, ps, kept,
+                events, n, other, base_ns, end_ns, period_ns, phase_ns, column_ns,
+                camera.refractory_ns, fired, t_ns, xs, ys, ps, kept,
             )  # fmt: skip
             for k in range(waiting):
                 events[k] -= (end_ns - row_ns[begin]) << 25
         else:
             kept = read_each(
-                events, n, other, base_ns, end_ns - base_ns, refractory_ns, fired, t_ns, xs, ys,
-                ps, kept,
+                events, n, other, base_ns, end_ns - base_ns, camera.refractory_ns, fired, t_ns,
+                xs, ys, ps, kept,
             )  # fmt: skip
         begin = stop
     return (

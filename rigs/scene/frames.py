@@ -1,7 +1,11 @@
 """Pictures of the tips through the plate, drawn at exact places as cheaply as can be.
 
 Papillae are white discs, the sliding plate shows its ArUco marker, and a nuisance of reflections
-may be laid over both. What moves while the shutter is open is smeared.
+may be laid over both.
+
+At the speeds of a slide nothing moves a tenth of a pixel while the shutter is open, and such frames
+cost nothing extra. A falling plate and a tip that jumps are smeared: the picture is the mean over
+places along the path (midpoint rule).
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ MODULES = 6
 
 @dataclass(frozen=True)
 class Print:
-    """What is printed where. Lengths mm."""
+    """A printed marker and its place. Lengths mm."""
 
     marker_id: int
     side_mm: float
@@ -60,14 +64,14 @@ class PlateMarker:
         return len(self._patch)
 
     def centre_px(self, height_mm: F64) -> F64:
-        """Where the marker's centre is seen for the plate's heights, (..., 2) from (...,)."""
+        """Project the marker's centre for the plate's heights, (..., 2) from (...,)."""
         place = np.empty((*np.shape(height_mm), 2))
         place[..., 0], place[..., 1] = self._printed.centre_mm
         place[..., 1] += height_mm
         return self._lens.project(place)
 
     def view(self, heights_mm: F64, width: int, height: int) -> tuple[int, int, U8] | None:
-        """The mean picture over heights of the plate, (s,): left, top and the piece (h, w).
+        """The mean picture over heights of the plate, (s,): left, top and the patch (h, w).
 
         None where nothing of it lies in a picture of `width` x `height`.
         """
@@ -127,7 +131,7 @@ def _patch(printed: Print, px_per_mm: float, dark: int, bright: int) -> U8:
 
 @dataclass(frozen=True)
 class Reflections:
-    """How many there are, and how bright: levels in grey values, lengths mm."""
+    """Number and brightness of reflections: levels in grey values, lengths mm."""
 
     count: int = 0
     level: float = 10.0
@@ -137,7 +141,7 @@ class Reflections:
 def draw_reflections(
     reflections: Reflections, width: int, height: int, px_per_mm: float, seed: int
 ) -> U8:
-    """What the reflections of a trial add to every picture, grey levels, (height, width).
+    """Draw what the reflections of a trial add to every picture, grey levels, (height, width).
 
     Each is a Gaussian with its standard deviation along one axis about `size_mm` and across it
     between a fifth of that and as much, at a random place and angle; together they reach at most
@@ -175,7 +179,7 @@ _FEWEST, _MOST = 32, 128
 
 
 @dataclass(frozen=True)
-class Way:
+class ExposurePath:
     """Places of everything at equal shares of one exposure."""
 
     tips_mm: F64
@@ -192,7 +196,7 @@ class Exposures:
     """(m, n, 2)."""
     plate_mm: F64
     """(m,)."""
-    ways: Mapping[int, Way] = field(default_factory=dict)
+    ways: Mapping[int, ExposurePath] = field(default_factory=dict)
     """By index of the exposure."""
 
 
@@ -211,7 +215,7 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
     if not len(smeared):
         return Exposures(tips, plate)
     counts = np.clip(np.ceil(farthest[smeared] / _STEP_PX).astype(np.int64), _FEWEST, _MOST)
-    ways: dict[int, Way] = {}
+    ways: dict[int, ExposurePath] = {}
     for count in np.unique(counts).tolist():
         # ways of as many places are looked at together
         here = smeared[counts == count]
@@ -221,12 +225,12 @@ def expose(look: Look, mid_ns: I64, exposure_ns: int, px_per_mm: float) -> Expos
         along = along.reshape(-1, count, *along.shape[1:])
         heights = heights.reshape(-1, count)
         tips[here], plate[here] = along.mean(axis=1), heights.mean(axis=1)
-        ways.update(zip(here.tolist(), map(Way, along, heights), strict=True))
+        ways.update(zip(here.tolist(), map(ExposurePath, along, heights), strict=True))
     return Exposures(tips, plate, ways)
 
 
 def moved(way_px: F64) -> npt.NDArray[np.bool_]:
-    """Which of n things need their way drawn: (n,) from their places along it, px, (s, n, 2)."""
+    """Tell which of n things need their path drawn, (n,), from places along it, px, (s, n, 2)."""
     count = len(way_px)
     steps = _length(np.diff(way_px, axis=0)).sum(axis=0)
     # from the first midpoint to the last is less than the whole way
@@ -268,7 +272,7 @@ def _average(tips, plate, px_per_mm):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class FrameOptics:
-    """What the outside camera sees, and how. Lengths mm, levels 0 to 255; see `Lens`."""
+    """The outside camera and what it looks at. Lengths mm, levels 0 to 255; see `Lens`."""
 
     px_per_mm: float = 20.0
     tip_radius_mm: float = 1.0
@@ -315,7 +319,7 @@ class PlateView:
         plate_mm: F64 | None,
         number: I64,
         seed: int,
-        ways: Mapping[int, Way] | None = None,
+        ways: Mapping[int, ExposurePath] | None = None,
     ) -> None:
         """Fill `images`, (k, height, width), uint8.
 
@@ -348,10 +352,10 @@ class PlateView:
                 cv2.add(image, self._light, dst=image)
 
     def _prepare(self, seed: int) -> None:
-        """What belongs to the trial: a noise tile, and what the plate mirrors."""
+        """Draw what belongs to the trial: a noise tile, and what the plate mirrors."""
         optics = self.optics
         self._seed, self._key = seed, key(seed, "frame noise")
-        # one tile a trial: a picture only ever shows shifted pieces of it
+        # one tile a trial: a picture only ever shows shifted patches of it
         draw = generator(seed, "frame noise").standard_normal((self._tile, self._tile))
         grey = np.rint(np.clip(draw, -4.0, 4.0) * optics.noise)
         self._noise = grey.astype(np.int8)

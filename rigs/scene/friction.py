@@ -1,9 +1,15 @@
-"""Friction that varies along the path of each tip: what keeps steady sliding from being silent.
+"""Friction: the coefficient along the path of each tip, and the cone that it makes of the force.
 
 With one constant coefficient a sliding papilla pulls with a constant force and its marker stands
 still in the image, exactly as if it stuck. Real surfaces are not like that. The field is smooth
 (C1 between its knots), so that forces, marker paths and event times stay smooth too, and the
 contact solver's Newton steps have a true slope.
+
+Where the direction turns, a tip is dragged behind its base on a line of the cone's radius: a
+tractrix, tan(theta/2) = tan(theta0/2) exp(-s / rho). That is exact for linear springs also while
+the radius grows or shrinks linearly, rho being then its logarithmic mean. A step of the solver
+takes from it only the direction of the step's slip, which lies between those of the force at both
+ends: an error of second order there is one of third order in the tip's place.
 """
 
 from __future__ import annotations
@@ -175,7 +181,7 @@ def leaves_cone_at(fx, fy, dx, dy, start, end):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def tractrix(fx, fy, dx, dy, before, after):  # type: ignore[no-untyped-def]
-    """How a sliding tip's force is dragged by the drive d, for `tractrix_end`.
+    """Set up the tractrix on which the drive d drags a sliding tip's force, for `tractrix_end`.
 
     `before`, `after`: the cone's radius at both ends.
 

@@ -41,7 +41,7 @@ class Lens:
     ) -> None:
         self.px_per_mm, self.k1 = px_per_mm, k1
         self.straight = tilt_deg == (0.0, 0.0) and k1 == 0.0
-        """Whether the picture is the plane at one scale."""
+        """True if the picture is the plane at one scale."""
         a, b = (math.radians(angle) for angle in tilt_deg)
         # rows: x, y and depth over the distance, of the plane point (X, Y, 1) after both turns
         self._turn = np.array([
@@ -117,7 +117,7 @@ class BoardPrint:
 
 @dataclass(frozen=True)
 class BoardPlace:
-    """Where a board is held: its centre in plate coordinates (z away from the camera), turns.
+    """Pose of a board: its centre in plate coordinates (z away from the camera), turns.
 
     The board's face looks at the camera; turned by `spin_deg` in its plane, then by `lean_deg`
     about the plate's x and y.
@@ -155,7 +155,7 @@ VIEWS = (
     BoardPlace((-18.0, 10.0, 0.0), (-15.0, -18.0), 5.0),
     BoardPlace((18.0, -10.0, 0.0), (18.0, 16.0), -8.0),
 )
-"""How a careful person holds the board: flat on the plate first, then leaning, all over."""
+"""Poses of a board in careful hands: flat on the plate first, then leaning, all over."""
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ def draw_board(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet(matrix, coefficients, rotation, shift, offset, scale, where):  # type: ignore[no-untyped-def]
-    """Where in the print each ray meets the board, column and row, (2, rows, columns)."""
+    """Find where in the print each ray meets the board, column and row, (2, rows, columns)."""
     k1, k2, p1, p2, k3 = coefficients
     # in the board's axes: the camera's place, and each ray's direction
     eye = -(rotation.T @ shift)

@@ -1,9 +1,15 @@
-"""Where the markers are between the rows that the contact model gives: cubic curves in time.
+"""Paths of the markers between the rows that the contact model gives: cubic curves in time.
 
 The time of an event is as exact as the path. At 3 px/s a microsecond is 3e-6 px, which straight
 lines between rows miss by far; cubic Hermite curves with slopes from four rows are of fourth order.
 A block never looks past its own rows, so that cutting a stream at the borders of blocks changes
 nothing.
+
+A block is cut into segments on which a pixel's distance from the rim is monotone, or nearly: there
+a threshold is met once or not at all. Whether it is follows from the mean velocity and from how far
+the velocity strays from it (the derivative of a cubic is a Bezier curve and stays in the hull of
+its control points), and from how far the direction to the pixel can turn. So blocks of fast markers
+are cut up: their discs turn a pixel's direction too far in one go.
 """
 
 from __future__ import annotations
@@ -56,7 +62,7 @@ def largest(values, row, n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
-    """Whether marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
+    """Tell if marker i is the same, to the bit, in all rows from `begin` up to and with `stop`."""
     for c in range(3):
         if path[i, c, begin] != path[i, c, stop]:
             return False
@@ -69,7 +75,7 @@ def stands_still(path, i, begin, stop):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slope_weights(t, first, last, shift, inverse, weights):  # type: ignore[no-untyped-def]
-    """What rows count for the slope at each row of a block, which looks at no other rows.
+    """Weigh the rows for the slope at each row of a block, which looks at no other rows.
 
     The slope is that of the cubic through the four nearest rows (Lagrange), at both ends of a
     block a one-sided one; through all of them where a block has fewer.
@@ -223,7 +229,7 @@ def bound_rates(curve, first, last, base, tree):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def excursion(t, curve, last, spread):  # type: ignore[no-untyped-def]
-    """How far a marker strays up to a row, px: (from its start, from the chord to its end).
+    """Bound how far a marker strays up to a row, px: (from its start, from the chord to its end).
 
     At most: the rows' distances from the chord, and how far a cubic is from the line between its
     rows, which is h s (1 - s) (c2 + c3 (1 + s)). Growth counts like a move.
@@ -276,7 +282,7 @@ _CLOSE = 1e-4  # of the block: after a step as small as that the next error is b
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: ignore[no-untyped-def]
-    """How far rates in some steps stray from their means, px/ns: of the centre, and of the radius.
+    """Bound how far rates stray from their means, px/ns: of the centre, and of the radius.
 
     Args:
         first, last: first step, and the step behind the last one.
@@ -305,7 +311,7 @@ def deviation(first, last, mean_x, mean_y, mean_r, curve, spread):  # type: igno
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cut_block(first, last, block, zero, reach, since, until, curve, spread, segments, n):  # type: ignore[no-untyped-def]
-    """Cut a block into pieces in which the marker does not move far.
+    """Cut a block into segments on which the marker does not move far.
 
     What is done follows from the block's own rows alone.
 
@@ -315,10 +321,10 @@ def cut_block(first, last, block, zero, reach, since, until, curve, spread, segm
         reach: how far from the rim the edge ends, px.
         since, until: when each step begins and ends, ns after the begin of its block.
         spread: scratch, see `deviation`.
-        pieces: (most, FIELDS), written from `n` on; room for as many as there are steps.
+        segments: `SEGMENT`, written from `n` on; room for as many as there are steps.
 
     Returns:
-        how many pieces there are now.
+        how many segments there are now.
     """
     size, parts, done = 1, 1, first
     while size < last - first:
@@ -370,5 +376,5 @@ def cut_block(first, last, block, zero, reach, since, until, curve, spread, segm
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def farthest(segment):  # type: ignore[no-untyped-def]
-    """How long the ways of centre and radius are on a piece, at most and together, px."""
+    """Bound the length of the paths of centre and radius on a segment, together, px."""
     return (segment.speed + abs(segment.mr) + segment.deviation) * (segment.end - segment.begin)

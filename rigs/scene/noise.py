@@ -10,6 +10,7 @@ neither chunks nor what the camera sees change which candidates there are.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,17 +21,25 @@ from sliplab.rigs.scene.randomness import generator
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-Candidates = tuple[I64, I64, F64]
-"""Time (ns, rising), place (column << 12 | row) and lot (0 to 1) of possible noise events."""
-
 BIN_NS = 1_000_000_000
 BRIGHT_SHARE = 0.25
 """Shot noise of the brightest pixels over that of dark ones: v2e's SHOT_NOISE_INTEN_FACTOR."""
 
 
+class Candidates(NamedTuple):
+    """Possible noise events, (n,) each."""
+
+    t_ns: I64
+    """Rising."""
+    place: I64
+    """Column << 12 | row."""
+    lot: F64
+    """0 to 1; decides on what becomes of it."""
+
+
 @dataclass(frozen=True)
 class NoiseRates:
-    """How noisy a camera is; its hot pixels are its own, whatever the trial."""
+    """Noise rates of a camera; its hot pixels are its own, whatever the trial."""
 
     width: int
     height: int
@@ -58,7 +67,7 @@ class NoiseRates:
 
 
 def hot_places(width: int, height: int, count: int, seed: int) -> I64:
-    """Which pixels are hot in the camera of a rig with `seed`: column << 12 | row, (count,)."""
+    """Choose the hot pixels of the camera of a rig with `seed`: column << 12 | row, (count,)."""
     pixel = generator(seed, "hot pixels").choice(width * height, count, replace=False)
     return (pixel % width << 12 | pixel // width).astype(np.int64)
 
@@ -73,10 +82,12 @@ def candidates(rates: NoiseRates, seed: int, index: int) -> Candidates:
     rng = generator(seed, "event noise", index)
     n = int(rng.poisson(rates.total_hz * (BIN_NS * 1e-9)))
     gaps, draws = rng.standard_exponential(n + 1), rng.random((2, n))
-    t_ns, place, lot = _spread(
-        gaps, draws, index * BIN_NS, rates.width, rates.height, rates.hot_share, rates.hot_places
-    )
-    return t_ns, place, lot
+    return Candidates(
+        *_spread(
+            gaps, draws, index * BIN_NS, rates.width, rates.height, rates.hot_share,
+            rates.hot_places,
+        )
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -121,7 +132,7 @@ def brightness(x, y, discs, contrast, edge):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def noise_events(  # type: ignore[no-untyped-def]
-    t_ns, place, lot, begin, end_ns, base_ns, leak_below, contrast, edge, discs, events, n
+    candidates, begin, end_ns, base_ns, leak_below, contrast, edge, discs, events, n
 ):
     """Turn candidates from `begin` on, and before `end_ns`, into events where their pixel is.
 
@@ -132,6 +143,7 @@ def noise_events(  # type: ignore[no-untyped-def]
     Returns:
         the next candidate, and how many events there are now.
     """
+    t_ns, place, lot = candidates
     k = begin
     while k < t_ns.shape[0] and t_ns[k] < end_ns:
         positive, kept = True, True

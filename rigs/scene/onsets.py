@@ -22,7 +22,7 @@ _NEWTON = 7
 
 @dataclass(frozen=True)
 class Material:
-    """What friction and relaxation are; fields as in `rigs.scene.springs.make_springs`."""
+    """Friction and relaxation; fields as in `rigs.scene.springs.make_springs`."""
 
     kinetic: float
     static_excess: float = 0.0
@@ -40,8 +40,8 @@ def slide_onsets(
     settled_s: npt.ArrayLike = 2.0,
     grip: F64 | None = None,
 ) -> F64:
-    """When each tip lets go after the start of straight slides, s, (..., n); infinite if it never
-    touches. Depth, speeds and times broadcast: one slide each.
+    """Compute when each tip lets go after the start of straight slides, s, (..., n); infinite if it
+    never touches. Depth, speeds and times broadcast: one slide each.
 
     Level 1 is u = mu N / k_t. Level 2 takes the bent column's potential
     (`rigs.scene.contact`), level 3 also static friction and the linear solid's relaxation

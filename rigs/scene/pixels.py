@@ -1,4 +1,4 @@
-"""Pixels side by side: which of many meet thresholds on a piece of a marker's path, and when.
+"""Events of many pixels at once: which meet thresholds on a segment of a marker's path, and when.
 
 One pixel's events wait for each other; those of many do not, and where their numbers lie side
 by side a compiler does four or eight of them at a time. So all that a pixel needs stands in a
@@ -6,8 +6,15 @@ tile, one field after the other with a lane for each pixel, and is worked on in 
 branches. Fields are constant distances apart, which is how the compiler knows that lanes do not
 touch each other.
 
-A tile of pixels goes through all pieces of a look. Those of its pixels that fire on a piece are
-gathered in a tile of roots, one threshold after the other.
+A tile of pixels goes through all segments of a path. Those of its pixels that fire on a segment are
+gathered in a tile of roots, one threshold after the other. On a monotone segment time is a function
+of distance. A cubic through both ends is the first guess; then one step of Chebyshev's method,
+which is Newton's with the curvature, is nearly always enough. What is not good enough yet waits in
+a second tile for more of them. What is not monotone, and what never gets good, is left to
+`crossings`, one pixel at a time.
+
+What is done on a segment follows from the rows of its block alone, to the bit, and pixels do not
+wait for each other, so neither the cut of a trial into calls nor the order of pixels matters.
 """
 
 from __future__ import annotations
@@ -16,7 +23,7 @@ import numpy as np
 from numba import njit
 
 from sliplab.rigs.scene.branchless import logarithm
-from sliplab.rigs.scene.crossings import events_of_piece, solve
+from sliplab.rigs.scene.crossings import events_of_segment, solve, time_between, turning
 from sliplab.rigs.scene.edges import CUT, FAR, LAST, LEVEL, OFF, ON, TAIL
 from sliplab.rigs.scene.marker_path import (
     bound_rates,
@@ -40,7 +47,7 @@ for the same sets of the cache."""
     P_CODE,
 ) = (STRIDE * k for k in range(11))
 """Fields of a tile of pixels: column and row; as in `edges`, four; the threshold; distance from the
-rim at the begin and at the end of a piece, px; what happens on it; column and row in a packed
+rim at the begin and at the end of a segment, px; what happens on it; column and row in a packed
 event."""
 PIXEL_FIELDS = 11
 NOTHING, COMES, GOES, DOUBT = 0.0, 1.0, 2.0, 3.0
@@ -51,7 +58,7 @@ _DONE_PX = 1e-10
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
-    """Distances from the rim at the begin of the first piece."""
+    """Distances from the rim at the begin of the first segment."""
     for j in range(n):
         dx, dy = tile[P_X + j] - column, tile[P_Y + j] - row
         tile[P_END + j] = np.sqrt(dx * dx + dy * dy) - radius
@@ -59,7 +66,7 @@ def place_pixels(tile, n, column, row, radius):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
-    """What each of n pixels does on a piece.
+    """Tell what each of n pixels does on a segment.
 
     Args:
         reach: distance from the rim beyond which a pixel may be another disc's, px.
@@ -82,9 +89,8 @@ def classify(tile, n, segment, reach):  # type: ignore[no-untyped-def]
         dx, dy = dx - half_x, dy - half_y
         inverse = 1.0 / max(np.sqrt(dx * dx + dy * dy), 1e-3)
         mean = -(dx * mean_x + dy * mean_y) * inverse - mean_r
-        # how far a direction turns on the way: see `crossings.turning`
         share = way * inverse
-        spread = apart + (1.34 * share if share <= 0.5 else 2.0) * speed
+        spread = apart + turning(share) * speed
         slowest, fastest = mean - spread, mean + spread
         turns = (slowest < 0.0) & (fastest > 0.0) & (2.0 * spread * length > _DONE_PX)
         # as `crossings.may_reach`, without its division
@@ -134,7 +140,7 @@ STEP_FIELDS = 14
     R_SCALE_B,
     R_NEXT,
 ) = (STRIDE * k for k in range(24, 33))
-"""Of every pixel that fires: distances at both ends of the piece; rim distance of the last event
+"""Of every pixel that fires: distances at both ends of the segment; rim distance of the last event
 before; reference level; what an event adds to it; lane in the pixels' tile; slopes of time over
 distance at both ends; rim distance of the next event."""
 FIRE_FIELDS = 33
@@ -143,8 +149,8 @@ _TICK = float(1 << 25)  # a nanosecond in a packed event
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def begin_piece(fire, n, segment):  # type: ignore[no-untyped-def]
-    """What does not change from one threshold to the next: limits, and slopes at both ends."""
+def begin_segment(fire, n, segment):  # type: ignore[no-untyped-def]
+    """Set up what is the same for all thresholds: limits, and slopes at both ends."""
     a, b = segment.begin, segment.end
     for j in range(n):
         fire[R_LOW + j], fire[R_HIGH + j], fire[R_FINE + j] = a, b, segment.fine
@@ -173,19 +179,15 @@ def guess(fire, n, segment, pace):  # type: ignore[no-untyped-def]
     """First guesses of time, and of the step in which it lies.
 
     Args:
-        pace: one over the length of the piece's first step, 1/ns.
+        pace: one over the length of the segment's first step, 1/ns.
     """
     a, b, k0 = segment.begin, segment.end, segment.k0
     length, final = b - a, segment.k1 - 1.0
     for j in range(n):
         s = (fire[R_TARGET + j] - fire[R_BEGIN + j]) / (fire[R_END + j] - fire[R_BEGIN + j])
-        # a target that was met before the piece, by rounding, is met at its begin
+        # a target that was met before the segment, by rounding, is met at its begin
         s = s if s > 0.0 else 0.0
-        u = 1.0 - s
-        t = a + s * (
-            s * (3.0 - 2.0 * s) * length
-            + u * (u * fire[R_SCALE_A + j] - s * fire[R_SCALE_B + j])
-        )  # fmt: skip
+        t = a + time_between(s, length, fire[R_SCALE_A + j], fire[R_SCALE_B + j])
         t = min(max(t, a), b)
         fire[R_TIME + j] = t
         fire[R_STEP + j] = np.floor(min(k0 + (t - a) * pace, final))
@@ -214,7 +216,7 @@ def next_thresholds(fire, n, contrast, edge):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def pack_steps(n, since, inverse, curve, steps):  # type: ignore[no-untyped-def]
-    """What `fetch` needs of each step, side by side: `steps` (r, STEP_FIELDS), written."""
+    """Pack what `fetch` needs of each step: `steps` (r, STEP_FIELDS), written."""
     for k in range(n):
         steps[k, 0], steps[k, 1] = since[k], inverse[k]
         for c in range(12):
@@ -393,7 +395,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                     if tree[4 * begin, 0] == 0.0:
                         bound_rates(curve, begin, final, 4 * begin, tree)
                         tree[4 * begin, 0] = 1.0
-                    on, off, last, level, n = events_of_piece(
+                    on, off, last, level, n = events_of_segment(
                         tile[P_X + j], tile[P_Y + j], tile[P_ON + j],
                         tile[P_OFF + j], tile[P_LAST + j], tile[P_LEVEL + j],
                         tile[P_STEP + j], tile[P_BEGIN + j], segment, 4 * begin, begin, final,
@@ -418,7 +420,7 @@ def events_of_pixels(  # type: ignore[no-untyped-def]
                 firing += 1
             if firing == 0:
                 continue
-            begin_piece(fire, firing, segment)
+            begin_segment(fire, firing, segment)
             pace = inverse[segment.k0]
             while firing > 0:
                 guess(fire, firing, segment, pace)

@@ -1,4 +1,4 @@
-"""How an event camera hands its events over: the dead time of a pixel, and the scans of the array.
+"""Read-out of an event camera: the dead time of a pixel, and the scans of the array.
 
 The DVXplorer does not send an event when it happens: it scans its pixels, by default 5000 times a
 second. A scan begins with a hold of the whole array; what happens later waits for the next scan.
@@ -13,6 +13,9 @@ that scan. What it sees meanwhile is not lost from its reference level, as if it
 with a dead time of half a millisecond there is rarely more than one. Inside a scan, events are
 ordered as they are read: by column, then by row. A scan that is not complete when a stream stops
 is never read.
+
+Events are packed into one integer each, from the highest bit: time, column (12 bits), row (12
+bits), polarity (1 bit). They are sorted by radix, for a comparison sort costs more than the scene.
 """
 
 from __future__ import annotations
@@ -57,7 +60,7 @@ class Scans:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def bits_for(largest):  # type: ignore[no-untyped-def]
-    """How many bits hold the numbers 0 to `largest`."""
+    """Count the bits that hold the numbers 0 to `largest`."""
     n = 0
     while largest >> n > 0:
         n += 1

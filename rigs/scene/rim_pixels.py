@@ -1,30 +1,49 @@
-"""Which pixels have to be looked at in a block: a list of each marker's pixels, and a cheap test.
+"""Pixels that have to be looked at in a block: a list of each marker's pixels, and a cheap test.
 
 When a list is made, every pixel near the rim keeps the direction u to it, its distance rho and how
 far its next thresholds are. Once the marker has moved by D and grown by G, the pixel's distance
 from the rim has fallen by q = u.D - (u x D)^2 / (2 rho) + G, to third order in D / rho. So a block
 is one pass of a few single precision operations a pixel, without branches, over all that may fire,
 and what cannot fire costs nothing more. A marker that has moved by `REACH_PX` gets a new list.
-
-Lists of n markers with room for s pixels: `aim` (n, 5, s), float32: both components of u,
-1 / (2 rho), and what q must rise to and fall to (negated) for a positive and a negative event;
-`place` (n, s), int32: column << 12 | row; `origin` (n, 5): column, row and radius when the list was
-made, how many pixels there are (0: no list), and the least rho.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from sliplab.rigs.scene.edges import CUT, OFF, ON
 
 REACH_PX = 1.5
-"""How far a marker may move, and grow, before its list is made again."""
+"""Distance that a marker may move, and grow, before its list is made again."""
 UX, UY, BEND, RISE, FALL = 0, 1, 2, 3, 4
 _COUNT, _NEAREST = 3, 4
 _NEVER_PX = 1e6
 _SPARE_PX = np.float32(2e-6)  # rounding of single precision cannot hide a pixel
+
+
+class RimLists(NamedTuple):
+    """Lists of n markers with room for s pixels each."""
+
+    origin: npt.NDArray[np.float64]
+    """Column, row and radius when the list was made, how many pixels there are (0: no list), and
+    the least rho, (n, 5)."""
+    aim: npt.NDArray[np.float32]
+    """Both components of u, 1 / (2 rho), and what q must rise to and fall to (negated) for a
+    positive and a negative event, (n, 5, s)."""
+    place: npt.NDArray[np.int32]
+    """Column << 12 | row, (n, s)."""
+
+
+def no_lists(markers: int, slots: int) -> RimLists:
+    """Room for lists, none of which is made yet."""
+    return RimLists(
+        np.zeros((markers, 5)), np.empty((markers, 5, slots), np.float32),
+        np.empty((markers, slots), np.int32),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -57,7 +76,7 @@ def near_rim(column, row, radius, band, height, width, pixels):  # type: ignore[
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def thresholds(gap, on, off, reach):  # type: ignore[no-untyped-def]
-    """How far a pixel's distance must fall for a positive, and rise for a negative event, px.
+    """Distance by which a pixel must fall for a positive, and rise for a negative event, px.
 
     Outside the edge (`reach`) the pixel may be another marker's: then only the way to it counts.
     """
@@ -107,7 +126,7 @@ def make_list(i, column, row, radius, state, edge, pixels, origin, aim, place): 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def reaches(i, column, row, radius, strays, origin):  # type: ignore[no-untyped-def]
-    """Whether marker i's list still holds if it strays so far from (column, row, radius), px."""
+    """Tell if marker i's list still holds if it strays so far from (column, row, radius), px."""
     dx, dy = column - origin[i, 0], row - origin[i, 1]
     moved = np.sqrt(dx * dx + dy * dy) + abs(radius - origin[i, 2])
     return origin[i, _COUNT] > 0.0 and moved + strays <= REACH_PX

@@ -24,7 +24,7 @@ half the integral of the squared slope of its cubic shape."""
 
 @dataclass(frozen=True)
 class SkinGeometry:
-    """What a skin is made as. Lengths mm, modulus MPa (N/mm2), base stiffnesses N/m.
+    """Design of a skin. Lengths mm, modulus MPa (N/mm2), base stiffnesses N/m.
 
     A base stiffness of None is a rigid base.
     """
@@ -50,7 +50,7 @@ class Skin:
     layout_mm: F64
     """Places in the sensor's plane, shape (n, 2)."""
     gap_mm: F64
-    """How much deeper than the highest tip the sensor must go to touch, shape (n,)."""
+    """Depth at which each tip touches, over that of the highest one, shape (n,)."""
     ring: I64
     """Layer, 0 is the centre, shape (n,)."""
     height_mm: F64

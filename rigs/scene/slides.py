@@ -24,7 +24,7 @@ HOLD_STEPS = 1
 
 @dataclass(frozen=True)
 class SlideRun:
-    """What one slide left; rows from the start of the slide on.
+    """Result of one slide; rows from the start of the slide on.
 
     Attributes:
         t_ns: row times after the start of the slide, (m,); the first is 0.

@@ -1,11 +1,16 @@
-"""The slip of a tip in one step: how far along its direction, with friction by the slip.
+"""Equations of one papilla: its bend and forces as a column, and the slip of its tip in a step.
 
-The unknowns are the slip and the bend, the equations that spring and base together are as long as
-the stretch that is left, and that the force lies on the friction cone at the end of the slip. One
-Newton step for both, shared by the tip that is computed alone (`rigs.scene.contact`) and by those
-computed side by side (`rigs.scene.contact`), so that both give the same bits. No branches,
-for the latter. Where it does not get there, because friction has a kink at rest or falls more
-steeply than the spring pulls, `march_to_slip` does, slowly.
+A papilla is a bent and compressed column on a soft base. Large deflection comes from one potential,
+so that it cannot create energy: with the bend b, the papilla is compressed by
+c = depth - 0.6 b^2 / h, and N = k_n c, T = b (k_b - 1.2 N / h). The second term is the softening of
+an axially loaded column, which buckles at 10 E I / h^2 (exact: pi^2 E I / h^2); the stiffness left
+is clamped at 5 % of k_b.
+
+The unknowns of a slip are its length and the bend, the equations that spring and base together are
+as long as the stretch that is left, and that the force lies on the friction cone at the end of the
+slip. What `rigs.scene.contact` computes for many tips at once has no branches. Where Newton's
+method does not get there, because friction has a kink at rest or falls more steeply than the spring
+pulls, `march_to_slip` does, slowly.
 
 All vectors are split along the slip and across it; across it the tip does not move.
 """
@@ -342,7 +347,7 @@ def column(bent, bending, shortening, pressed, pressing):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def first_bend(stretch, guess, bending, shortening, compliance):  # type: ignore[no-untyped-def]
-    """Where the search for a bend begins: its solution, if the papilla is not shortened."""
+    """Begin of the search for a bend: its solution, if the papilla is not shortened."""
     straight = stretch / (1.0 + compliance * bending)
     return straight if shortening == 0.0 else min(guess, stretch)
 

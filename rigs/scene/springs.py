@@ -1,4 +1,4 @@
-"""What the contact solver works on: each papilla's constants, its state, and the level of physics.
+"""Constants and state of the papillae, and the levels of physics, for the contact solver.
 
 A scene should hold what it needs and nothing more, so the physics come in levels:
 
@@ -35,7 +35,7 @@ LAYOUT_X, LAYOUT_Y, GAP, ALONG, BENDING, COMPLIANCE, ACROSS, SHORTER = range(8)
 
 
 class Law(NamedTuple):
-    """What all papillae have in common."""
+    """Parameters that all papillae have in common."""
 
     static_excess: float
     """Static over kinetic friction, less one."""
@@ -53,7 +53,7 @@ class Law(NamedTuple):
 
 @dataclass(frozen=True)
 class Springs:
-    """What does not change during a trial; n papillae."""
+    """Constants of n papillae during a trial."""
 
     table: F64
     """A row each: place in the sensor's plane (x, y, mm); indentation at which the tip touches
@@ -130,7 +130,7 @@ class Tips:
 
     @property
     def slipped_s(self) -> F64:
-        """When the tip last went from stick to slip, s, located in its step; NaN: never, (n,)."""
+        """Time of the last change from stick to slip, s, located in its step; NaN: never, (n,)."""
         return self.state[:, SLIPPED]
 
     @property

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplab.rigs.scene.edges import CUT, level_at, rim_of
-from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor, _empty_lists
+from sliplab.rigs.scene.events import EventOptics, Events, MarkerSensor
+from sliplab.rigs.scene.rim_pixels import no_lists
 
 STEP_NS = 1_000_000
 ONE = np.zeros((1, 2))
@@ -227,7 +228,7 @@ def test_lists_of_pixels_change_no_event(slots: int) -> None:
     loads = winding(optics, layout, 960, 3, 2e-3)
     whole = sense(sensor, loads)
     sensor.reset(loads[0], 1)
-    sensor._lists = _empty_lists(2, slots)
+    sensor._lists = no_lists(2, slots)
     again = sensor.sense(loads, times(961))
     assert len(whole[0]) > 5000
     assert all(np.array_equal(a, b) for a, b in zip(whole, again, strict=True))

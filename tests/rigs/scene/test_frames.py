@@ -6,11 +6,11 @@ from scipy.integrate import quad
 
 from sliplab.analysis.labels.plate import PlateTracker
 from sliplab.rigs.scene.frames import (
+    ExposurePath,
     Exposures,
     FrameOptics,
     PlateView,
     Reflections,
-    Way,
     draw_reflections,
     expose,
     moved,
@@ -24,7 +24,7 @@ HALF = 0.5 * (SIZE - 1)
 
 def draw(
     optics: FrameOptics, tips: np.ndarray, plate: float | None = None, number: int = 0,
-    size: tuple[int, int] = (SIZE, SIZE), seed: int = 1, way: Way | None = None,
+    size: tuple[int, int] = (SIZE, SIZE), seed: int = 1, way: ExposurePath | None = None,
 ) -> np.ndarray:  # fmt: skip
     image = np.full((1, size[1], size[0]), 77, np.uint8)
     height = None if plate is None else np.array([plate])
@@ -89,7 +89,11 @@ def test_a_picture_does_not_depend_on_what_is_drawn_with_it() -> None:
     optics, rng = FrameOptics(), np.random.default_rng(1)
     tips = SKIN.layout_mm + rng.normal(0.0, 0.2, (5, len(SKIN), 2))
     heights, number = np.linspace(0.0, -2.0, 5), np.arange(5)
-    way = {3: Way(tips[3] + np.linspace(-0.1, 0.1, 9)[:, None, None], heights[3] + np.zeros(9))}
+    way = {
+        3: ExposurePath(
+            tips[3] + np.linspace(-0.1, 0.1, 9)[:, None, None], heights[3] + np.zeros(9)
+        )
+    }
     whole = np.empty((5, SIZE, SIZE), np.uint8)
     PlateView(optics, SIZE, SIZE).draw(whole, tips, heights, number, 1, way)
     for k in range(5):
@@ -105,7 +109,7 @@ def test_discs_may_leave_the_picture_even_smeared() -> None:
     assert image.max() < 210
     assert image.min() > 15
     path = tips + np.linspace(-1.0, 1.0, 41)[:, None, None]
-    smeared = draw(optics, tips, way=Way(path, np.zeros(41)))
+    smeared = draw(optics, tips, way=ExposurePath(path, np.zeros(41)))
     assert smeared.max() < 215
     assert smeared.min() > 15
 
@@ -120,7 +124,7 @@ def test_a_smeared_disc_is_the_mean_of_sharp_ones(length_px: float, angle: float
     shares = (np.arange(count) + 0.5) / count
     path = start + shares[:, None, None] * along
     size = (96, 96)
-    drawn = draw(optics, path.mean(axis=0), size=size, way=Way(path, np.zeros(count)))
+    drawn = draw(optics, path.mean(axis=0), size=size, way=ExposurePath(path, np.zeros(count)))
     # brute force: 64 whole pictures, summed
     total = np.zeros(size)
     for share in (np.arange(64) + 0.5) / 64:
@@ -137,7 +141,7 @@ def test_a_smeared_plate_marker_is_the_mean_of_sharp_ones() -> None:
     optics = FrameOptics(noise=0.0)
     nothing = np.empty((0, 2))
     heights = -3.0 - (np.arange(112) + 0.5) / 112 * 1.4
-    way = Way(np.empty((112, 0, 2)), heights)
+    way = ExposurePath(np.empty((112, 0, 2)), heights)
     drawn = draw(optics, nothing, heights.mean(), way=way)
     total = np.zeros((SIZE, SIZE))
     for share in (np.arange(64) + 0.5) / 64:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numba import njit
 from scipy.optimize import brentq
 
-from sliplab.rigs.scene.crossings import events_of_piece
+from sliplab.rigs.scene.crossings import events_of_segment
 from sliplab.rigs.scene.edges import CUT, dark_pixels, rim_of, see_discs
 from sliplab.rigs.scene.marker_path import (
     SEGMENT,
@@ -136,7 +136,7 @@ def search_all(  # type: ignore[no-untyped-def]
                 begin = int(first[segment.block])
                 gap = np.hypot(x - segment.x0, y - segment.y0) - segment.r0
                 head = int(segment.zero) << 25 | x << 13 | y << 1
-                on, off, last_one, level, n = events_of_piece(
+                on, off, last_one, level, n = events_of_segment(
                     float(x), float(y), on, off, last_one, level, threshold[y, x], gap, segment,
                     4 * begin, begin, begin + STEPS, since, until, inverse, curve, tree, CONTRAST,
                     EDGE, head, stack, out, n,
