@@ -16,14 +16,19 @@ from typing import Any
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.networks.models import Model, choose_model, training_settings, wanted_models
 from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.sweeps.generalisation import TrialSamples, markdown, scored, train_without
 from sliplab.analysis.sweeps.runner import Json, ResultFile, Task, task_sweep
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.learning.evaluate import choose_model
-from sliplab.flows.learning.samples import TrialRef, by_id, load_samples, several, split_trials
-from sliplab.flows.learning.train import Model, training_settings, wanted_models
+from sliplab.analysis.windows.sample_sets import (
+    TrialRef,
+    by_id,
+    load_samples,
+    several,
+    split_trials,
+)
 from sliplab.flows.other_rig import other_request, retake
 from sliplab.flows.running import console
 from sliplab.protocols.errors import InputError

@@ -15,16 +15,16 @@ from importlib.metadata import version
 from typing import Any
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.evaluation.trials import summaries
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.sweeps.runner import Task, sample_trials, task_sweep
 from sliplab.analysis.windows import dataset
-from sliplab.flows.learning.evaluate import choose_model, evaluation_of
-from sliplab.flows.learning.samples import several
-from sliplab.flows.learning.train import wanted_models
-from sliplab.flows.learning.trial_scores import summaries
+from sliplab.analysis.windows.sample_sets import several
 from sliplab.flows.other_rig import judge, other_request, retake
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.running import console

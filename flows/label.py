@@ -16,8 +16,9 @@ from sliplab.analysis.campaigns import Collected, collected
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.labels.label_errors import CHECK, rules_compared
 from sliplab.analysis.labels.reviewed import Labels, State, label_key
+from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
-from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
+from sliplab.flows.running.parallel_map import run_trials
 from sliplab.protocols.yaml_file import mask_secrets, parse_yaml
 from sliplab.rigs.rig_inheritance import rig_yaml
 from sliplab.storage.files import write_text

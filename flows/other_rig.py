@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.evaluation.trials import score_row
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.windows import dataset
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
-from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.learning.trial_scores import score_row
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.protocols.settings import Detection
 from sliplab.protocols.yaml_file import parse_yaml, read_text
@@ -88,7 +88,7 @@ class Judged:
     Attributes:
         counts: spikes of each class in each sample, int64 (n, 3).
         samples: of the kinematic test trials.
-        trials: a row of `flows.learning.trial_scores.score_row` for each, and its recording.
+        trials: a row of `analysis.evaluation.trials.score_row` for each, and its recording.
     """
 
     counts: npt.NDArray[np.int64]

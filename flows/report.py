@@ -12,8 +12,14 @@ from typing import Any
 from prefect import flow
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.detectors.predictions import trial_counts
+from sliplab.analysis.evaluation import baselines as window_baselines
+from sliplab.analysis.evaluation import networks as other_networks
+from sliplab.analysis.evaluation import windows as window_scores
+from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.labels import label_errors
 from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import choose_model, training_settings, wanted_models
 from sliplab.analysis.report import against as comparison
 from sliplab.analysis.report import report as content
 from sliplab.analysis.report.clocks import PAGE as CLOCKS
@@ -21,8 +27,6 @@ from sliplab.analysis.report.page import write_figures
 from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.report.summary import Sources, make_summary
 from sliplab.analysis.report.trial import choose_example
-from sliplab.flows.learning import evaluate, other_networks, window_baselines, window_scores
-from sliplab.flows.learning.train import training_settings, wanted_models
 from sliplab.flows.planning.estimate import plan_bytes
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.run_records import step_seconds, timed
@@ -58,7 +62,7 @@ def report(store: Store, campaigns: list[Collected]) -> dict[str, Any]:
 
 def _key(store: Store, campaigns: list[Collected]) -> str:
     """Return the key of all that the report is made of."""
-    evaluation = evaluate.evaluation_of(store)
+    evaluation = evaluation_of(store)
     collected = [
         [
             item.name,
@@ -103,7 +107,7 @@ def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
 
 def _sources(store: Store, campaigns: list[Collected]) -> Sources:
     """Read what earlier steps kept."""
-    evaluation = evaluate.evaluation_of(store)
+    evaluation = evaluation_of(store)
     return Sources(
         store,
         campaigns,
@@ -131,13 +135,13 @@ def _shown(sources: Sources) -> content.Shown:
     """Read what the page shows beside the summary's numbers."""
     store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
     models = wanted_models(store, campaigns, evaluation.reviewed is not None)
-    model = evaluate.choose_model(models)
+    model = choose_model(models)
     example = choose_example(campaigns, evaluation.trials)
     counts: dict[str, Any] = {}
     if example is not None:
         rule = evaluation.detection[example.item.name]
         trial = example.recording.trial_id
-        counts = evaluate.trial_counts(store, example.item.name, trial, rule)
+        counts = trial_counts(store, example.item.name, trial, rule)
     return content.Shown(
         model_file.load(model.path),
         None if example is None else (example, counts),

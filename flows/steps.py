@@ -11,11 +11,11 @@ from sliplab.flows.running import console
 STEPS = {
     "sync": "sliplab.flows.sync",
     "label": "sliplab.flows.label",
-    "train": "sliplab.flows.learning.train",
-    "evaluate": "sliplab.flows.learning.evaluate",
-    "judge_model": "sliplab.flows.learning.other_networks",
-    "window_baselines": "sliplab.flows.learning.window_baselines",
-    "window_checks": "sliplab.flows.learning.window_checks",
+    "train": "sliplab.flows.train",
+    "evaluate": "sliplab.flows.evaluate",
+    "judge_model": "sliplab.flows.evaluate",
+    "window_baselines": "sliplab.flows.evaluate",
+    "window_checks": "sliplab.flows.evaluate",
     "report": "sliplab.flows.report",
 }
 """The module of each step; its function has the step's name."""

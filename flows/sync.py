@@ -17,8 +17,9 @@ from sliplab.analysis.clocks.refit import fit_again, sync_key
 from sliplab.analysis.report.clock_page import render
 from sliplab.analysis.report.clock_trials import TrialClocks, campaign_clocks, read_trials
 from sliplab.analysis.report.clocks import PAGE
+from sliplab.analysis.trial_work import TrialWork, stale_trials
 from sliplab.flows.running import console
-from sliplab.flows.running.parallel_map import TrialWork, run_trials, stale_trials
+from sliplab.flows.running.parallel_map import run_trials
 from sliplab.storage.files import write_text
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import SYNC, Store

@@ -141,7 +141,7 @@ def export_model(
         raise InputError("--store", "", None, f"is needed: {model} lies in no store")
     opened = open_store(folder)
     prepare_store(folder)
-    from sliplab.flows.learning.model_export import export_model as run
+    from sliplab.flows.export_model import export_model as run
 
     result = run(model, fitted, out, opened, campaign, onnx=onnx, checked=windows)
     for warning in (*result["warnings"], *result["problems"]):

@@ -21,6 +21,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.settings import PREFECT_API_URL
 
+from sliplab.analysis.trial_work import Make, TrialWork
 from sliplab.flows.running import console, stopping
 from sliplab.flows.running.orchestration import Opaque, Pickled, run
 from sliplab.flows.running.run_records import timed
@@ -143,19 +144,6 @@ def _remote_chunk(payload: Pickled[tuple[Piece, Sequence[Any], dict[str, str]]])
 START_S = 3.0
 """Work goes on in this process for so long before others are started, which takes as long: what is
 short is done by then, and what is long takes two starts at the most."""
-Make = Callable[[Recording, Any], Any]
-"""Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
-module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
-
-
-@dataclass(frozen=True)
-class TrialWork:
-    """One result that is wanted of one trial, with the key it must have."""
-
-    recording: Recording
-    campaign: str
-    key: str
-    settings: Any = None
 
 
 @dataclass(frozen=True)
@@ -191,15 +179,6 @@ class _Job:
     clocks: SyncResult | None
     make: Make
     settings: Any
-
-
-def stale_trials(store: Store, step: str, wanted: list[TrialWork]) -> list[TrialWork]:
-    """Those of `wanted` that have to be made."""
-    return [
-        work
-        for work in wanted
-        if not Derived.of(store, step, work.campaign).fresh(work.recording.folder.name, work.key)
-    ]
 
 
 def run_trials(

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps import generalisation
 from sliplab.analysis.sweeps.generalisation import markdown
 from sliplab.analysis.sweeps.runner import Json, Task, task_sweep
 from sliplab.flows import other_rig
 from sliplab.flows.generalise import Generalisation, measure_generalisation
-from sliplab.flows.learning.evaluate import choose_model
-from sliplab.flows.learning.train import wanted_models
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.report.holdout import holdout_part, holdout_rows
 from sliplab.flows import generalise, holdout
 from sliplab.flows.holdout import PROTOCOL_SEED, SKIN_SEED, Holdout, measure_holdout
 from sliplab.flows.label import label
-from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.evaluation import evaluation_of
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.report import campaign, programs
 from sliplab.analysis.report.against import compare
@@ -32,7 +33,6 @@ from sliplab.analysis.report.tradeoff_scene import ERRORS
 from sliplab.analysis.sweeps.scene_windows import PHASES
 from sliplab.flows.collect import collect
 from sliplab.flows.label import label
-from sliplab.flows.learning.evaluate import evaluation_of
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import read_summary, report
 from sliplab.flows.study import Outcome

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.analysis.evaluation import evaluation as evaluate
 from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.networks import models as train
 from sliplab.flows.label import report_states
-from sliplab.flows.learning import evaluate, train
 from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
 from sliplab.protocols.errors import InputError
 from sliplab.storage.errors import StoreError

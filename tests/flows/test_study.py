@@ -13,23 +13,24 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected, training_campaigns
+from sliplab.analysis.evaluation import baselines as window_baselines
 from sliplab.analysis.labels.label_errors import read_check
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics.classification import CLASSES
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
 from sliplab.analysis.windows.dataset import recorded_span
+from sliplab.analysis.windows.sample_sets import by_id, load_samples, split_trials
+from sliplab.flows import evaluate as evaluate_flows
 from sliplab.flows.collect import collect
+from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import check_folder, check_labels, check_wanted
-from sliplab.flows.learning import window_baselines, window_checks
-from sliplab.flows.learning.evaluate import evaluate
-from sliplab.flows.learning.samples import by_id, load_samples, split_trials
-from sliplab.flows.learning.train import train
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import report
 from sliplab.flows.running import parallel_map
 from sliplab.flows.running.extras import lacking
 from sliplab.flows.study import Outcome, study
+from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
 from sliplab.storage.files import write_bytes
 from sliplab.storage.trials.derived import Derived
@@ -225,9 +226,9 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
     store = store_of(ran)
     campaigns = collected(store)
     monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1, "cnn_frame": 1})
-    first = window_baselines.window_baselines(store, campaigns)
+    first = evaluate_flows.window_baselines(store, campaigns)
     assert (first["done"], first["fresh"]) == (2, 0)
-    assert window_baselines.window_baselines(store, campaigns)["done"] == 0
+    assert evaluate_flows.window_baselines(store, campaigns)["done"] == 0
     assert report(store, campaigns)["done"] == 1
     kinematic = summary_json(store)["kinematic"]
     for name, share in first["argmax"].items():
@@ -245,7 +246,7 @@ def test_a_device_that_is_not_there_is_a_wrong_input(
     ran: tuple[list[RunRequest], Outcome], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = store_of(ran)
-    monkeypatch.setattr("sliplab.flows.learning.train.Model.fresh", False)
+    monkeypatch.setattr("sliplab.analysis.networks.models.Model.fresh", False)
     monkeypatch.setattr("sliplab.analysis.networks.gradients.devices", lambda: ["cuda", "cuda:0"])
     with pytest.raises(
         InputError,
@@ -260,12 +261,12 @@ def test_a_check_that_fails_ends_the_command(
     store = store_of(ran)
     campaigns = collected(store)
     fair = Chance((0.3, 0.36), 0.2, 0.45, 0.8, 0.999)
-    monkeypatch.setattr(window_checks, "shuffled_chance", lambda *_: fair)
-    assert window_checks.window_checks(store, campaigns)["orders"] == 6
+    monkeypatch.setattr(evaluate_flows, "shuffled_chance", lambda *_: fair)
+    assert evaluate_flows.window_checks(store, campaigns)["orders"] == 6
     leak = Chance((0.9, 0.91), 0.85, 0.95, 0.92, 0.999)
-    monkeypatch.setattr(window_checks, "shuffled_chance", lambda *_: leak)
+    monkeypatch.setattr(evaluate_flows, "shuffled_chance", lambda *_: leak)
     with pytest.raises(StoreError, match="shuffled labels"):
-        window_checks.window_checks(store, campaigns)
+        evaluate_flows.window_checks(store, campaigns)
 
 
 def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outcome]) -> None:
@@ -381,7 +382,7 @@ def test_a_training_that_was_killed_goes_on_to_the_same_model(
         raise _Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("sliplab.flows.learning.train.write_bytes", write_and_die)
+        patched.setattr("sliplab.flows.train.write_bytes", write_and_die)
         with pytest.raises(_Killed):
             train(store, collected(store))
     assert len(list(models.glob("*.state"))) == 1
@@ -409,9 +410,10 @@ def test_the_model_goes_out_as_what_it_is(
     ran: tuple[list[RunRequest], Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="ONNX is not installed (sliplab[onnx])")
+    from sliplab.analysis.evaluation.export import ExportFailed
     from sliplab.analysis.networks import onnx_file
     from sliplab.flows.detect import load_model
-    from sliplab.flows.learning.model_export import ExportFailed, export_model
+    from sliplab.flows.export_model import export_model
 
     store = store_of(ran)
     model = store.folder / "models" / "seed0.pt"

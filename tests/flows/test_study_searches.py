@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from sliplab.analysis.evaluation import baselines as window_baselines
 from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.flows import study as chain
 from sliplab.flows.generalise import measure_generalisation
-from sliplab.flows.learning import window_baselines
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome, expected, searches, study
 from sliplab.protocols.errors import InputError

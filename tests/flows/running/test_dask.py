@@ -19,13 +19,13 @@ import distributed
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
-from sliplab.flows.learning.evaluate import evaluate
-from sliplab.flows.learning.train import train
 from sliplab.flows.running import cluster as clusters
 from sliplab.flows.running import parallel_map, stopping
 from sliplab.flows.running.cluster import Cluster, ClusterError, connected
 from sliplab.flows.tradeoff_scene import everywhere
+from sliplab.flows.train import train
 from sliplab.protocols.errors import InputError
 from sliplab.storage.remote.mirror import open_mirror
 from sliplab.storage.remote.objects import Remote

@@ -1,8 +1,7 @@
 """Other networks on the store's test trials: the preset that `also` names, and models of files.
 
 They are judged by the very functions that judge the store's own network, on the same windows and
-trials, and by the rule in spikes of their own outputs. What comes of it stands in a column of the
-report beside the others.
+trials, and by the rule in spikes of their own outputs.
 """
 
 from __future__ import annotations
@@ -11,47 +10,35 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from prefect import flow
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.evaluation import windows as window_scores
+from sliplab.analysis.evaluation.trials import score_row, summaries
+from sliplab.analysis.evaluation.windows import intervals_of
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import window_groups
 from sliplab.analysis.networks import model_file, training
 from sliplab.analysis.networks.external_model import Description, ExternalModel, load_external
+from sliplab.analysis.networks.models import training_settings
 from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.spiking import Engine
+from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
 from sliplab.analysis.windows.sparse import SparseWindows
-from sliplab.flows.label import report_states
-from sliplab.flows.learning import window_scores
-from sliplab.flows.learning.train import comparison_models, rules_of, training_settings
-from sliplab.flows.learning.trial_scores import score_row, summaries
-from sliplab.flows.learning.window_scores import intervals_of
-from sliplab.flows.running import console
-from sliplab.flows.running.orchestration import Opaque, run
-from sliplab.flows.running.parallel_map import TrialWork, keep_trials, stale_trials
-from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.hashing import hash_data, hash_integer
 from sliplab.protocols.settings import Detection, Samples, Windows
-from sliplab.storage.schema.evaluation import (
-    OtherEvaluation,
-    OtherWindowScores,
-    TrialScore,
-)
+from sliplab.storage.schema.evaluation import OtherEvaluation, OtherWindowScores, TrialScore
 from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store, StoreError
-
-if TYPE_CHECKING:
-    from sliplab.flows.running.cluster import Cluster
 
 STEP = "other_networks"
 VERSION = 1
@@ -163,7 +150,6 @@ class Judgement:
     network: OtherNetwork
     rules: dict[str, Detection]
     about: Json
-    cluster: Cluster | None = None
 
     @property
     def data_key(self) -> str:
@@ -180,12 +166,36 @@ class Judgement:
             [network.key, self.data_key, network.title, self.about, window_scores.VERSION], rules,
         )  # fmt: skip
 
-    def run(self) -> bool:
-        """Compute it if anything changed; whether it did."""
-        stale = not Derived.of(self.store, STEP).fresh(self.network.name, self.key)
-        if stale:
-            run(_flow, Opaque(self), self.cluster)
-        return stale
+    @property
+    def fresh(self) -> bool:
+        """True where nothing changed since it was judged."""
+        return Derived.of(self.store, STEP).fresh(self.network.name, self.key)
+
+    def count(self, keep: KeepTrials, threads: int | None = None) -> None:
+        """Count spikes of every test trial.
+
+        Args:
+            keep: makes the stale ones and keeps each; threads: of the network, None for all.
+        """
+        network = self.network
+        kinematic = {item.name for item in training_campaigns(self.campaigns)}
+        samples = training_settings(self.campaigns).samples
+        work = []
+        for item in self.campaigns:
+            stride = self.rules[item.name].stride_ms or network.windows.length_ms
+            for trial, recording in item.of_split("test"):
+                label = self.labels.read(item, recording) if item.name in kinematic else None
+                key = make_key(
+                    STEP, VERSION,
+                    [network.key, recording.checksum, self.labels.key(item, recording)],
+                    [network.windows.model_dump(mode="json"), samples.model_dump(), stride],
+                )  # fmt: skip
+                seed = hash_integer("samples", trial.id)
+                judging = _Judging(network, label, samples, seed, stride, threads)
+                work.append(TrialWork(recording, item.name, key, judging))
+        step = _counts_step(network)
+        if stale := stale_trials(self.store, step, work):
+            keep(step, stale, _count)
 
 
 def data_key(labels: Labels, campaigns: list[Collected]) -> str:
@@ -203,101 +213,6 @@ def data_key(labels: Labels, campaigns: list[Collected]) -> str:
     return make_key(STEP, VERSION, inputs, training_settings(campaigns).samples.model_dump())
 
 
-def judge_model(
-    store: Store,
-    campaigns: list[Collected],
-    model: Path,
-    engine: Engines | None = None,
-    margin: float | None = None,
-    smoothing: int | None = None,
-    cluster: Cluster | None = None,
-    reviewed: bool = False,
-) -> Json:
-    """Judge a model of a file on the test trials; what came of it, for people and programs.
-
-    Args:
-        model, engine: see `network_of`.
-        margin, smoothing: instead of the protocols' own.
-        reviewed: people's decisions are applied to the labels.
-
-    Raises:
-        InputError: the model; the message says what would be right.
-        StoreError: a trial has no label yet.
-    """
-    network = network_of(model, engine)
-    change: Json = {"choose": "protocol", "compare": None, "margin": margin, "smoothing": smoothing}
-    change = {k: v for k, v in change.items() if v is not None or k == "compare"}
-    rules = {
-        name: Detection.model_validate({**rule.model_dump(), **change})
-        for name, rule in rules_of(campaigns, network.outputs_per_class).items()
-    }
-    labels = Labels(store, reviewed)
-    about = {"preset": None, "seed": None}
-    judgement = Judgement(store, campaigns, labels, network, rules, about, cluster)
-    if network.engine == "fast" and not network.exact:
-        console.say(
-            f"warning: {network.title}: its weights are off the grid, where the fast engine's "
-            "counts may differ from Sinabs' in a few windows; --engine sinabs gives Sinabs' own"
-        )
-    done = judgement.run()
-    found = Derived.of(store, STEP).load(network.name, OtherEvaluation)
-    kinematic = found.experiments["kinematic"]
-    return {
-        "step": "evaluate",
-        "done": int(done),
-        "fresh": int(not done),
-        "model": network.title,
-        "engine": network.engine,
-        "same_as_sinabs": network.exact or network.engine == "sinabs",
-        "simulated": store.simulated,
-        "margin": {name: rule.margin for name, rule in rules.items()},
-        "accuracy": found.windows.accuracy.to_json(),
-        "interval": found.windows.interval.to_json(),
-        "latency_ms": kinematic.latency_ms.to_json(),
-        "lead_ms": {
-            name: scores.lead_ms.to_json()
-            for name, scores in found.experiments.items()
-            if name != "kinematic"
-        },
-        **report_states(labels, campaigns),
-    }
-
-
-def evaluate_comparison(
-    store: Store,
-    campaigns: list[Collected],
-    cluster: Cluster | None = None,
-    reviewed: bool = False,
-) -> bool:
-    """Judge the network that `analysis.also` asks for; whether there was anything to do.
-
-    Raises:
-        StoreError: it is missing or stale.
-    """
-    done = False
-    for model in comparison_models(store, campaigns, reviewed):
-        if not model.fresh:
-            raise StoreError(f"{model.path}: is missing or stale; run `sliplab train` first")
-        settings = model.settings
-        own = settings.network.outputs_per_class
-        network = OtherNetwork(
-            f"preset-{settings.preset}", f"preset: {settings.preset}", model.path.read_bytes(),
-            None, settings.windows, own, "fast", exact=True,
-        )  # fmt: skip
-        rules = {
-            item.name: settings.detection.model_copy(
-                update={"false_early_ms": item.settings.detection.false_early_ms}
-            )
-            for item in campaigns
-        }
-        about = {"preset": settings.preset, "seed": model.seed}
-        judgement = Judgement(
-            store, campaigns, Labels(store, reviewed), network, rules, about, cluster
-        )
-        done |= judgement.run()
-    return done
-
-
 def kept(
     store: Store, campaigns: list[Collected], reviewed: bool = False
 ) -> dict[str, OtherEvaluation]:
@@ -309,38 +224,6 @@ def kept(
         if folder.read(path.stem).get("data_key") == wanted:
             found[path.stem] = folder.load(path.stem, OtherEvaluation)
     return found
-
-
-@flow(name="judge a network", validate_parameters=False, persist_result=False)
-def _flow(wanted: Opaque[Judgement]) -> None:
-    """Count spikes of every test trial, then score."""
-    job = wanted.content
-    with timed(job.store, "evaluate"):
-        _count_all(job)
-        _score(job)
-
-
-def _count_all(job: Judgement) -> None:
-    network, kinematic = job.network, {item.name for item in training_campaigns(job.campaigns)}
-    samples = training_settings(job.campaigns).samples
-    work = []
-    for item in job.campaigns:
-        stride = job.rules[item.name].stride_ms or network.windows.length_ms
-        for trial, recording in item.of_split("test"):
-            label = job.labels.read(item, recording) if item.name in kinematic else None
-            key = make_key(
-                STEP, VERSION, [network.key, recording.checksum, job.labels.key(item, recording)],
-                [network.windows.model_dump(mode="json"), samples.model_dump(), stride],
-            )  # fmt: skip
-            judging = _Judging(
-                network, label, samples, hash_integer("samples", trial.id), stride,
-                None if job.cluster is None else 1,
-            )  # fmt: skip
-            work.append(TrialWork(recording, item.name, key, judging))
-    step = _counts_step(network)
-    stale = stale_trials(job.store, step, work)
-    if stale:
-        keep_trials(job.store, step, "evaluate", stale, _count, job.cluster, processes=False)
 
 
 def _counts_step(network: OtherNetwork) -> str:
@@ -387,7 +270,7 @@ def _counter(
     return lambda x: sinabs.counts(x.dense())
 
 
-def _score(job: Judgement) -> None:
+def score_network(job: Judgement) -> None:
     """Windows, detections and latencies, kept as one result."""
     network = job.network
     rows: list[TrialScore] = []

@@ -1,4 +1,4 @@
-"""Which trials detectors learn from, are set by and are judged on, found before any is read."""
+"""The trials that detectors learn from, are set by and are judged on, found before any is read."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
+from sliplab.analysis.detectors.predictions import Wanted, predictions, want
 from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing
 from sliplab.analysis.labels.reviewed import Labels
-from sliplab.flows.learning.detector_trials import Wanted, predictions, want
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.schema.evaluation import Choice, DetectorComparison
 from sliplab.storage.trials.recording import Recording

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.evaluation.windows import kept_counts
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.windows.dataset import TrialId
+from sliplab.analysis.windows.sample_sets import load_samples, split_trials
 from sliplab.flows.collect import collect
+from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import label
-from sliplab.flows.learning.evaluate import evaluate, evaluation_of
-from sliplab.flows.learning.samples import load_samples, split_trials
-from sliplab.flows.learning.train import train
-from sliplab.flows.learning.window_scores import kept_counts
 from sliplab.flows.planning.run_request import make_request
+from sliplab.flows.train import train
 from sliplab.storage.trials.review import Onsets, decide
 from sliplab.storage.trials.store import Store
 from tests.flows.conftest import tiny, write

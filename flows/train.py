@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from prefect import flow, task
@@ -16,143 +15,24 @@ from prefect.cache_policies import NO_CACHE
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import gradients, model_file, training
+from sliplab.analysis.networks.models import Model, begun, comparison_models, wanted_models
 from sliplab.analysis.networks.training import EpochRecord
 from sliplab.analysis.report.figures.windows import training_curves
-from sliplab.analysis.windows import dataset
+from sliplab.analysis.trial_work import Done, EachTrial, Make, TrialWork, in_order
 from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import report_states
-from sliplab.flows.learning.samples import load_samples
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.orchestration import Opaque, run
+from sliplab.flows.running.parallel_map import each_trial
 from sliplab.flows.running.run_records import timed
 from sliplab.protocols.errors import InputError
-from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
 from sliplab.storage.files import write_bytes, write_json, write_text
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
-from sliplab.storage.trials.derived import make_key
 from sliplab.storage.trials.store import Store, StoreError
 
 if TYPE_CHECKING:
     from sliplab.flows.running.cluster import Cluster
-
-
-@dataclass(frozen=True)
-class Model:
-    """A trained network on disk."""
-
-    seed: int
-    path: Path
-    key: str
-    settings: AnalysisSettings
-
-    @property
-    def title(self) -> str:
-        """``seed 0``, or ``paper-seed 0``."""
-        return self.path.stem.replace("seed", "seed ")
-
-    @property
-    def info_path(self) -> Path:
-        """The JSON beside the model file; written last, it decides."""
-        return self.path.with_suffix(".json")
-
-    @property
-    def info(self) -> TrainedModel:
-        """The document beside the model file.
-
-        Raises:
-            OSError: there is none.
-            DocumentError, NewerFormat: it cannot be read.
-        """
-        return TrainedModel.load(self.info_path)
-
-    @property
-    def state_path(self) -> Path:
-        """Where its training is kept after each epoch, to go on there after a stop."""
-        return self.path.with_suffix(f".{self.key[:16]}.state")
-
-    @property
-    def curves_path(self) -> Path:
-        """The training curves, drawn anew after each epoch."""
-        return self.path.with_suffix(".svg")
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the file was made with `key`."""
-        try:
-            return self.path.exists() and self.info.key == self.key
-        except (OSError, ValueError):
-            return False
-
-
-def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
-    """The settings that the network is made by: those of the first kinematic campaign."""
-    return training_campaigns(campaigns)[0].settings
-
-
-def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, Detection]:
-    """The rule of each campaign, in spikes of a network with so many output neurons a class."""
-    usual = MARGIN * outputs_per_class
-    margin = training_settings(campaigns).rule_for(outputs_per_class, usual).margin
-    return {item.name: item.settings.rule_for(outputs_per_class, margin) for item in campaigns}
-
-
-def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
-    """The models that the settings ask for, with the keys they must have.
-
-    Args:
-        reviewed: people's decisions are applied to the labels.
-
-    Raises:
-        StoreError: a trial has no fresh label yet.
-    """
-    return _models(store, campaigns, training_settings(campaigns), reviewed, "")
-
-
-def comparison_models(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> list[Model]:
-    """Models of the comparison network that `analysis.also` names; none without one."""
-    settings = training_settings(campaigns).comparison_settings()
-    if settings is None:
-        return []
-    return _models(store, campaigns, settings, reviewed, f"{settings.preset}-")
-
-
-def _models(
-    store: Store,
-    campaigns: list[Collected],
-    settings: AnalysisSettings,
-    reviewed: bool,
-    prefix: str,
-) -> list[Model]:
-    used = training_campaigns(campaigns)
-    inputs = []
-    labels = Labels(store, reviewed)
-    for item in used:
-        for trial, recording in item.trials:
-            if not labels.fresh(item, recording):
-                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
-            if trial.split in {"train", "validation"}:
-                key = labels.key(item, recording)
-                inputs.append([item.name, trial.id, trial.split, key])
-    parameters = {
-        name: getattr(settings, name).model_dump(mode="json")
-        for name in ("windows", "samples", "network")
-    }
-    if settings.network.biases:
-        del parameters["network"]["biases"]  # models of before it could be left out stay fresh
-    parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
-    models = []
-    for seed in settings.training.seeds:
-        key = make_key(
-            "train",
-            training.VERSION,
-            inputs,
-            {**parameters, "seed": seed, "dataset": dataset.VERSION},
-        )
-        path = store.folder / "models" / f"{prefix}seed{seed}.pt"
-        models.append(Model(seed, path, key, settings))
-    return models
 
 
 @task(name="train one seed", cache_policy=NO_CACHE, persist_result=False)
@@ -196,14 +76,6 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     return model.seed
 
 
-def begun(model: Model) -> bytes | None:
-    """Where a training of this model stopped; None where it never began."""
-    try:
-        return model.state_path.read_bytes()
-    except FileNotFoundError:
-        return None
-
-
 @flow(name="train", validate_parameters=False, persist_result=False)
 def train_flow(
     wanted: Opaque[tuple[Labels, list[Collected], list[Model], Cluster | None]],
@@ -212,8 +84,10 @@ def train_flow(
     labels, campaigns, models, cluster = wanted.content
     simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
     with timed(labels.store, "train"):
-        train = load_samples(labels, campaigns, "train", cluster)
-        validation = load_samples(labels, campaigns, "validation", cluster)
+        train, validation = (
+            load_samples(labels, campaigns, split, sample_maker(labels.store, split, cluster))
+            for split in ("train", "validation")
+        )
         for name, part in (("training", train), ("validation", validation)):
             if not len(part):
                 raise StoreError(f"there are no {name} samples; collect more trials")
@@ -321,3 +195,14 @@ class _Progress:
                 )
             )
             self._artifact = made.id
+
+
+def sample_maker(store: Store, split: str, cluster: Cluster | None) -> EachTrial:
+    """Return what makes the samples of a split: this process, or a cluster's workers."""
+    if cluster is None:
+        return in_order
+
+    def each(work: Sequence[TrialWork], make: Make, done: Done) -> None:
+        each_trial(store, f"samples to {split}", work, make, done, cluster, processes=False)
+
+    return each

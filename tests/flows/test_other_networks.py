@@ -13,19 +13,20 @@ import torch
 import yaml
 
 from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.evaluation.networks import STEP
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import model_file
 from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.training import restore
 from sliplab.analysis.windows.dataset import trial_windows
-from sliplab.flows.learning.evaluate import evaluate, evaluation_of
-from sliplab.flows.learning.other_networks import STEP, judge_model
-from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.learning.train import train
+from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.flows.evaluate import evaluate, judge_model
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome
+from sliplab.flows.train import train
 from sliplab.protocols import InputError
 from sliplab.protocols.settings import Windows
 from sliplab.storage.trials.derived import Derived

@@ -1,13 +1,13 @@
-"""`sliplab export-model`: a trained network as ONNX, on a Speck, and with a card.
+"""A trained network as ONNX, on a Speck, and with a card.
 
 Everything that is said of the network is measured on windows of a store, by default the one that
-the model lies in. Nothing is written until all of it is there and the ONNX file has given Sinabs'
-spike counts.
+the model lies in.
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,12 +16,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected, collected, training_campaigns
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.evaluation.trials import latencies
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.activity import activity
 from sliplab.analysis.networks.model_card import SplitResult, card_markdown, model_card
+from sliplab.analysis.networks.models import (
+    comparison_models,
+    rules_of,
+    training_settings,
+    wanted_models,
+)
 from sliplab.analysis.networks.network import SPIKING, WEIGHTED
 from sliplab.analysis.networks.quantised import (
     Quantised,
@@ -33,17 +40,9 @@ from sliplab.analysis.networks.quantised import (
 from sliplab.analysis.networks.speck import speck_fit, speck_markdown
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.learning.model_latency import latencies
-from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.learning.train import (
-    comparison_models,
-    rules_of,
-    training_settings,
-    wanted_models,
-)
-from sliplab.flows.running import console
+from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import json_text, make_folder, sha256, write_bytes, write_text
+from sliplab.storage.files import json_text, sha256
 from sliplab.storage.schema.model import TrainedModel
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -84,80 +83,6 @@ class _Source:
     def about(self) -> dict[str, str]:
         """What every file says of the model."""
         return {"file": self.path.name, "sha256": self.sha256}
-
-
-def export_model(
-    model: Path,
-    fitted: Fitted,
-    out: Path,
-    store: Store,
-    names: list[str] | None = None,
-    *,
-    onnx: bool = True,
-    checked: int = CHECKED,
-) -> dict[str, Any]:
-    """Write ``NAME.onnx``, ``NAME.speck.{json,md,npz}`` and ``NAME.card.{json,md}`` into `out`.
-
-    Args:
-        model, fitted: the file, and what is in it.
-        names: campaigns of the store; all by default.
-        onnx: whether to make the ONNX file, which needs the extra of that name.
-        checked: windows to check it on.
-
-    Raises:
-        InputError: the store's windows are others than the model's.
-        StoreError: nothing collected, or not labelled.
-        ExportFailed: the ONNX file gives other counts.
-        ModuleNotFoundError: the extra ``onnx`` is not installed.
-    """
-    campaigns = collected(store, names)
-    if training_settings(campaigns).windows != fitted.windows:
-        file = training_campaigns(campaigns)[0].campaign.protocol_file
-        raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
-    source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
-    files: dict[str, bytes | str] = {}
-    trials = sum(1 for item in campaigns for _ in item.of_split("test"))
-    with console.bar("export", 4 + trials) as bar:
-        made_from_these = _made_from_these(source)
-        samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}
-        seen = _look_at(samples)
-        bar.advance(1, "windows")
-        checks = 0
-        if onnx:
-            files[".onnx"], checks = _onnx(source, seen.x, checked)
-        bar.advance(1, "onnx")
-        whole = quantise(training.restore(fitted))
-        real, chip = latencies(
-            campaigns, source.labels, fitted, whole, lambda: bar.advance(1, "test trials")
-        )
-        speck = _speck(source, whole, seen, real, chip)
-        files |= {
-            ".speck.json": json_text(speck),
-            ".speck.md": speck_markdown(speck),
-            ".speck.npz": _weights_file(whole),
-        }
-        bar.advance(1, "speck")
-        card = _card(source, samples, seen, real, made_from_these)
-        files |= {".card.json": json_text(card), ".card.md": card_markdown(card)}
-        bar.advance(1, "card")
-    make_folder(out)
-    for suffix, content in files.items():
-        path = out / f"{model.stem}{suffix}"
-        if isinstance(content, bytes):
-            write_bytes(path, content)
-        else:
-            write_text(path, content)
-    return {
-        "files": [str(out / f"{model.stem}{suffix}") for suffix in files],
-        "simulated": source.simulated,
-        "onnx_windows_equal": checks,
-        "speck_fits": speck["fit"]["fits"],
-        "problems": speck["fit"]["problems"],
-        "change": speck["quantisation"]["change"],
-        "accuracy": speck["quantisation"]["accuracy"],
-        "synaptic_operations": card["activity"]["synaptic_operations"]["all"],
-        "warnings": card["warnings"],
-    }
 
 
 def _weights_file(whole: Quantised) -> bytes:
@@ -294,3 +219,63 @@ def _card(
         source.fitted, source.about, data, splits, activity(net, seen.x), detection, versions,
         margin,
     )  # fmt: skip
+
+
+def export_files(
+    model: Path,
+    fitted: Fitted,
+    store: Store,
+    campaigns: list[Collected],
+    checked: int | None,
+    advance: Callable[[str], None],
+) -> tuple[dict[str, bytes | str], dict[str, Any]]:
+    """Make the files of a model, and say of the result what matters.
+
+    Args:
+        checked: windows that the ONNX file is held against Sinabs on; None for no such file.
+        advance: hears of each part that is done; 4 parts and each test trial.
+
+    Returns:
+        contents by the ending of the file's name, and the figures.
+
+    Raises:
+        InputError: the store's windows are others than the model's.
+        StoreError: not labelled.
+        ExportFailed: the ONNX file gives other counts.
+        ModuleNotFoundError: the extra ``onnx`` is not installed.
+    """
+    if training_settings(campaigns).windows != fitted.windows:
+        file = training_campaigns(campaigns)[0].campaign.protocol_file
+        raise InputError(file, "analysis.windows", None, f"are not those that {model} takes")
+    source = _Source(model, sha256(model), fitted, store, campaigns, Labels(store))
+    files: dict[str, bytes | str] = {}
+    made_from_these = _made_from_these(source)
+    samples = {split: load_samples(source.labels, campaigns, split) for split in SPLITS}
+    seen = _look_at(samples)
+    advance("windows")
+    checks = 0
+    if checked is not None:
+        files[".onnx"], checks = _onnx(source, seen.x, checked)
+    advance("onnx")
+    whole = quantise(training.restore(fitted))
+    real, chip = latencies(campaigns, source.labels, fitted, whole, lambda: advance("test trials"))
+    speck = _speck(source, whole, seen, real, chip)
+    files |= {
+        ".speck.json": json_text(speck),
+        ".speck.md": speck_markdown(speck),
+        ".speck.npz": _weights_file(whole),
+    }
+    advance("speck")
+    card = _card(source, samples, seen, real, made_from_these)
+    files |= {".card.json": json_text(card), ".card.md": card_markdown(card)}
+    advance("card")
+    return files, {
+        "simulated": source.simulated,
+        "onnx_windows_equal": checks,
+        "speck_fits": speck["fit"]["fits"],
+        "problems": speck["fit"]["problems"],
+        "change": speck["quantisation"]["change"],
+        "accuracy": speck["quantisation"]["accuracy"],
+        "synaptic_operations": card["activity"]["synaptic_operations"]["all"],
+        "warnings": card["warnings"],
+    }

@@ -1,7 +1,7 @@
-"""Predictions that detectors read: spikes and events of windows at any stride, kept once made.
+"""Predictions that detectors read: spikes of all windows of a trial, at any stride, kept once made.
 
-Consecutive windows of the trials that are scored are counted by `flows.learning.counting`; this is
-for windows that overlap, and for the trials that detectors learn from and are set by.
+Spike counts are of consecutive windows of the trials that are scored; predictions, which count
+events too, of windows that overlap and of the trials that detectors learn from and are set by.
 """
 
 from __future__ import annotations
@@ -10,27 +10,78 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.detectors.stateful import stateful_spikes, trailing_sums
 from sliplab.analysis.networks import model_file, training
+from sliplab.analysis.trial_work import KeepTrials, TrialWork, stale_trials
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.samples import strided_windows
-from sliplab.flows.running.parallel_map import TrialWork, keep_trials, stale_trials
-from sliplab.protocols.settings import Windows
+from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
-if TYPE_CHECKING:
-    from sliplab.flows.running.cluster import Cluster
+COUNTS = "counts"
+COUNTS_VERSION = 1
+
+
+@dataclass(frozen=True)
+class _Counting:
+    """What spike counts depend on besides the trial.
+
+    Attributes:
+        threads: of the network; None for as many as there are cores.
+    """
+
+    model: bytes
+    windows: Windows
+    threads: int | None
+
+
+def count_spikes(
+    store: Store,
+    model: Path,
+    windows: Windows,
+    trials: Sequence[tuple[str, Recording, str]],
+    keep: KeepTrials,
+    threads: int | None = None,
+) -> int:
+    """Run a network over all consecutive windows of every trial that needs it.
+
+    Args:
+        trials: campaign, recording and the key that its counts must have.
+        keep: makes the stale ones and keeps each.
+        threads: of the network; None for as many as there are cores.
+
+    Returns:
+        how many trials were counted.
+    """
+    counting = _Counting(model.read_bytes(), windows, threads)
+    wanted = [TrialWork(recording, name, key, counting) for name, recording, key in trials]
+    work = stale_trials(store, COUNTS, wanted)
+    if work:
+        keep(COUNTS, work, _count)
+    return len(work)
+
+
+def _count(
+    recording: Recording, counting: _Counting
+) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Spike counts of all windows of a trial."""
+    if counting.threads is not None:
+        training.limit_threads(counting.threads)
+    x, end_ns = dataset.trial_windows(recording, counting.windows)
+    counts = training.predict_counts(_fitted(counting.model), x)
+    return {}, {"counts": counts, "end_ns": end_ns}
+
 
 PREDICTIONS = "heard"
 """The step's name in stores and keys."""
-VERSION = 1
+PREDICTIONS_VERSION = 1
 
 
 def predictions_step(stride_ms: int, carried: bool = False) -> str:
@@ -69,7 +120,7 @@ def want(
 ) -> Wanted:
     """Windows at a stride, with the key of the model that counts them."""
     inputs = [model_key, recording.checksum, stride_ms, carried]
-    key = make_key(PREDICTIONS, VERSION, inputs, windows.model_dump(mode="json"))
+    key = make_key(PREDICTIONS, PREDICTIONS_VERSION, inputs, windows.model_dump(mode="json"))
     return Wanted(campaign, recording, stride_ms, carried, key)
 
 
@@ -89,11 +140,15 @@ def predict_trials(
     model: Path,
     windows: Windows,
     wanted: Sequence[Wanted],
-    cluster: Cluster | None = None,
+    keep: KeepTrials,
+    threads: int | None = None,
 ) -> int:
-    """Run inference for stale trials, inside a flow; return the number of them."""
-    content, threads = model.read_bytes(), None if cluster is None else 1
-    made = 0
+    """Run inference for stale trials; return the number of them.
+
+    Args:
+        keep, threads: as for `count_spikes`.
+    """
+    content, made = model.read_bytes(), 0
     for step in sorted({item.step for item in wanted}):
         work = stale_trials(
             store,
@@ -108,7 +163,7 @@ def predict_trials(
             ],
         )  # fmt: skip
         if work:
-            keep_trials(store, step, "evaluate", work, _infer, cluster, processes=False)
+            keep(step, work, _infer)
         made += len(work)
     return made
 
@@ -167,3 +222,11 @@ def _stateful(
 @lru_cache(maxsize=2)
 def _fitted(model: bytes) -> training.Fitted:
     return model_file.parse(model, "the model")
+
+
+def trial_counts(
+    store: Store, campaign: str, trial_id: str, settings: Detection
+) -> dict[str, npt.NDArray[Any]]:
+    """``counts`` int64 (n, 3) and ``end_ns`` int64 (n,) of a scored trial, at its stride."""
+    step = COUNTS if settings.stride_ms is None else predictions_step(settings.stride_ms)
+    return Derived.of(store, step, campaign).arrays(trial_id)

@@ -1,33 +1,33 @@
-"""The chosen windows of test trials: what the network says of them, from every side.
+"""The chosen windows of test trials: figures of the network, by class, condition, phase and trial.
 
-The chosen network's figures by class, condition, phase and trial, all trained seeds beside it, what
-its leads are worth, and what it computes. Everything that is fitted here is fitted on training or
-validation trials.
+All trained seeds stand beside the chosen one, with the reliability of its leads and what it
+computes. Everything that is fitted here is fitted on training or validation trials.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.metrics import reliability, window_groups
 from sliplab.analysis.networks import model_file, synaptic, training
 from sliplab.analysis.networks.baselines import evaluate_baselines
+from sliplab.analysis.networks.models import Model, training_settings
 from sliplab.analysis.windows.dataset import SampleSet, recorded_span
-from sliplab.flows.learning.samples import (
+from sliplab.analysis.windows.sample_sets import (
     TrialRef,
     by_id,
     load_samples,
     several,
     split_trials,
 )
-from sliplab.flows.learning.train import Model, training_settings
 from sliplab.storage.schema.evaluation import (
     Baseline,
     NoSlip,
@@ -42,38 +42,45 @@ from sliplab.storage.schema.evaluation import (
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
-if TYPE_CHECKING:
-    from sliplab.analysis.labels.reviewed import Labels
-    from sliplab.flows.learning.evaluation_job import Job
-
 VERSION = 4
 STEP = "windows"
 """The network's counts of the test windows are kept under it, for what is compared later."""
 NAME = "test"
 
 
-def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) -> WindowScores:
-    """All figures of the test windows; see docs/metrics.md.
+def score_windows(
+    labels: Labels,
+    campaigns: list[Collected],
+    models: Sequence[Model],
+    chosen: Model,
+    key: str,
+    train: SampleSet,
+    test: SampleSet,
+    margin: float,
+) -> WindowScores:
+    """Score the test windows (docs/metrics.md), and keep the network's counts of them.
 
     Args:
+        models: of all seeds, the chosen one among them.
+        key: the evaluation's, under which the counts are kept.
         margin: the lead in spikes by which windows and trials are judged alike.
     """
-    settings = training_settings(job.campaigns)
-    fitted = model_file.load(job.model.path)
-    validation = load_samples(job.labels, job.campaigns, "validation")
+    settings = training_settings(campaigns)
+    fitted = model_file.load(chosen.path)
+    validation = load_samples(labels, campaigns, "validation")
     counts = training.predict_counts(fitted, test.windows)
-    found, trial = by_id(split_trials(job.campaigns, "test")), test.trial
+    found, trial = by_id(split_trials(campaigns, "test")), test.trial
     known = [found[name] for name in test.trials]
     hits = window_groups.strict_hits(counts, test.y)
-    Derived.of(job.store, STEP).write(
-        NAME, job.key, {},
+    Derived.of(labels.store, STEP).write(
+        NAME, key, {},
         {
             "counts": counts, "y": test.y, "trial": trial,
             "trials": np.array(test.trials, np.str_).reshape(-1, 2),
         },
     )  # fmt: skip
     cheap = evaluate_baselines(train.windows, train.y, test.windows, test.y)
-    by_tenth, no_slip = _phases(job.labels, known, test, trial, hits, settings.windows.length_ms)
+    by_tenth, no_slip = _phases(labels, known, test, trial, hits, settings.windows.length_ms)
     return WindowScores(
         **dict(metrics.score(counts, test.y, margin)),
         interval=window_groups.share(hits, trial),
@@ -90,7 +97,7 @@ def score_windows(job: Job, train: SampleSet, test: SampleSet, margin: float) ->
         by_tenth=by_tenth,
         no_slip=no_slip,
         by_trial=tuple(window_groups.by_trial(counts, test.y, trial, lambda k: _named(known[k]))),
-        seeds=_seeds(job, test, margin),
+        seeds=_seeds(models, chosen, test, margin),
         work=synaptic.count_work(fitted, test.windows),
         baselines={name: score.argmax for name, score in cheap.items()},
         beside={
@@ -142,16 +149,16 @@ def _phases(
     )
 
 
-def _seeds(job: Job, test: SampleSet, margin: float) -> Seeds:
+def _seeds(models: Sequence[Model], chosen: Model, test: SampleSet, margin: float) -> Seeds:
     """Every trained seed on the same windows: each, and mean, lowest and highest."""
     rows = []
-    for model in job.models:
+    for model in models:
         counts = training.predict_counts(model_file.load(model.path), test.windows)
         found = metrics.accuracy(counts, test.y, margin)
         rows.append(
             SeedScores(
                 seed=model.seed,
-                chosen=model.seed == job.model.seed,
+                chosen=model.seed == chosen.seed,
                 validation_strict=model.info.validation.strict,
                 **found.model_dump(exclude={"n"}),
             )

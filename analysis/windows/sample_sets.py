@@ -7,13 +7,12 @@ recording or a setting changed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.trial_work import EachTrial, TrialWork, in_order
 from sliplab.analysis.windows import dataset
 from sliplab.analysis.windows.dataset import SampleSet, TrialId
-from sliplab.flows.running.parallel_map import TrialWork, each_trial
 from sliplab.protocols import Trial
 from sliplab.protocols.hashing import hash_integer
 from sliplab.protocols.settings import Samples, Windows
@@ -21,14 +20,10 @@ from sliplab.storage.schema.label import TrialLabel
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.recording import Recording
 
-if TYPE_CHECKING:
-    from sliplab.flows.running.cluster import Cluster
-
 STEP = "samples"
 _FORMAT = "trials by name"
 _BY_PLACE = "numbered by place"
 """In keys of what was made of several campaigns since windows are told apart by their trial."""
-
 TrialRef = tuple[Collected, Trial, Recording]
 """A trial with its campaign and its recording."""
 
@@ -67,12 +62,12 @@ def several(campaigns: list[Collected]) -> list[str]:
 
 
 def load_samples(
-    labels: Labels, campaigns: list[Collected], split: str, cluster: Cluster | None = None
+    labels: Labels, campaigns: list[Collected], split: str, each: EachTrial = in_order
 ) -> SampleSet:
-    """The samples of all trials of one split of the kinematic campaigns, mapped from their file.
+    """Load the samples of all trials of one split of the kinematic campaigns, mapped from a file.
 
-    Without a cluster they are made in this process: a trial takes 10 ms. With one it stands in a
-    flow.
+    Args:
+        each: makes what is missing; in this process a trial takes 10 ms.
     """
     used = training_campaigns(campaigns)
     windows = used[0].settings.windows
@@ -89,20 +84,14 @@ def load_samples(
     kept = Derived.of(labels.store, STEP)
     path = kept.folder / f"{split}.arrays"
     if not (kept.fresh(split, key) and path.exists()):
-        made = _make(labels, trials, split, windows, cluster)
+        made = _make(labels, trials, windows, each)
         kept.folder.mkdir(parents=True, exist_ok=True)
         made.save(path)
         kept.write(split, key, {"samples": len(made), "cells": len(made.windows.cell)})
     return SampleSet.load(path)
 
 
-def _make(
-    labels: Labels,
-    trials: list[TrialRef],
-    split: str,
-    windows: Windows,
-    cluster: Cluster | None,
-) -> SampleSet:
+def _make(labels: Labels, trials: list[TrialRef], windows: Windows, each: EachTrial) -> SampleSet:
     work = [
         TrialWork(
             recording, item.name, "",
@@ -114,15 +103,7 @@ def _make(
         for item, trial, recording in trials
     ]  # fmt: skip
     parts: dict[int, SampleSet] = {}
-    each_trial(
-        labels.store,
-        f"samples to {split}",
-        work,
-        _samples,
-        parts.__setitem__,
-        cluster,
-        processes=False,
-    )
+    each(work, _samples, parts.__setitem__)
     return SampleSet.join([parts[number] for number in range(len(work))], windows)
 
 

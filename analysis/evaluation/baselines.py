@@ -1,4 +1,4 @@
-"""`sliplab evaluate --baselines`: other methods on the same windows, each trained and kept.
+"""Other methods on the same windows, each trained and kept: `sliplab evaluate --baselines`.
 
 They take minutes and do not depend on the spiking network, so each is kept on its own as soon as
 it is there, and is made again only when a sample changed. Networks are trained with several seeds
@@ -7,32 +7,27 @@ and chosen among by validation windows, as the spiking network is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy.typing as npt
 
-from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.evaluation import windows as window_scores
 from sliplab.analysis.metrics import classification as metrics
 from sliplab.analysis.networks.baseline_nets import EPOCHS, KINDS, trained_net
 from sliplab.analysis.networks.baselines import RIDGE, ROUNDS, boosted, logistic_cells
 from sliplab.analysis.windows.dataset import SampleSet
-from sliplab.flows.learning import window_scores
-from sliplab.flows.learning.samples import STEP as SAMPLES
-from sliplab.flows.learning.samples import load_samples
-from sliplab.flows.running import console
-from sliplab.flows.running.run_records import timed
+from sliplab.analysis.windows.sample_sets import STEP as SAMPLES
 from sliplab.storage.schema.evaluation import BaselineResult, TrainedBaseline
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store
 
 STEP = "baselines"
 EVALUATION = "evaluation"
-"""Step and name of what it is compared with (`flows.learning.evaluate`, which Prefect needs)."""
+"""Step and name of what it is compared with."""
 VERSION = 3
 SEEDS = (0, 1, 2)
 """Of every ordinary network; other methods have nothing random."""
-
 NAMES: dict[str, Any] = {
     "logistic_cells": RIDGE,
     "boosting": ROUNDS,
@@ -41,7 +36,7 @@ NAMES: dict[str, Any] = {
 """Each baseline, and what else it depends on."""
 
 
-def _key(store: Store, name: str) -> str:
+def baseline_key(store: Store, name: str) -> str:
     """By the samples as they stand in the store."""
     kept = Derived.of(store, SAMPLES)
     samples = [kept.key(split) for split in ("train", "validation", "test")]
@@ -51,7 +46,7 @@ def _key(store: Store, name: str) -> str:
 def fresh_keys(store: Store) -> list[str]:
     """Keys of the baselines that are there and belong to today's samples."""
     kept = Derived.of(store, STEP)
-    return [key for name in NAMES if kept.fresh(name, key := _key(store, name))]
+    return [key for name in NAMES if kept.fresh(name, key := baseline_key(store, name))]
 
 
 def baselines(store: Store) -> dict[str, TrainedBaseline]:
@@ -65,7 +60,7 @@ def baselines(store: Store) -> dict[str, TrainedBaseline]:
     if network is None:
         return found
     for name in NAMES:
-        if not kept.fresh(name, _key(store, name)):
+        if not kept.fresh(name, baseline_key(store, name)):
             continue
         votes = kept.arrays(name)["votes"]
         if len(votes) != len(network["y"]):
@@ -75,10 +70,14 @@ def baselines(store: Store) -> dict[str, TrainedBaseline]:
     return found
 
 
-def _made(
-    name: str, train: SampleSet, validation: SampleSet, test: SampleSet
+def train_baseline(
+    name: str,
+    train: SampleSet,
+    validation: SampleSet,
+    test: SampleSet,
+    say: Callable[[str], None],
 ) -> tuple[npt.NDArray[Any], dict[str, Any]]:
-    """Votes on the test windows, and what made them."""
+    """Return votes on the test windows, and what was fitted; `say` hears of each epoch."""
     if name == "logistic_cells":
         return logistic_cells(train.windows, train.y, test.windows)
     if name == "boosting":
@@ -88,7 +87,7 @@ def _made(
 
         def on_epoch(epoch: int, strict: float, seed: int = seed) -> None:
             validated = f"validation {100 * strict:.1f} %"
-            console.say(f"{name}: seed {seed}, epoch {epoch} of {EPOCHS}, {validated}")
+            say(f"{name}: seed {seed}, epoch {epoch} of {EPOCHS}, {validated}")
 
         runs.append(
             trained_net(name, train, validation, test.windows, seed=seed, on_epoch=on_epoch)
@@ -100,32 +99,3 @@ def _made(
     ]
     votes, said = max(runs, key=lambda run: float(run[1]["validation_strict"]))
     return votes, {**said, "seeds": each}
-
-
-def window_baselines(
-    store: Store, campaigns: list[Collected], reviewed: bool = False
-) -> dict[str, Any]:
-    """Train and keep every baseline that is missing or stale.
-
-    Args:
-        reviewed: people's decisions are applied to the labels.
-    """
-    labels = Labels(store, reviewed)
-    train, validation, test = (
-        load_samples(labels, campaigns, split) for split in ("train", "validation", "test")
-    )
-    kept = Derived.of(store, STEP)
-    stale = [name for name in NAMES if not kept.fresh(name, _key(store, name))]
-    if stale:
-        with timed(store, "baselines"):
-            for name in stale:
-                console.say(f"{name}: {len(train)} training windows")
-                votes, made = _made(name, train, validation, test)
-                result = BaselineResult(made=made, argmax=metrics.accuracy(votes, test.y).argmax)
-                kept.write(name, _key(store, name), result, {"votes": votes})
-    return {
-        "step": "baselines",
-        "done": len(stale),
-        "fresh": len(NAMES) - len(stale),
-        "argmax": {name: kept.load(name, BaselineResult).argmax for name in NAMES},
-    }

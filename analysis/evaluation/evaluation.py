@@ -1,0 +1,163 @@
+"""The evaluation of a store: what it depends on, and the figures that it keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.detectors.predictions import (
+    COUNTS,
+    COUNTS_VERSION,
+    trial_counts,
+)
+from sliplab.analysis.detectors.rule_sweep import settled
+from sliplab.analysis.evaluation.detectors import DetectorWork, detector_work
+from sliplab.analysis.evaluation.trials import score_row, summaries
+from sliplab.analysis.evaluation.windows import VERSION as WINDOWS_VERSION
+from sliplab.analysis.evaluation.windows import key_inputs, score_windows
+from sliplab.analysis.labels.label_errors import label_errors, rules_compared
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.networks.models import (
+    Model,
+    choose_model,
+    rules_of,
+    training_settings,
+    wanted_models,
+)
+from sliplab.analysis.windows.dataset import SampleSet
+from sliplab.protocols import Trial
+from sliplab.protocols.settings import Detection
+from sliplab.storage.schema.evaluation import Evaluation, TrialScore
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.store import Store, StoreError
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything an evaluation depends on, found before anything is computed."""
+
+    store: Store
+    campaigns: list[Collected]
+    labels: Labels
+    model: Model
+    models: list[Model]
+    """Of all seeds, the chosen one among them."""
+    detection: dict[str, Detection]
+    trials: list[tuple[Collected, Trial, Recording, str]]
+    """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
+    detectors: DetectorWork
+    key: str
+
+
+STEP = "evaluation"
+VERSION = 4
+NAME = "evaluation"
+FORMAT = (VERSION, WINDOWS_VERSION)
+"""Stands in an evaluation, so that who reads it knows that its keys are those of today."""
+
+
+def make_job(
+    store: Store,
+    campaigns: list[Collected],
+    margin: float | None = None,
+    smoothing: int | None = None,
+    reviewed: bool = False,
+) -> Job:
+    """Find what is to be evaluated, and by what detection settings.
+
+    Args:
+        margin, smoothing: instead of the protocols' own, and of what these would choose.
+        reviewed: people's decisions are applied to the labels.
+    """
+    labels = Labels(store, reviewed)
+    models = wanted_models(store, campaigns, reviewed)
+    model = choose_model(models)
+    settings = training_settings(campaigns)
+    windows = settings.windows.model_dump(mode="json")
+    change: dict[str, Any] = {"margin": margin, "smoothing": smoothing}
+    change = {name: value for name, value in change.items() if value is not None}
+    if change:
+        change["choose"] = "protocol"
+    rules = rules_of(campaigns, settings.network.outputs_per_class)
+    detection, trials, inputs = {}, [], [key_inputs(models, campaigns)]
+    for item in campaigns:
+        detection[item.name] = Detection.model_validate({**rules[item.name].model_dump(), **change})
+        for trial, recording in item.trials:
+            if trial.split != "test":
+                continue
+            if not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            label = labels.key(item, recording)
+            counts = make_key(COUNTS, COUNTS_VERSION, [model.key, recording.checksum], windows)
+            trials.append((item, trial, recording, counts))
+            inputs.append([item.name, trial.id, label, counts])
+    used = {name: value.model_dump(mode="json") for name, value in detection.items()}
+    detectors = detector_work(labels, campaigns, detection, model.key)
+    # what people decided on trials beside the test trials is counted in the result
+    states = labels.states(campaigns)
+    of_review = [] if states is None else [states]
+    key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)
+    return Job(store, campaigns, labels, model, models, detection, trials, detectors, key)
+
+
+def evaluation_of(store: Store) -> Evaluation:
+    """Return the store's evaluation.
+
+    Raises:
+        StoreError: there is none, or another version of the program made it.
+    """
+    kept = Derived.of(store, STEP)
+    if kept.key(NAME) is None:
+        raise StoreError(f"{store.folder}: nothing evaluated yet; run `sliplab evaluate` first")
+    if kept.read(NAME).get("format") != list(FORMAT):
+        raise StoreError(
+            f"{store.folder}: evaluated by another version of this program; run `sliplab evaluate`"
+        )
+    return kept.load(NAME, Evaluation)
+
+
+def _score_trials(job: Job, detection: dict[str, Detection]) -> list[TrialScore]:
+    """One row a trial: onsets, detections, latency."""
+    rows = []
+    for item, trial, recording, _ in job.trials:
+        found = trial_counts(job.store, item.name, trial.id, detection[item.name])
+        label = job.labels.read(item, recording)
+        rows.append(
+            score_row(item, trial, label, found["counts"], found["end_ns"], detection[item.name])
+        )
+    return rows
+
+
+def score_store(job: Job, train: SampleSet, test: SampleSet) -> None:
+    """Score windows, detections and labels, and keep them as one result."""
+    settings = training_settings(job.campaigns)
+    choices = job.detectors.choices(job.store, job.detection)
+    detection = {name: settled(value, choices[name]) for name, value in job.detection.items()}
+    kinematic = training_campaigns(job.campaigns)[0].name
+    rows = _score_trials(job, detection)
+    states = job.labels.states(job.campaigns)
+    result = Evaluation(
+        format=FORMAT,
+        seed=job.model.seed,
+        windows=score_windows(
+            job.labels,
+            job.campaigns,
+            job.models,
+            job.model,
+            job.key,
+            train,
+            test,
+            detection[kinematic].margin,
+        ),
+        trials=tuple(rows),
+        experiments=summaries(rows),
+        label_error_ms=label_errors(job.store, job.campaigns),
+        label_rules_ms=rules_compared(job.store, job.campaigns),
+        reviewed=None if states is None else {str(name): n for name, n in states.items()},
+        detection=detection,
+        choices=choices,
+        detectors=job.detectors.compare(job.store, settings, job.detection[kinematic]),
+    )
+    Derived.of(job.store, STEP).write(NAME, job.key, result)

@@ -1,0 +1,157 @@
+"""The trained models of a store: what they have to be made of, and which of them is evaluated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sliplab.analysis.campaigns import Collected, training_campaigns
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.networks import training
+from sliplab.analysis.windows import dataset
+from sliplab.protocols.settings import MARGIN, AnalysisSettings, Detection
+from sliplab.storage.schema.model import TrainedModel
+from sliplab.storage.trials.derived import make_key
+from sliplab.storage.trials.store import Store, StoreError
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network on disk."""
+
+    seed: int
+    path: Path
+    key: str
+    settings: AnalysisSettings
+
+    @property
+    def title(self) -> str:
+        """``seed 0``, or ``paper-seed 0``."""
+        return self.path.stem.replace("seed", "seed ")
+
+    @property
+    def info_path(self) -> Path:
+        """The JSON beside the model file; written last, it decides."""
+        return self.path.with_suffix(".json")
+
+    @property
+    def info(self) -> TrainedModel:
+        """The document beside the model file.
+
+        Raises:
+            OSError: there is none.
+            DocumentError, NewerFormat: it cannot be read.
+        """
+        return TrainedModel.load(self.info_path)
+
+    @property
+    def state_path(self) -> Path:
+        """Where its training is kept after each epoch, to go on there after a stop."""
+        return self.path.with_suffix(f".{self.key[:16]}.state")
+
+    @property
+    def curves_path(self) -> Path:
+        """The training curves, drawn anew after each epoch."""
+        return self.path.with_suffix(".svg")
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the file was made with `key`."""
+        try:
+            return self.path.exists() and self.info.key == self.key
+        except (OSError, ValueError):
+            return False
+
+
+def training_settings(campaigns: list[Collected]) -> AnalysisSettings:
+    """The settings that the network is made by: those of the first kinematic campaign."""
+    return training_campaigns(campaigns)[0].settings
+
+
+def rules_of(campaigns: list[Collected], outputs_per_class: float) -> dict[str, Detection]:
+    """The rule of each campaign, in spikes of a network with so many output neurons a class."""
+    usual = MARGIN * outputs_per_class
+    margin = training_settings(campaigns).rule_for(outputs_per_class, usual).margin
+    return {item.name: item.settings.rule_for(outputs_per_class, margin) for item in campaigns}
+
+
+def wanted_models(store: Store, campaigns: list[Collected], reviewed: bool = False) -> list[Model]:
+    """The models that the settings ask for, with the keys they must have.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
+
+    Raises:
+        StoreError: a trial has no fresh label yet.
+    """
+    return _models(store, campaigns, training_settings(campaigns), reviewed, "")
+
+
+def comparison_models(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> list[Model]:
+    """Models of the comparison network that `analysis.also` names; none without one."""
+    settings = training_settings(campaigns).comparison_settings()
+    if settings is None:
+        return []
+    return _models(store, campaigns, settings, reviewed, f"{settings.preset}-")
+
+
+def _models(
+    store: Store,
+    campaigns: list[Collected],
+    settings: AnalysisSettings,
+    reviewed: bool,
+    prefix: str,
+) -> list[Model]:
+    used = training_campaigns(campaigns)
+    inputs = []
+    labels = Labels(store, reviewed)
+    for item in used:
+        for trial, recording in item.trials:
+            if not labels.fresh(item, recording):
+                raise StoreError(f"{item.name}: {trial.id} has no label yet; run `sliplab label`")
+            if trial.split in {"train", "validation"}:
+                key = labels.key(item, recording)
+                inputs.append([item.name, trial.id, trial.split, key])
+    parameters = {
+        name: getattr(settings, name).model_dump(mode="json")
+        for name in ("windows", "samples", "network")
+    }
+    if settings.network.biases:
+        del parameters["network"]["biases"]  # models of before it could be left out stay fresh
+    parameters["training"] = settings.training.model_dump(mode="json", exclude={"seeds"})
+    models = []
+    for seed in settings.training.seeds:
+        key = make_key(
+            "train",
+            training.VERSION,
+            inputs,
+            {**parameters, "seed": seed, "dataset": dataset.VERSION},
+        )
+        path = store.folder / "models" / f"{prefix}seed{seed}.pt"
+        models.append(Model(seed, path, key, settings))
+    return models
+
+
+def begun(model: Model) -> bytes | None:
+    """Where a training of this model stopped; None where it never began."""
+    try:
+        return model.state_path.read_bytes()
+    except FileNotFoundError:
+        return None
+
+
+def choose_model(models: list[Model]) -> Model:
+    """The model with the best strict validation accuracy; ties go to the first seed.
+
+    Raises:
+        StoreError: a model is missing or stale.
+    """
+    for model in models:
+        if not model.fresh:
+            raise StoreError(
+                f"{model.path}: is missing or stale; run `sliplab train` first, with `--reviewed` "
+                "where the evaluation has it"
+            )
+    return max(models, key=lambda model: model.info.validation.strict or 0.0)

@@ -1,0 +1,57 @@
+"""`sliplab export-model`: a trained network as ONNX, on a Speck, and with a card.
+
+Nothing is written until all of it is there and the ONNX file has given Sinabs' spike counts.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sliplab.analysis.campaigns import collected
+from sliplab.analysis.evaluation.export import CHECKED, export_files
+from sliplab.analysis.networks.training import Fitted
+from sliplab.flows.running import console
+from sliplab.storage.files import make_folder, write_bytes, write_text
+from sliplab.storage.trials.store import Store
+
+
+def export_model(
+    model: Path,
+    fitted: Fitted,
+    out: Path,
+    store: Store,
+    names: list[str] | None = None,
+    *,
+    onnx: bool = True,
+    checked: int = CHECKED,
+) -> dict[str, Any]:
+    """Write ``NAME.onnx``, ``NAME.speck.{json,md,npz}`` and ``NAME.card.{json,md}`` into `out`.
+
+    Args:
+        model, fitted: the file, and what is in it.
+        names: campaigns of the store; all by default.
+        onnx: make the ONNX file, which needs the extra of that name.
+        checked: windows to check it on.
+
+    Raises:
+        InputError: the store's windows are others than the model's.
+        StoreError: nothing collected, or not labelled.
+        ExportFailed: the ONNX file gives other counts.
+        ModuleNotFoundError: the extra ``onnx`` is not installed.
+    """
+    campaigns = collected(store, names)
+    trials = sum(1 for item in campaigns for _ in item.of_split("test"))
+    with console.bar("export", 4 + trials) as bar:
+        files, figures = export_files(
+            model, fitted, store, campaigns, checked if onnx else None,
+            lambda part: bar.advance(1, part),
+        )  # fmt: skip
+    make_folder(out)
+    for suffix, content in files.items():
+        path = out / f"{model.stem}{suffix}"
+        if isinstance(content, bytes):
+            write_bytes(path, content)
+        else:
+            write_text(path, content)
+    return {"files": [str(out / f"{model.stem}{suffix}") for suffix in files], **figures}
