@@ -221,9 +221,7 @@ def _serve(handle: int, parent: int, home: Path) -> None:
     import uvicorn
     from prefect.server.api.server import create_app
 
-    from sliplab.flows.running.embedded_server import ready
-
-    ready(home)
+    prepare_database(home)
     with socket.socket(fileno=handle) as listener:
         app = SameOrigin(create_app(), listener.getsockname()[1])
         uvicorn.Server(uvicorn.Config(app, log_level="error")).run(sockets=[listener])
@@ -239,8 +237,14 @@ _MADE = "alembic_version"
 """The one table with a row in a file that has just been made."""
 
 
-def ready(home: Path) -> None:
-    """Have the tables in Prefect's home; does nothing where the user has set another database."""
+def prepare_database(home: Path) -> None:
+    """Have the tables in Prefect's home; do nothing where the user has set another database.
+
+    Prefect makes the tables of a new file by all migrations since its first version, which takes
+    half of the server's start. So the first file that is made with a version of Prefect is copied,
+    empty as it is then, into the user's cache folder, and every later store begins with that copy.
+    It may be deleted at any time; one that is damaged is not used.
+    """
     if any(name in os.environ for name in _CONNECTION) or (home / NAME).exists():
         return
     template = _template()

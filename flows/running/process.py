@@ -252,5 +252,9 @@ THRESHOLDS = (50_000, 20, 100)
 
 
 def collect_garbage_seldom() -> None:
-    """Have this process look for garbage seldom from here on."""
+    """Have this process look for garbage seldom from here on.
+
+    Nearly all that it holds are its modules. With Python's own thresholds it looks through them
+    again and again while more is imported, which is a fifth of a start.
+    """
     gc.set_threshold(*THRESHOLDS)

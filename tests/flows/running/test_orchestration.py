@@ -79,11 +79,11 @@ def test_a_new_file_begins_as_a_copy_only_of_one_that_is_sound(
         template.write_bytes(b"not a database at all" * 1000)
     elif kept != "none":
         _fill(template, runs=kept == "used")
-    embedded_server.ready(tmp_path / "home")
+    embedded_server.prepare_database(tmp_path / "home")
     assert made == ([] if kept == "sound" else ["made"])
     assert _tables(tmp_path / "home" / embedded_server.NAME) >= {"flow_run", "task_run"}
     assert embedded_server._sound(template)  # the next one begins with it
-    embedded_server.ready(tmp_path / "home")  # which is there now
+    embedded_server.prepare_database(tmp_path / "home")  # which is there now
     assert made == ([] if kept == "sound" else ["made"])
 
 
