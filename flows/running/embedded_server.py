@@ -227,10 +227,6 @@ def _serve(handle: int, parent: int, home: Path) -> None:
         uvicorn.Server(uvicorn.Config(app, log_level="error")).run(sockets=[listener])
 
 
-if __name__ == "__main__":
-    _serve(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))
-
-
 NAME = "prefect.db"
 _CONNECTION = ("PREFECT_SERVER_DATABASE_CONNECTION_URL", "PREFECT_API_DATABASE_CONNECTION_URL")
 _MADE = "alembic_version"
@@ -316,3 +312,7 @@ def _copy(template: Path, target: Path) -> None:
         os.replace(aside, target)
     finally:
         aside.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    _serve(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -15,8 +16,16 @@ from prefect.runtime import flow_run
 from prefect.settings import temporary_settings
 
 from benchmarks.orchestration import _drained
-from sliplab.flows.running import embedded_server
-from sliplab.flows.running.orchestration import Opaque, embedded, run
+from sliplab.flows.running import embedded_server, orchestration
+from sliplab.flows.running.orchestration import (
+    BEGIN_S,
+    END_S,
+    LOST_S,
+    Opaque,
+    ServerLink,
+    embedded,
+    run,
+)
 
 COUNT = 120
 
@@ -52,6 +61,35 @@ def test_every_quick_task_run_is_kept_with_its_end() -> None:
     assert all(each["start_time"] <= each["end_time"] for each in found)
     states = [each["state_type"] for each in found]
     assert (states.count("COMPLETED"), states.count("FAILED")) == (COUNT - 1, 1)
+
+
+def test_a_lost_server_gets_one_limited_request_tried_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(orchestration, "_lost_servers", set())
+    monkeypatch.setattr(orchestration, "_link", None)
+    answers, limits = [200, 503, 200, 500, 500], []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        limits.append(request.extensions["timeout"]["read"])
+        return httpx.Response(answers.pop(0))
+
+    link = ServerLink("http://lab")
+    hooks: dict[str, list[Any]] = {"request": [link._before], "response": [link._after]}
+    with httpx.Client(transport=httpx.MockTransport(answer), event_hooks=hooks) as client:
+        begin, end = (client.build_request("POST", f"http://lab/{name}") for name in ("b", "e"))
+        assert client.send(begin).status_code == 200
+        assert client.send(end).status_code == 503  # SQLite is busy: Prefect's client tries again
+        assert client.send(end).status_code == 200
+        link.ending = True
+        assert [client.send(begin).status_code, client.send(begin).status_code] == [500, 500]
+        with pytest.raises(orchestration._NotSent):  # "failed" must not follow a lost "completed"
+            client.send(end)
+    assert limits == [BEGIN_S, BEGIN_S, LOST_S, END_S, LOST_S]
+    assert not orchestration.lost()
+    link.lose("nothing came")
+    link.lose("nothing came")
+    assert orchestration.lost()
 
 
 def _tables(path: Path) -> set[str]:
