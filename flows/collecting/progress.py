@@ -201,7 +201,8 @@ class _Page:
                     self._report_progress, client
                 ):
                     before = now
-            public = [self._report_figure, lambda client: self._rig(client, False)]
+            # the rig is free before the figure, which takes longest, is drawn
+            public = [lambda client: self._rig(client, False), self._report_figure]
             last = [self._report_progress, self._report_table, *(public if self._public else ())]
             for report in last:
                 try:

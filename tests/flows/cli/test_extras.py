@@ -106,7 +106,7 @@ def test_python_reads_a_store_with_the_core_alone(store: Path) -> None:
         ("prefect", "prefect", "label STORE"),
         ("prefect", "prefect", "sync STORE"),
         ("prefect", "prefect", "collect pilot --rig rehearsal --store OUT/new --trials 1"),
-        ("report", "jinja2", "sync STORE"),
+        ("report", "matplotlib", "sync STORE"),
         ("report", "bokeh", "review STORE"),
         ("report", "matplotlib", "calibrate board --out OUT/board.pdf"),
         ("hardware", "abb_motion_program_exec", "rigs irb120 --ask"),
