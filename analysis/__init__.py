@@ -1,1 +1,1 @@
-"""What it means: pure functions from recordings to labels, spikes, detections and figures."""
+"""Pure functions from recordings to labels, spikes, detections and figures."""

@@ -70,7 +70,7 @@ class Assessment:
 
     @property
     def passed(self) -> bool:
-        """Whether every gate is passed."""
+        """True where every gate is passed."""
         return all(gate.passed for gate in self.gates.values())
 
     @property

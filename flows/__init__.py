@@ -1,1 +1,1 @@
-"""What happens when: Prefect flows over the other packages, and the command line."""
+"""Prefect flows over the other packages, and the command line."""

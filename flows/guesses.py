@@ -44,7 +44,7 @@ from sliplab.storage.trials.store import Store, StoreError
 STEP, FILE, VERSION = "guesses", "results.json", 1
 TRIALS = 20
 GUESSES = tuple(NAMES)
-"""What is tried unless others are named."""
+"""Assumed parameters that are varied by default."""
 
 Json = dict[str, Any]
 

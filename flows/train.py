@@ -148,9 +148,9 @@ def _progress(model: Model, epochs: int, simulated: bool) -> Iterator[_Progress]
 
 
 class _Progress:
-    """What people see of a training while it runs: a bar, and a picture drawn after each epoch.
+    """Progress display of a training: a bar, and a plot drawn after each epoch.
 
-    The picture is in the store and on Prefect's page. Where the page cannot be reached, the store
+    The plot is in the store and on Prefect's page. Where the page cannot be reached, the store
     has it.
     """
 

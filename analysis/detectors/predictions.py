@@ -31,7 +31,7 @@ COUNTS_VERSION = 1
 
 @dataclass(frozen=True)
 class _Counting:
-    """What spike counts depend on besides the trial.
+    """Inputs of spike counts besides the trial.
 
     Attributes:
         threads: of the network; None for as many as there are cores.

@@ -58,7 +58,7 @@ class DetectorWork:
 
     @property
     def inputs(self) -> list[Any]:
-        """What results depend on here, for a key."""
+        """Inputs of the results, for a key."""
 
         def keys(trials: list[Known]) -> list[list[str]]:
             return [[trial.wanted.key, trial.label] for trial in trials]

@@ -54,7 +54,7 @@ SPECK_FORMAT = "sliplab-speck-1"
 
 
 class ExportFailed(StoreError):
-    """What was exported does not do what the network does, or could not be made."""
+    """An exported file gives other results than the network, or could not be made."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class _Source:
 
     @property
     def simulated(self) -> bool:
-        """Whether anything of the data is."""
+        """True where any campaign's data is simulated."""
         return any(bool(item.info["simulated"]) for item in self.campaigns)
 
     @property
@@ -81,7 +81,7 @@ class _Source:
 
     @property
     def about(self) -> dict[str, str]:
-        """What every file says of the model."""
+        """Description of the model in every exported file."""
         return {"file": self.path.name, "sha256": self.sha256}
 
 
@@ -94,7 +94,7 @@ def _weights_file(whole: Quantised) -> bytes:
 
 
 def _made_from_these(source: _Source) -> bool:
-    """Whether the model is what `train` would make of this store now. Raises StoreError."""
+    """Return True where `train` would make this model of the store now. Raises StoreError."""
     wanted = {
         model.key
         for make in (wanted_models, comparison_models)

@@ -178,7 +178,7 @@ _KINDS = ("argmax", "strict", "margin")
 
 
 def key_inputs(models: Sequence[Model], campaigns: list[Collected]) -> list[Any]:
-    """What the figures here depend on, beside the chosen model and the test trials."""
+    """Return the inputs of these figures besides the chosen model and the test trials."""
     return [VERSION, *several(campaigns), *(model.key for model in models)]
 
 

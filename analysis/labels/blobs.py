@@ -82,7 +82,7 @@ def find_blobs(
 def match_layout(
     xy: Floats, layout_px: Floats, tolerance_px: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Which blob is which marker, the layout being free to shift but not to turn.
+    """Assign blobs to markers; the layout may shift but not turn.
 
     The shift under which most markers have a blob within the tolerance wins, the smaller residual
     among equals; the blobs are then given to the markers at the least total distance.

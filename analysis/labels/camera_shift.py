@@ -31,7 +31,7 @@ _UNANCHORED_PX = 0.15
 
 @dataclass(frozen=True)
 class CameraShift:
-    """How the camera moved.
+    """Motion of the camera.
 
     Attributes:
         px: (n, 2) common shift, 0 where there is none.

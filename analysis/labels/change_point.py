@@ -34,11 +34,11 @@ DEPARTED_PX = 0.06
 DEPARTED_SIGMAS = 6.0
 """A marker has left its place when three frames in a row are this far from where it was."""
 _REST = (24, 4)
-"""Where it was: the median over frames this long, and this shortly, before."""
+"""Frames before the present one over which the median gives its place: first and last."""
 _WANDER = 2.0 ** np.arange(-6.0, 0.0)
 """Strength of the wandering as shares of the speed, a frame to the power -1/2."""
 _RELIEF = np.array([0.12, 0.25, 0.5, 1.0, 2.0, 4.0])
-"""How long it takes to relieve the excess of static friction, frames."""
+"""Relaxation time of the excess of static friction, frames."""
 _DRIFT_PX = 0.002
 """Prior of the drift before the slip, px a frame, standard deviation."""
 _COARSE, _FINE = 49, 61

@@ -1,4 +1,4 @@
-"""Why an onset is not known although a rule gives one, in words.
+"""Reasons why an onset is ambiguous although a rule gives one, in words.
 
 A label is what everything downstream is measured against: a wrong one costs more than a missing
 one. An onset is in doubt where a marker that could have changed it was out of sight, where its
@@ -28,7 +28,7 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Doubts:
-    """Why an onset of a trial is not known, in words; None where it is."""
+    """Reasons why a trial's onsets are ambiguous, in words; None where an onset is known."""
 
     incipient: str | None
     gross: str | None
@@ -53,7 +53,7 @@ def unseen(
     frame_ns: Ints, displacement: Floats, onsets: Onsets, centre: int, not_before_ns: int,
     motion_ns: int | None = None,
 ) -> Doubts:  # fmt: skip
-    """Whether markers that were hidden, torn off or never seen could have changed the onsets.
+    """Return the onsets that hidden, lost or never seen markers could have changed.
 
     A marker that is out of sight and comes back where it was has not slipped; one that comes back
     displaced, or not at all, slipped at some time in between. An onset is in doubt when such a
@@ -101,7 +101,7 @@ def uncertain(
     frame_ns: Ints, displacement: Floats, sigma: Floats, onsets: Onsets, centre: int,
     threshold_px: float, not_before_ns: int,
 ) -> Doubts:  # fmt: skip
-    """Whether the places' standard deviations leave it open when a marker crossed the line.
+    """Return the onsets whose threshold crossing the standard deviations leave ambiguous.
 
     Args:
         displacement, sigma: (n, m) px, the second of the first; NaN where unknown.

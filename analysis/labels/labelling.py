@@ -129,7 +129,7 @@ class Label:
         return np.where(np.isfinite(lowest), lowest, 0.0)
 
     def flags(self) -> list[str]:
-        """What a person should look at first."""
+        """Return warnings that a reviewer should check first."""
         found = []
         if self.camera.largest_px:
             found.append(f"the camera moved by up to {self.camera.largest_px:.1f} px")

@@ -19,14 +19,14 @@ FLANK = 0.06
 """Share of the contrast, at the foot and at the top of the rim, that is not looked at."""
 LEAST_CONTRAST = 40.0
 GRID_PX = 0.0035
-"""What the pixel grid does to a centroid, px RMS, measured on drawn discs of 20 px radius."""
+"""Error of a centroid by the pixel grid, px RMS, measured on drawn discs of 20 px radius."""
 FREE_SHARE = 0.002
 """A change of area up to this share is the pixel grid's; what is beyond it may be a hidden part."""
 AREA, SIGMA, QUALITY, DARK, BRIGHT = 0, 1, 2, 3, 4
 """Columns of `found`."""
 _CORNER_PX = 8
 _KEEPS_UP = 0.02
-"""How fast a marker's area may change for good (a tilted plate, a bent papilla), share a frame."""
+"""Fastest lasting change of a marker's area (tilted plate, bent papilla), share per frame."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -145,7 +145,7 @@ def _near_cuts(xy: Any, k: int, x: float, y: float, known: Any, reach: float, cu
 
 @numba.njit(cache=True, nogil=True)
 def _stands_free(xy, k, left, top, side, radius, shape):  # type: ignore[no-untyped-def]
-    """Whether a box lies in the picture and no other marker may show in it."""
+    """Return True where a box lies in the image and no other marker can appear in it."""
     if left < 0 or top < 0 or left + side > shape[1] or top + side > shape[0]:
         return False
     half = side / 2

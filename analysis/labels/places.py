@@ -1,4 +1,4 @@
-"""Where everything is in a trial's frames: from its video, or as the camera handed it over."""
+"""Positions of markers and plate in a trial's frames, from its video or the camera's tracks."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Places:
 
     @property
     def tilted(self) -> bool:
-        """Whether the camera looks askew."""
+        """True where the camera looks at the plate at an angle."""
         return self.plane is not None
 
 
@@ -82,7 +82,7 @@ def places_of(recording: Recording) -> Places:
 def from_tracks(
     markers: MarkerTracks, plate: PlateTrack | None, size_px: tuple[int, ...]
 ) -> Places:
-    """What tracking a video of `size_px` gave."""
+    """Return the positions that tracking a video of `size_px` gave."""
     plane = None
     if plate is not None:
         plane = plane_of(plate.corners, plate.ok, (size_px[0], size_px[1]))

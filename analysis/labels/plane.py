@@ -85,7 +85,7 @@ def plane_of(corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int])
 
 
 def _unlike(quads: Floats) -> Floats:
-    """What (k, 4, 2) corners miss of one square, placed and turned as fits best, of one size."""
+    """Return the residuals of (k, 4, 2) corners from one best-fitting square."""
     middle = quads - quads.mean(axis=1, keepdims=True)
     z = middle[..., 0] + 1j * middle[..., 1]
     unit = np.array([-1 - 1j, 1 - 1j, 1 + 1j, -1 + 1j]) / 2

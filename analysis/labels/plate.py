@@ -1,4 +1,4 @@
-"""Where the plate is: its ArUco marker in the outside video, and a video read in a single pass.
+"""Track the plate's ArUco marker in the outside video, and read a video in a single pass.
 
 In the gravity and disturbance trials the plate moves, and a papilla slips only when it moves on the
 plate; so the plate's own marker is the frame of reference. Finding it in a whole frame takes longer
@@ -95,7 +95,7 @@ class PlateTracker:
     def __init__(self, marker_id: int | None = None) -> None:
         self.marker_id = marker_id
         self.detections = 0
-        """How often a detector looked."""
+        """Number of calls of the ArUco detector."""
         settings = cv2.aruco.DetectorParameters()
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         # a window of up to 0.4 of a cell: larger ones see the next edge, smaller ones more noise
@@ -258,7 +258,7 @@ def bridge(poses: list[PlatePose], max_bridged: int = MAX_BRIDGED) -> PlateTrack
 
 
 def _bow(columns: Floats, before: int, after: int) -> float:
-    """How far a way across a gap may leave its chord: by the change of velocity across it, px."""
+    """Return a path's largest deviation from its chord in a gap, px, by the change of velocity."""
     if before < 1 or after + 1 >= len(columns):
         return _DETECTED_SIGMA_PX
     change = (columns[after + 1] - columns[after]) - (columns[before] - columns[before - 1])

@@ -17,7 +17,7 @@ LEAST_CONTRAST = 30.0
 _PROFILES = 32
 _SAMPLES = 17
 GRID_PX = 0.018
-"""What the pixel grid does to the centre as it moves, px RMS, measured on drawn markers."""
+"""Error of a moving centre by the pixel grid, px RMS, measured on drawn markers."""
 _KEPT = 0.6
 """Share of a side's profiles that have to agree."""
 
@@ -36,9 +36,9 @@ def _grey(frame: Any, x: float, y: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _side(frame: Any, ax: float, ay: float, bx: float, by: float, reach: float) -> Any:
-    """How far outwards the side from a to b lies at a and at b, and its scatter, px; NaN if lost.
+    """Return the side's outward offsets at a and at b, and its scatter, px; NaN if lost.
 
-    Corners go clockwise in the picture, so that outwards is to the left of the way.
+    Corners go clockwise in the image, so that outwards is to the left of the direction from a to b.
     """
     length = np.hypot(bx - ax, by - ay)
     nx, ny = (by - ay) / length, -(bx - ax) / length

@@ -46,7 +46,7 @@ class SlipTimes:
         )
 
     def doubts(self) -> Doubts:
-        """Whether the intervals leave the onsets open."""
+        """Return the onsets that these intervals leave ambiguous."""
         onsets, wide = self.onsets, self.high_ns - self.low_ns > WIDEST_NS
         gross = incipient = None
         if onsets.gross_ns is not None and wide[self.centre]:

@@ -46,7 +46,7 @@ class Model:
 
     @property
     def state_path(self) -> Path:
-        """Where its training is kept after each epoch, to go on there after a stop."""
+        """File of the training's state after its last epoch, from which it resumes."""
         return self.path.with_suffix(f".{self.key[:16]}.state")
 
     @property
@@ -56,7 +56,7 @@ class Model:
 
     @property
     def fresh(self) -> bool:
-        """Whether the file was made with `key`."""
+        """True where the file was made with `key`."""
         try:
             return self.path.exists() and self.info.key == self.key
         except (OSError, ValueError):
@@ -135,7 +135,7 @@ def _models(
 
 
 def begun(model: Model) -> bytes | None:
-    """Where a training of this model stopped; None where it never began."""
+    """Return the state at which a training of this model stopped; None where none began."""
     try:
         return model.state_path.read_bytes()
     except FileNotFoundError:

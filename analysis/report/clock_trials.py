@@ -75,7 +75,7 @@ class TrialClocks:
 
     @property
     def doubt(self) -> str:
-        """Why this committed trial would not be kept today, in words; empty if it would."""
+        """Reason to reject this committed trial by today's gates, in words; empty if none."""
         found = [
             f"{device} cannot be fitted again ({reason}); the record's clock is in use"
             for device, reason in self.refused.items()

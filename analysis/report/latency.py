@@ -35,7 +35,7 @@ STATISTICS = {
     "missed": "missed", "late": "late", "false_early": "false early",
 }  # fmt: skip
 _CAUSE = {"latency_incipient_ms": "outcome", "lead_ms": "outcome", "latency_gross_ms": "gross"}
-"""Which entry of a trial says why a time is missing."""
+"""Entry of a trial that gives the reason for a missing time."""
 _SHORT = {"missed": "missed", "late": "late", "false_early": "early", "without_onsets": "no onset"}
 
 

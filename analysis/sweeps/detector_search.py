@@ -103,7 +103,7 @@ class LabelledTrial:
 
     @property
     def inputs(self) -> list[str]:
-        """What results depend on, for a key."""
+        """Inputs of the results, for a key."""
         return [self.item.name, self.trial.id, self.recording.checksum, self.label_key]
 
 

@@ -30,7 +30,7 @@ TrialRef = tuple[Collected, Trial, Recording]
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What a trial's samples depend on besides the trial: see `dataset.trial_samples`."""
+    """Inputs of a trial's samples besides the trial; see `dataset.trial_samples`."""
 
     label: TrialLabel
     trial: TrialId

@@ -53,7 +53,7 @@ from sliplab.storage.trials.writer import TrialWriter
 
 PAUSE_LIMIT_S = 12 * 3600.0
 LOOK_S = 0.5
-"""How often a paused collection checks whether it may go on."""
+"""Interval at which a paused collection checks for its resumption, s."""
 _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sliplab.rigs.core.rig import Rig
 
 LISTEN_S = 3.0
-"""How long pulses are recorded to fit the clocks, s."""
+"""Duration of the pulses' recording to fit the clocks, s."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What every flow stands on: the terminal, stop requests, Prefect, and campaigns as steps see them.
+"""Basis of every flow: the terminal, stop requests, Prefect, and processes.
 
-Also how work is spread over cores or a cluster.
+Work is distributed over cores or a cluster here, too.
 """

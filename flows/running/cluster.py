@@ -29,14 +29,14 @@ from sliplab.protocols.hashing import hash_text
 from sliplab.storage.files import sha256
 
 CONNECT_S = 15.0
-"""How long a scheduler, and a first worker, are waited for."""
+"""Timeout for a scheduler, and for a first worker, s."""
 ALONE_S = 60.0
-"""How long a cluster may be without any worker before the step gives up."""
+"""Time without any worker after which the step fails, s."""
 LOOK_S = 0.5
 ANSWER_S = 60.0
-"""How long all workers may take to answer a question."""
+"""Timeout for the answers of all workers, s."""
 REPORT_S = 5.0
-"""How long workers may take to send their last reports to Prefect's server."""
+"""Timeout for the workers' last reports to Prefect's server, s."""
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/:\s]+:\d{1,5}")
 _LIBRARIES = ("numpy", "numba", "scipy", "torch", "h5py", "av", "opencv-contrib-python-headless")
 
@@ -199,7 +199,7 @@ def _ask_all(client: Any, question: Callable[[Any], None], about: Any, todo: str
 
 
 def _run(client: Any, question: Callable[[Any], None], about: Any) -> dict[str, Any]:
-    """What each worker answers, or the exception that it had instead."""
+    """Run a function on each worker; return its result or the exception that it raised."""
     try:
         # as `client.run`, which knows no limit
         answers: dict[str, Any] = client.sync(
@@ -216,7 +216,7 @@ async def in_thread(question: Callable[[Any], None], about: Any) -> None:
 
 
 def this_program() -> dict[str, str]:
-    """What results depend on: this program's source, Python, and the libraries that compute."""
+    """Return the versions that results depend on: our source, Python, and numerical libraries."""
     found = {"sliplab": _source(), "python": platform.python_version()}
     for name in _LIBRARIES:
         with suppress(PackageNotFoundError):
@@ -279,7 +279,7 @@ def report_all(limit_s: float = REPORT_S) -> None:
 
 
 def _result(future: Any) -> Any:
-    """What a chunk gave; errors of the work itself are raised as they are."""
+    """Return a chunk's result; errors of the work itself are raised unchanged."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker

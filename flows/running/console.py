@@ -1,4 +1,4 @@
-"""What a person or a program sees: tables and progress on standard error, one JSON on output.
+"""Output for people and programs: tables and progress on standard error, JSON on output.
 
 With ``--json`` a command prints exactly one JSON object on standard output and everything else on
 standard error. Without it, results are tables for people.
@@ -36,11 +36,11 @@ from sliplab.storage.errors import masked
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 LINE_EVERY_S = 60.0
-"""How often a bar says how far it is where there is no terminal: in the log of a night's run."""
+"""Interval between lines of progress where there is no terminal, s: in the log of a long run."""
 
 SPEED_OVER_S = 900.0
-"""What is left is told by the speed of the last so many seconds. Over rich's own 30, steps of other
-kinds, which the same bar counts, made an hour of ten minutes and back."""
+"""Time over which speed is averaged to estimate the time left, s. With rich's default of 30,
+steps of other kinds, counted by the same bar, changed the estimate from minutes to an hour."""
 
 _LINE = 10_000
 """Characters of a line where there is no terminal: nothing is folded in a file or a pipe."""
@@ -79,7 +79,7 @@ def begin(*, as_json: bool) -> None:
 
 
 def printed() -> bool:
-    """Whether the command has printed its one JSON object."""
+    """Return True where the command has printed its one JSON object."""
     return _printed
 
 

@@ -112,7 +112,7 @@ class EmbeddedServer:
 
     @property
     def url(self) -> str:
-        """What PREFECT_API_URL must be; waits until the server answers there.
+        """Value of PREFECT_API_URL; waits until the server answers there.
 
         Raises:
             ServerError: it did not start.
@@ -139,12 +139,12 @@ class EmbeddedServer:
 
     @property
     def alive(self) -> bool:
-        """Whether its process runs."""
+        """True while its process runs."""
         return self._process.poll() is None
 
     @property
     def answers(self) -> bool:
-        """Whether it answers within 5 s."""
+        """True where it answers within 5 s."""
         return self.alive and self._healthy()
 
     def _wait_until_healthy(self) -> None:
@@ -164,7 +164,7 @@ class EmbeddedServer:
         )
 
     def _cause(self, code: int | None) -> str:
-        """Why it did not start, in words: its exit code, its last message, a limit of the shell."""
+        """Return why it did not start: its exit code, its last message, a limit of the shell."""
         if code is None:
             return f"no answer at {self.address} in {START_LIMIT_S:.0f} s"
         found = f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -254,7 +254,7 @@ def prepare_database(home: Path) -> None:
 
 
 def _template() -> Path | None:
-    """Where the file to begin with is kept; None for a user without a home."""
+    """Return the path of the cached database template; None for a user without a home."""
     import prefect
 
     try:
@@ -265,7 +265,7 @@ def _template() -> Path | None:
 
 
 def _sound(path: Path) -> bool:
-    """Whether it is a file with tables, and nothing in them but which tables they are."""
+    """Return True where the file is an intact database of Prefect without any flow run."""
     if not path.is_file():
         return False
     try:

@@ -1,4 +1,4 @@
-"""Which extra of SlipLab brings a package that is not installed."""
+"""The extra of SlipLab that installs a missing package."""
 
 from __future__ import annotations
 

@@ -244,7 +244,7 @@ def limited_settings() -> dict[Any, Any]:
 
 
 class _Work:
-    """What a flow run does, and what became of it, whatever becomes of its report."""
+    """The work of a flow run and its outcome, which is kept even if its report fails."""
 
     def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
         self._do, self._link = do, link

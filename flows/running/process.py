@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 PATIENCE_S = 1.0
-"""How long standard error may take no more before messages are dropped."""
+"""Time for which standard error may block before messages are dropped, s."""
 
 
 class OutputLost(Exception):

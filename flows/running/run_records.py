@@ -1,4 +1,4 @@
-"""How each flow run ended, kept in the store: it outlives the server, the process and the machine.
+"""Ends of flow runs, kept in the store: they outlive the server, the process and the machine.
 
     STORE/control/runs/ID.json       what began, when, and in which process on which machine
     STORE/control/runs/ID.end.json   how it ended; the first word stands

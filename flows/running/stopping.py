@@ -45,7 +45,7 @@ def _end_with(parent: BaseProcess) -> None:
 
 
 def requested() -> bool:
-    """Whether somebody asked the program to stop."""
+    """Return True where the program was asked to stop."""
     return _requested.is_set()
 
 

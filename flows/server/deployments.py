@@ -43,7 +43,7 @@ from sliplab.storage.trials.lock import Locked
 from sliplab.storage.trials.store import StoreError
 
 LOOK_S = 2.0
-"""How often a rig that is in use is asked for again."""
+"""Interval between attempts to lock a rig that is in use, s."""
 _EXPECTED = (StoreError, RigError, Locked, CampaignStopped, InputError)
 
 

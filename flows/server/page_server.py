@@ -26,11 +26,11 @@ PASSWORD = "page-password"
 """The file in Prefect's home that has the password of the service's own page."""
 _PASSWORD = r"[!-~]{30,200}"
 ANSWER_S = 10.0
-"""How long a server is waited for when it is asked whether it has a password."""
+"""Timeout of the check that a server asks for a password, s."""
 WATCH_S = 5.0
-"""How often the server is asked whether it is well, and how long its answer is waited for."""
+"""Interval and timeout of the server's health check, s."""
 MISSES = 3
-"""So many times without an answer, and the server is lost."""
+"""Failed health checks in a row after which the server counts as lost."""
 
 
 class PageServer:

@@ -27,9 +27,9 @@ from sliplab.flows.running import console, orchestration, run_records, stopping
 from sliplab.flows.running.process import collect_garbage_seldom
 
 MOST_AT_ONCE = 16
-"""Words to the arm that are carried out side by side."""
+"""Requests to the arm that run at the same time."""
 STOP_LIMIT_S = 30.0
-"""How long a run may take to stop its arm and to end; it is killed then."""
+"""Time in which a run must stop its arm and end, s; it is killed then."""
 
 
 class ServedRuns:

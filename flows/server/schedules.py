@@ -1,4 +1,4 @@
-"""What each deployment may be asked for, and the file that says when.
+"""Parameters of each deployment, and the file of schedules.
 
 timezone: Europe/Rome
 schedules:
@@ -93,7 +93,7 @@ class Parameters(StrictModel):
 
 
 class OnRig(Parameters):
-    """What everything that moves the arm may be told."""
+    """Parameters of every deployment that moves the arm."""
 
     operator: str = Field(default="", description="Who stands at the rig.")
     temperature_c: float | None = Field(
@@ -184,7 +184,7 @@ SCHEDULED: dict[FlowName, type[Parameters]] = {
     "study": Study,
     "chain": Chain,
 }
-"""What a schedule may start; `pause`, `resume` and `stop` are for people."""
+"""Flows that a schedule may start; `pause`, `resume` and `stop` are for people."""
 
 
 Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]

@@ -25,7 +25,7 @@ LOCK = ".serve.lock"
 PORT = 4200
 """Prefect's usual one."""
 LOOK_S = 1.0
-"""How often the page is asked for runs at least: a word to the arm must not wait."""
+"""Longest interval between polls for runs, s: a request to the arm must not wait."""
 
 
 def serve(
@@ -112,7 +112,7 @@ async def _serve(
 
 
 def _protocols(folders: Sequence[Path], schedules: Sequence[Scheduled]) -> tuple[str, ...]:
-    """Where protocols may be, absolute; the root of the file system is no folder of anybody's."""
+    """Return the absolute folders in which protocols may be; the file system's root is excluded."""
     named = [
         Path(item.parameters["protocol"]) for item in schedules if "protocol" in item.parameters
     ]

@@ -1,6 +1,6 @@
-"""What `sliplab serve` was started with, told to the processes of its flow runs.
+"""Settings of `sliplab serve`, passed to the processes of its flow runs.
 
-It goes through the environment and not through the runs' parameters, which anybody who sees
+They are passed by the environment and not by the runs' parameters, which anybody who sees
 Prefect's page could change.
 """
 
@@ -78,7 +78,7 @@ class Service:
 
 
 def service() -> Service:
-    """What this process is served by.
+    """Return the settings of the service that started this process.
 
     Raises:
         RuntimeError: nobody serves here.

@@ -81,7 +81,7 @@ class Classification(Part):
 
 
 class CalibrationScores(Part):
-    """How far probabilities are from what happens."""
+    """Difference between predicted probabilities and observed frequencies."""
 
     ece: Number
     """Expected calibration error, 0 to 1."""
@@ -153,7 +153,7 @@ class Seeds(Part):
 
 
 class WindowWork(Part):
-    """What the network computes for a window, in the mean."""
+    """Mean work of the network per window."""
 
     synaptic_operations: dict[str, Number]
     """Additions that input spikes cause, by weighted layer, and `all`."""
@@ -183,10 +183,10 @@ class Baseline(Part):
 
 
 class TrainedBaseline(Baseline):
-    """A trained method beside the network."""
+    """A trained method that the network is compared with."""
 
     made: dict[str, Any]
-    """What was fitted, in words and numbers."""
+    """Description of the fit, in words and numbers."""
 
 
 class SampleCounts(Part):
@@ -478,7 +478,7 @@ Experiments = dict[str, ExperimentScores]
 
 
 class Evaluation(Document):
-    """What `evaluate` keeps of the store's network."""
+    """Results that `evaluate` keeps of the store's network."""
 
     key: str = ""
     """Of what made it."""
@@ -501,7 +501,7 @@ class Evaluation(Document):
 
 
 class OtherEvaluation(Document):
-    """What `evaluate` keeps of another network: of `analysis.also`, or of `--model`."""
+    """Results that `evaluate` keeps of another network: of `analysis.also`, or of `--model`."""
 
     key: str = ""
     data_key: str | None = None
@@ -509,7 +509,7 @@ class OtherEvaluation(Document):
     title: str
     """The network in words."""
     engine: str
-    """What counted its spikes: `fast` or `sinabs`."""
+    """Engine that counted its spikes: `fast` or `sinabs`."""
     exact: Bool
     """Both give the same counts by arithmetic."""
     preset: str | None
@@ -521,12 +521,12 @@ class OtherEvaluation(Document):
 
 
 class BaselineResult(Document):
-    """What `evaluate --baselines` keeps of one method; its votes stand beside it."""
+    """Results that `evaluate --baselines` keeps of one method; its votes are in another file."""
 
     key: str = ""
     argmax: Number | None
     made: dict[str, Any]
-    """What was fitted, in words and numbers."""
+    """Description of the fit, in words and numbers."""
 
 
 class LabelCheck(Document):

@@ -19,7 +19,7 @@ RULES: tuple[Rule, ...] = ("paper", "change_point")
 
 
 class OnsetDoubts(Part):
-    """Why an onset is not known although a rule gives one, in words; null where it is known."""
+    """Reason why an onset is ambiguous although a rule gives one, in words; null where known."""
 
     incipient: str | None = None
     gross: str | None = None
@@ -69,7 +69,7 @@ class TrialLabel(RuleOnsets, Document):
     end_ns: Int
     """End of the slip: the plate came to rest after gross onset, or the motion ended."""
     rule: Rule = "paper"
-    """Which onsets count."""
+    """Rule whose onsets are used."""
     reference: Literal["hold_start", "hold_end"] | None = None
     """The end of the hold from which displacements count by the paper's rule; null in older labels,
     which count from its end."""
@@ -79,7 +79,7 @@ class TrialLabel(RuleOnsets, Document):
     """By the paper's rule, from either end of the hold; null in older labels."""
     change_point: ChangePoints | None = None
     hold_slip_px: tuple[Number | None, ...] = ()
-    """How far each marker moved in the hold; null where that is unknown."""
+    """Displacement of each marker in the hold; null where unknown."""
     markers_lost: Int = 0
     """Marker-frames without a measurement."""
     plate_lost: Int = 0
@@ -87,11 +87,11 @@ class TrialLabel(RuleOnsets, Document):
     camera_moved_px: Number | None = None
     """Largest shift of the camera."""
     flags: tuple[str, ...] = ()
-    """What a person should look at first, in words."""
+    """Warnings that a reviewer should check first, in words."""
     quality: tuple[Number, ...] = ()
     """Each marker's lowest quality from the motion's start to its slip, 0 to 1."""
     source: str | None = None
-    """`video`, or `tracks` that the camera handed over."""
+    """`video`, or `tracks` that the camera provided."""
 
     def by_rule(self, rule: Rule) -> RuleOnsets:
         """Return the onsets of one rule.

@@ -21,7 +21,7 @@ class ValidationAccuracy(Part):
 
 
 class TrainedModel(Document):
-    """What `train` keeps of one seed."""
+    """Record that `train` keeps of one seed."""
 
     key: str
     """Of what the network was trained on, and by which settings."""

@@ -110,9 +110,9 @@ class DeviceRecord(Part):
     map: Map
     """From the device's clock to the time line."""
     uncertainty_ns: Number | None = None
-    """How far the map may be off within the trial; null where that is unknown."""
+    """Bound of the map's error within the trial; null where unknown."""
     grade: str = "unknown"
-    """How the device is timed."""
+    """Method by which the device is timed."""
     kind: str | None = None
     """`95 %` or `hard bound`: the meaning of the uncertainty."""
     drift_ppm: Number | None = None
@@ -151,9 +151,9 @@ class Clocks(Part):
     frames: DeviceRecord | None = None
     arm: DeviceRecord | None = None
     refused: dict[str, str] = Field(default_factory=dict)
-    """Why a device has no clock."""
+    """Reasons why devices have no clock, by device."""
     pieces: dict[str, list[DeviceRecord | str]] = Field(default_factory=dict)
-    """Of a device that began anew within the trial: each piece, or why it was not fitted."""
+    """Of a device that restarted within the trial: each piece, or why it was not fitted."""
 
     def devices(self) -> dict[str, DeviceRecord]:
         """The clocks that are known, by device."""
@@ -208,7 +208,7 @@ class Imported(Part):
     epoch: str | None = None
     """The zero of its times, in words."""
     unknown: tuple[str, ...] = ()
-    """What nobody knows of it any more."""
+    """Facts about the trial that are no longer known."""
     warnings: tuple[str, ...] = ()
 
 
@@ -232,7 +232,7 @@ class TrialRecord(Document):
     motion_s: Number | None = None
     """Seconds from the first step to the end of the last."""
     depth_zero_mm: Number | None = None
-    """Where the arm found contact, from the rig's plane."""
+    """Depth at which the arm found contact, from the rig's plane."""
     counts: Counts
     clocks: Clocks
     timing: RecordedTiming | None = None
@@ -286,6 +286,6 @@ class SyncResult(Document):
     raw: str | None = None
     """Checksum of the raw data that it is of."""
     refused: dict[str, str] = Field(default_factory=dict)
-    """Why a device could not be fitted again."""
+    """Reasons why devices could not be fitted again, by device."""
     clocks: Clocks | None = None
     """The clocks, where they differ from those of the record."""

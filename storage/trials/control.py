@@ -42,7 +42,7 @@ class Request(Entry):
 
     @property
     def by(self) -> Json:
-        """Who, when and why, to be kept with what follows from it."""
+        """Person, time and reason of the request, to be kept with its consequences."""
         names = ("who", "when", "why", "host")
         return {**{name: getattr(self, name) for name in names}, "request": self.number}
 
