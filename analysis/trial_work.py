@@ -1,4 +1,4 @@
-"""Results that are wanted of single trials, each with the key that it must have."""
+"""Results to compute from single trials, each with the key of its inputs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from sliplab.storage.trials.recording import Recording
 from sliplab.storage.trials.store import Store
 
 Make = Callable[[Recording, Any], Any]
-"""Of a trial and settings, what is wanted. It may run in processes of their own, so it stands in a
-module, best in one that loads quickly. For `run_trials`, a result's JSON and its arrays."""
+"""Compute a result of a trial and settings. It may run in other processes, so it is a function of a
+module that loads quickly. For `run_trials` it returns a result's JSON and arrays."""
 
 
 @dataclass(frozen=True)
 class TrialWork:
-    """One result that is wanted of one trial, with the key it must have."""
+    """One result to compute from one trial, with the key of its inputs."""
 
     recording: Recording
     campaign: str
@@ -25,26 +25,26 @@ class TrialWork:
     settings: Any = None
 
 
-def stale_trials(store: Store, step: str, wanted: list[TrialWork]) -> list[TrialWork]:
-    """Those of `wanted` that have to be made."""
+def stale_trials(store: Store, step: str, required: list[TrialWork]) -> list[TrialWork]:
+    """Return the `required` results that are missing or have another key."""
     return [
         work
-        for work in wanted
+        for work in required
         if not Derived.of(store, step, work.campaign).fresh(work.recording.folder.name, work.key)
     ]
 
 
 Done = Callable[[int, Any], None]
-"""Gets the number of an item of the work, and what was made of it."""
+"""Receives the number of an item of the work, and its result."""
 EachTrial = Callable[[Sequence[TrialWork], Make, Done], None]
-"""Makes every item of some work, in any order: in this process, or on other machines."""
+"""Computes every item of some work, in any order: in this process, or on other machines."""
 
 
 def in_order(work: Sequence[TrialWork], make: Make, done: Done) -> None:
-    """Make every item in this process, one after the other."""
+    """Compute every item in this process, one after the other."""
     for number, item in enumerate(work):
         done(number, make(item.recording, item.settings))
 
 
 KeepTrials = Callable[[str, list[TrialWork], Make], None]
-"""Makes every item of some work and keeps it among the derived results of a step, by its name."""
+"""Computes every item of some work and stores it with the derived results of the named step."""

@@ -44,11 +44,11 @@ def take_trials(session: Opaque[Session], trials: Opaque[list[Trial]]) -> int:
 @flow(name="collect", validate_parameters=False, persist_result=False)
 def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
     """Take the trials of a run request that its store lacks."""
-    wanted = run_request.content
+    request = run_request.content
     with (
-        shown(wanted) as progress,
-        run_session(wanted) as work,
-        timed(Store(wanted.store), f"collect {wanted.campaign}"),
+        shown(request) as progress,
+        run_session(request) as work,
+        timed(Store(request.store), f"collect {request.campaign}"),
     ):
         session, trials = work.session, work.trials
         session.on_trial, work.gate.on_pause = progress.on_trial_done, progress.on_pause
@@ -59,10 +59,10 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
                 taken = 0
                 while taken < len(trials):
                     taken += take_trials(Opaque(session), Opaque(trials[taken:]))
-                trials = work.gate.more() if wanted.most is None else []
+                trials = work.gate.more() if request.most is None else []
                 progress.add(trials)
         return {
-            **wanted.counts(session.campaign),
+            **request.counts(session.campaign),
             "taken": session.taken,
             "retaken": session.retaken,
             "left_out": work.left_out,
@@ -81,7 +81,7 @@ def collect(run_request: RunRequest) -> dict[str, Any]:
     if control.open_requests(store):  # whoever asked was killed before it was done
         with store_lock(store):
             carry_out(store)
-    if run_request.wanted(store.campaign(run_request.campaign)):
+    if run_request.due_trials(store.campaign(run_request.campaign)):
         check_disk([run_request])
         return run(collect_flow, Opaque(run_request))
     return {

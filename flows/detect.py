@@ -158,16 +158,16 @@ def load_model(path: Path) -> Fitted:
         raise InputError(path, "", None, text) from None
 
 
-def choose_trial(plan: Plan, wanted: str | None) -> Trial:
+def choose_trial(plan: Plan, condition: str | None) -> Trial:
     """Find the first trial of a condition, which may omit the repetition and single levels.
 
     Args:
-        wanted: as in a trial's id: ``depth=2.4mm,direction=0deg``, in any request.
+        condition: as in a trial's id: ``depth=2.4mm,direction=0deg``, in any order.
 
     Raises:
         InputError: no trial has it, or trials of several conditions do.
     """
-    parts = {part.strip() for part in (wanted or "").split(",") if part.strip()}
+    parts = {part.strip() for part in (condition or "").split(",") if part.strip()}
     measured = [trial for trial in plan if trial.role == "measured"]
     found = [trial for trial in measured if parts <= set(trial.id.split(","))]
     conditions = list(dict.fromkeys(trial.condition for trial in found))
@@ -177,9 +177,9 @@ def choose_trial(plan: Plan, wanted: str | None) -> Trial:
     names = [*firsts.values()][:SHOWN]
     more = f" and {len(firsts) - SHOWN} more" if len(firsts) > SHOWN else ""
     what = "fits several conditions" if found else "fits no trial"
-    if wanted is None:
+    if condition is None:
         what = "is needed: which of the protocol's conditions"
-    raise InputError("--trial", "", wanted, f"{what}: {'; '.join(names)}{more}")
+    raise InputError("--trial", "", condition, f"{what}: {'; '.join(names)}{more}")
 
 
 def make_reflex(text: str, file: RigFile, plan: Plan, trial: Trial, hold_s: float) -> Reflex:

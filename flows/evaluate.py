@@ -1,4 +1,4 @@
-"""Evaluation: the trained network on trials it has never seen, and what stands beside it.
+"""Evaluation of the trained network and its baselines on trials it has never seen.
 
 Beside it are other networks, other methods on the same windows, and checks that try to show that a
 figure cannot be trusted.
@@ -56,13 +56,13 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "validation", "test")
 CHECKED_EPOCHS = 3
-"""Of each training on shuffled labels: as many as true labels need to be well above chance."""
+"""Epochs of each training on shuffled labels: enough to beat chance clearly with true labels."""
 CHECKED_WINDOWS = 2000
-"""Test windows that are looked at, evenly spread over all."""
+"""Number of test windows that are checked, evenly spread over all."""
 
 
 def _keeper(store: Store, cluster: Cluster | None) -> KeepTrials:
-    """Return what counts spikes and keeps them: in this process, where the network uses all cores,
+    """Return a function that counts and stores spikes: in this process, where it uses all cores,
     or on a cluster."""
 
     def keep(step: str, work: list[TrialWork], make: Make) -> None:
@@ -101,15 +101,15 @@ def evaluate(
 
 
 @flow(name="evaluate", validate_parameters=False, persist_result=False)
-def evaluate_flow(wanted: Opaque[tuple[Job, Cluster | None]]) -> None:
+def evaluate_flow(argument: Opaque[tuple[Job, Cluster | None]]) -> None:
     """Count spikes where needed, then score."""
-    job, cluster = wanted.content
+    job, cluster = argument.content
     keep, threads = _keeper(job.store, cluster), None if cluster is None else 1
     windows = training_settings(job.campaigns).windows
     with timed(job.store, "evaluate"):
         trials = [(item.name, recording, key) for item, _, recording, key in job.trials]
         count_spikes(job.store, job.model.path, windows, trials, keep, threads)
-        predict_trials(job.store, job.model.path, windows, job.detectors.wanted, keep, threads)
+        predict_trials(job.store, job.model.path, windows, job.detectors.requests, keep, threads)
         train, test = (
             load_samples(job.labels, job.campaigns, split, sample_maker(job.store, split, cluster))
             for split in ("train", "test")
@@ -118,9 +118,9 @@ def evaluate_flow(wanted: Opaque[tuple[Job, Cluster | None]]) -> None:
 
 
 @task(name="scores", cache_policy=NO_CACHE, persist_result=False)
-def score(wanted: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
+def score(argument: Opaque[tuple[Job, SampleSet, SampleSet]]) -> None:
     """Windows, detections and label errors, kept as one result."""
-    score_store(*wanted.content)
+    score_store(*argument.content)
 
 
 def judge_model(
@@ -226,9 +226,9 @@ def _judge(judgement: Judgement, cluster: Cluster | None) -> bool:
 
 
 @flow(name="judge a network", validate_parameters=False, persist_result=False)
-def judge_flow(wanted: Opaque[tuple[Judgement, Cluster | None]]) -> None:
+def judge_flow(argument: Opaque[tuple[Judgement, Cluster | None]]) -> None:
     """Count spikes of every test trial, then score."""
-    judgement, cluster = wanted.content
+    judgement, cluster = argument.content
     with timed(judgement.store, "evaluate"):
         judgement.count(_keeper(judgement.store, cluster), None if cluster is None else 1)
         networks.score_network(judgement)

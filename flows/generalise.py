@@ -44,7 +44,7 @@ SKINS, TRIALS = 5, 36
 
 
 class _Results(ResultFile):
-    """The results, with a table of all beside them."""
+    """The results, and a table of all of them."""
 
     def write(self, name: str, key: str, data: Json, arrays: Json | None = None) -> None:
         super().write(name, key, data, arrays)

@@ -3,7 +3,7 @@
 Some of a study's test trials are taken again on the same simulated rig with one assumed number 20 %
 lower, then 20 % higher. They are labelled anew and judged by the study's own network and detection
 settings. Each setting is a small store, which goes when its figures are kept; so the sweep may be
-stopped anywhere, and goes on.
+stopped anywhere, and resumes.
 """
 
 from __future__ import annotations

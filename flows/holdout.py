@@ -4,7 +4,7 @@ Test trials of a study judge every change of the program, so the changes that st
 test trials liked: after some years they choose the design, a little. The trials here have a seed
 and a skin of the simulated rig that stand nowhere else. The study's own network and detection
 settings are judged on them, as they are, once with each version of the program; each time stands in
-the ledger beside the figures, so that a reader sees how often somebody looked.
+the ledger next to the figures, so that a reader sees how often somebody looked.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Labelling: onsets of every committed trial whose label is missing or stale, and a check of them.
 
-A study on a rig that hands over tracks in the place of video sees labels, but not what finding the
+A study on a rig that provides tracks instead of video sees labels, but not what finding the
 markers does to them. So some of its trials, the first of its shuffled order, are taken once more
 on the same rig with its camera at the level `video`, into a store of their own inside the study's,
 and their labels are compared with the simulation's truth.
@@ -35,7 +35,7 @@ CHECK_VERSION = 1
 CHECKED_TRIALS = 60
 
 
-def _wanted(campaigns: list[Collected]) -> list[TrialWork]:
+def _required_labels(campaigns: list[Collected]) -> list[TrialWork]:
     """The label of every trial."""
     return [
         TrialWork(recording, item.name, label_key(recording, settings), settings)
@@ -49,10 +49,10 @@ def label(
     store: Store, campaigns: list[Collected], cluster: Cluster | None = None
 ) -> dict[str, Any]:
     """Label every trial of `campaigns` that needs it."""
-    wanted = _wanted(campaigns)
-    stale = stale_trials(store, LABELS, wanted)
+    required = _required_labels(campaigns)
+    stale = stale_trials(store, LABELS, required)
     run_trials(store, LABELS, "label", stale, labelling.label_results, cluster)
-    return {"step": "label", "done": len(stale), "fresh": len(wanted) - len(stale)}
+    return {"step": "label", "done": len(stale), "fresh": len(required) - len(stale)}
 
 
 def report_states(labels: Labels, campaigns: list[Collected]) -> dict[str, dict[State, int]]:
@@ -88,15 +88,15 @@ def video_request(run_request: RunRequest, trials: int) -> RunRequest:
     rig = folder.with_suffix(".yaml")
     write_text(rig, rig_yaml(data))
     protocol = Store.open(run_request.store).campaign(run_request.campaign).protocol_file
-    wanted = make_request(protocol, rig, folder, campaign=run_request.campaign)
+    request = make_request(protocol, rig, folder, campaign=run_request.campaign)
     there = 0
     if (folder / "store.json").exists():
         there = len(Store.open(folder).campaign(run_request.campaign).committed())
-    return replace(wanted, most=max(trials - there, 0))
+    return replace(request, most=max(trials - there, 0))
 
 
-def check_wanted(run_request: RunRequest) -> bool:
-    """Check that there is anything to check: a simulated rig that draws no video."""
+def check_required(run_request: RunRequest) -> bool:
+    """Return True where labels need a check: a simulated rig that draws no video."""
     return run_request.rig.simulated and run_request.rig.frame_source == "tracks"
 
 

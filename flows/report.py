@@ -1,6 +1,6 @@
 """`sliplab report`: `report/index.html` for people and `report/summary.json` for programs.
 
-Every figure also stands beside them as `report/figures/NAME.svg`, its data as
+Every figure is also written as `report/figures/NAME.svg`, its data as
 `report/data/NAME.csv`; the page needs neither, nor anything else.
 """
 
@@ -89,9 +89,9 @@ def _key(store: Store, campaigns: list[Collected]) -> str:
 
 
 @flow(name="report", validate_parameters=False, persist_result=False)
-def report_flow(wanted: Opaque[tuple[Store, list[Collected], str]]) -> None:
+def report_flow(argument: Opaque[tuple[Store, list[Collected], str]]) -> None:
     """Write page and summary; the summary last, with the key."""
-    store, campaigns, key = wanted.content
+    store, campaigns, key = argument.content
     folder = report_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
     with timed(store, "report"):
@@ -132,7 +132,7 @@ def _planned_bytes(item: Collected) -> int:
 
 
 def _shown(sources: Sources) -> content.Shown:
-    """Read what the page shows beside the summary's numbers."""
+    """Read what the page shows besides the summary's numbers."""
     store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
     models = wanted_models(store, campaigns, evaluation.reviewed is not None)
     model = choose_model(models)

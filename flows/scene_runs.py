@@ -47,7 +47,7 @@ PERFECT = Clocks(
 EVENT_TRIALS = 2
 """Trials of a sensitivity analysis that are run as a whole, for event rates."""
 STEP_MM = 0.05
-"""Of the contact in a slide that is simulated by contact alone."""
+"""Step of the contact in a slide that is simulated by contact alone, mm."""
 _SMALL_PX = 32
 
 

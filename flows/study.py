@@ -25,7 +25,7 @@ from sliplab.flows.evaluate import evaluate, window_baselines
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.holdout import STEP, measure_holdout
-from sliplab.flows.label import check_labels, check_wanted, label
+from sliplab.flows.label import check_labels, check_required, label
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study_ledger import Ledger, Row
@@ -48,11 +48,11 @@ SYNC_S = 0.03
 SAMPLES_PER_S = 1500.0
 EVALUATE_S = 0.045
 START_S = 4.0
-"""Of a step however little there is to do: processes, kernels, pages."""
+"""Fixed time of a step: processes, kernels, pages."""
 BASELINE_S = 0.0105
-"""Of all ordinary networks and trees, for a training window."""
+"""Time of all ordinary networks and trees, per training window."""
 LEVEL_S = 0.0004
-"""Of a level that is left out, for a window and an epoch."""
+"""Time of a level that is left out, per window and epoch."""
 SKIN_S, GUESS_S, SCENE_S, SEARCH_S = 25.0, 40.0, 120.0, 6000.0
 
 Json = dict[str, Any]
@@ -95,7 +95,7 @@ def study(
         holdout: trials of the campaign that chooses nothing, where slides are simulated.
     """
     Store.create(run_requests[0].store)
-    check = check if check_wanted(run_requests[0]) else 0
+    check = check if check_required(run_requests[0]) else 0
     slides = _slides(run_requests)
     holdout = holdout if slides and slides[0].rig.simulated else 0
     ledger = Ledger(run_requests[0].store, expected(run_requests, check, more, holdout))

@@ -31,7 +31,7 @@ PAGE_VERSION = 1
 COLUMNS = (
     "device", "grade", "median\n(µs)", "worst\n(µs)", "drift (ppm)", "missed /\nlate / spurious"
 )  # fmt: skip
-"""Of the tables for a terminal; uncertainties are of events against the device, both clocks
+"""Columns of the tables for a terminal; uncertainties are of events against the device, both clocks
 together; of events, their own."""
 
 
@@ -39,17 +39,17 @@ def sync(
     store: Store, campaigns: list[Collected], cluster: Cluster | None = None
 ) -> dict[str, Any]:
     """Fit what is stale, and write the page if anything on it has changed."""
-    wanted = [
+    required = [
         TrialWork(recording, item.name, sync_key(recording))
         for item in campaigns
         for _, recording in item.trials
     ]
-    stale = stale_trials(store, SYNC, wanted)
+    stale = stale_trials(store, SYNC, required)
     run_trials(store, SYNC, "sync", stale, fit_again, cluster)
-    for work in wanted:
+    for work in required:
         work.recording.forget_clocks()
     trials = {item.name: read_trials(store, item) for item in campaigns}
-    page = _write_page(store, campaigns, wanted, trials)
+    page = _write_page(store, campaigns, required, trials)
     found = {
         name: campaign_clocks(of, sum(work.campaign == name for work in stale))
         for name, of in trials.items()
@@ -61,7 +61,7 @@ def sync(
     return {
         "step": SYNC,
         "done": len(stale),
-        "fresh": len(wanted) - len(stale),
+        "fresh": len(required) - len(stale),
         "changed": sum(known.changed for known in found.values()),
         "simulated": store.simulated,
         "page": str(page),
@@ -72,12 +72,12 @@ def sync(
 def _write_page(
     store: Store,
     campaigns: Sequence[Collected],
-    wanted: Sequence[TrialWork],
+    required: Sequence[TrialWork],
     trials: Mapping[str, Sequence[TrialClocks]],
 ) -> Path:
     path = store.folder / "report" / PAGE
     quarantined = [[item.name, item.campaign.quarantined()] for item in campaigns]
-    shown = [[work.campaign, work.key] for work in wanted]
+    shown = [[work.campaign, work.key] for work in required]
     key = make_key(SYNC, PAGE_VERSION, [shown, quarantined], None)
     kept = Derived.of(store, SYNC)
     if not kept.fresh("page", key) or not path.exists():

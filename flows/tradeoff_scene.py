@@ -1,7 +1,7 @@
-"""`sliplab tradeoff --scene`: what each way of simulating a trial costs, and how far off it is.
+"""`sliplab tradeoff --scene`: cost and error of each way to simulate a trial.
 
 Every variant runs the same trials with the same seeds. It is timed as the rig file has it, on this
-machine with nothing of ours beside, and compared with the dearest variant without noise and
+otherwise idle machine, and compared with the dearest variant without noise and
 read-out, here or on a Dask cluster, so that the scene alone differs.
 """
 
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 ROUNDS = 2
 STEPS = (1, 2, 4, 8, 16, 32)
 CONTACT_TRIALS = 12
-"""Trials of a sensitivity analysis that onsets are of."""
+"""Trials of a sensitivity analysis that onsets are taken from."""
 PAGE, NUMBERS, TABLE = "tradeoff.html", "tradeoff.json", "sensitivity.md"
 Each = Callable[..., list[Any]]
-"""Of a function, jobs and ``done=``, which is called after each: all results, in order."""
+"""Call a function on jobs, and ``done=`` after each; return all results in order."""
 
 
 def tradeoff_scene(

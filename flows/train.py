@@ -78,10 +78,10 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
 
 @flow(name="train", validate_parameters=False, persist_result=False)
 def train_flow(
-    wanted: Opaque[tuple[Labels, list[Collected], list[Model], Cluster | None]],
+    argument: Opaque[tuple[Labels, list[Collected], list[Model], Cluster | None]],
 ) -> int:
     """Train the seeds that are stale, one after the other."""
-    labels, campaigns, models, cluster = wanted.content
+    labels, campaigns, models, cluster = argument.content
     simulated = any(r.simulated for item in campaigns for _, r in item.trials[:1])
     with timed(labels.store, "train"):
         train, validation = (

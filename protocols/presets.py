@@ -62,7 +62,7 @@ PAPER = (
 """Overlapping windows would have been said; mirroring, layers' sizes, loss and rate are not."""
 
 COMPARED = ("network", "training", "detection")
-"""Sections that a network beside the protocol's own takes from a preset; it shares the others."""
+"""Sections that an additional network takes from a preset; it shares the others."""
 
 
 def expanded(data: Mapping[str, Any]) -> dict[str, Any]:

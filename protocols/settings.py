@@ -178,7 +178,7 @@ class Training(StrictModel):
 
 
 class Comparison(StrictModel):
-    """Other detectors beside the paper's rule, at equal rates of false early detections."""
+    """Other detectors compared with the paper's rule, at equal rates of false early detections."""
 
     rates: tuple[Annotated[float, Field(le=1)], ...] = (0.005, 0.01, 0.02)
     """False early detections allowed, as shares of the validation trials."""
@@ -221,7 +221,7 @@ class Detection(StrictModel):
     false_early_rate: float = Field(default=0.02, ge=0, lt=1)
     """Share of trials that a choice may leave false early, and as many missed."""
     compare: Comparison | None = Comparison()
-    """Other detectors beside this rule (docs/detection.md); null leaves them out."""
+    """Other detectors to compare with this rule (docs/detection.md); null leaves them out."""
 
     @field_validator("smoothing_grid", "margin_grid")
     @classmethod
@@ -246,7 +246,7 @@ class AnalysisSettings(StrictModel):
     it go before its values."""
     also: Literal["paper"] | None = None
     """A preset whose network is trained and judged as well, on the same windows and labels, with
-    the first seed; its figures stand beside the others in the report."""
+    the first seed; the report compares its figures with the others."""
     labelling: Labelling = Labelling()
     windows: Windows = Windows()
     samples: Samples = Samples()

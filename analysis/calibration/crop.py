@@ -2,7 +2,7 @@
 
 Every marker fires along its rim while the skin is moved about, so where events are is the layout
 smeared by the motion. The smallest circle round it does not mind that some papillae bear more than
-others, which pulls a mean aside.
+others, which biases a mean.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STEP_PX = 20
 """A crop is a multiple of this, the side of a pooled cell."""
 _BLUR_PX = 9
 _SHARE = 0.1
-"""Of the brightest of the blurred counts: what is above it belongs to the skin."""
+"""Share of the highest blurred count above which a cell belongs to the skin."""
 _LEAST_EVENTS = 2000
 _ROUND = 0.6
 """Least ratio of the narrowest to the widest spread of what fires."""

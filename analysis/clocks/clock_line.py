@@ -42,7 +42,7 @@ _PIECE_PULSES = 30
 _PIECES = 4
 """Into so many pieces a straight clock is cut, and one with knots into twice as many as it has."""
 _MOVED_KNOTS = 4
-"""As long as there are so few knots, each is moved to its best place when one is added."""
+"""Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
 """Share of straight clocks with locked stamps that are taken for bent."""
@@ -98,7 +98,7 @@ class ClockLine:
             bends, ns.
         jump: by how much the clock jumped somewhere, ns; 0 if it did not.
         straightened: whether what is left over looks like chance.
-        aside: how many pieces at the begin and at the end follow pulses that nothing vouches for;
+        unverified: number of pieces at either end that follow pulses which nothing confirms;
             uncertainty, slopes and sudden are of the others.
     """
 
@@ -111,12 +111,12 @@ class ClockLine:
     sudden: float
     jump: float
     straightened: bool
-    aside: tuple[int, int] = (0, 0)
+    unverified: tuple[int, int] = (0, 0)
 
     @property
     def span(self) -> tuple[float, float]:
-        """From where to where pulses may vouch for the line, ns."""
-        return float(self.knots[self.aside[0]]), float(self.knots[-1 - self.aside[1]])
+        """First and last x between which pulses confirm the line, ns."""
+        return float(self.knots[self.unverified[0]]), float(self.knots[-1 - self.unverified[1]])
 
     @cached_property
     def residual_p95(self) -> float:
@@ -127,7 +127,7 @@ class ClockLine:
     def slopes(self) -> Floats:
         """Slope of each piece."""
         every: Floats = np.diff(self.values) / np.diff(self.knots)
-        return every[self.aside[0] : every.size - self.aside[1]]
+        return every[self.unverified[0] : every.size - self.unverified[1]]
 
 
 def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> ClockLine:
@@ -183,7 +183,7 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
                 # a step may be taken for a change of drift, and hides in the knot from then on
                 mistaken = max(mistaken, abs(found.step_size))
             knots = np.sort(np.append(knots, x[found.knot_at]))
-        # a knot beside its place leaves a step there
+        # a knot off its place leaves a step there
         moved = bool(step) or pieces <= _MOVED_KNOTS
         if moved:
             knots = _moved(x, y, knots, inside, noise)
@@ -204,8 +204,8 @@ def fit_line(x: Floats, y: Floats, resolution: float, bend_per_ns: float) -> Clo
 
 
 def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
-    """The line with a piece more over the pulses that were left out, which nobody vouches for."""
-    (knots, values), aside = (line.knots, line.values), [0, 0]
+    """The line with a piece more over the pulses that were left out, which nothing confirms."""
+    (knots, values), unverified = (line.knots, line.values), [0, 0]
     for end in (0, -1):
         away = x - line.knots[end]
         rest = y - gained(x, line.knots, line.values)
@@ -214,7 +214,7 @@ def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
         top = float((away[left] * rest[left]).sum())
         # chance alone turns a line by little
         if abs(top) > _KNOT * line.sigma * square**0.5:
-            aside[end], turn = 1, top / square
+            unverified[end], turn = 1, top / square
             value = gained(x[[end]], line.knots, line.values) + turn * away[end]
             order = slice(None, None, -1 if end else 1)
             knots = np.concatenate((x[[end]], knots)[order])
@@ -223,12 +223,12 @@ def _followed(line: ClockLine, x: Floats, y: Floats) -> ClockLine:
     inside: Bools = np.abs(residuals) <= _GATE * line.sigma
     return replace(
         line, knots=knots, values=values, residuals=residuals, inside=inside,
-        aside=(aside[0], aside[1]),
+        unverified=(unverified[0], unverified[1]),
     )  # fmt: skip
 
 
 def gained(x: Floats, knots: Floats, values: Floats) -> Floats:
-    """The line at x; beyond its ends it goes on straight."""
+    """Return the line at x, extrapolated linearly beyond its ends."""
     piece, share = places_of(x, knots)
     result: Floats = -residuals_at(piece, share, np.zeros(x.size), values)
     return result
@@ -237,8 +237,8 @@ def gained(x: Floats, knots: Floats, values: Floats) -> Floats:
 def _cut(x: Floats, knots: Floats) -> Floats:
     """Knots with more between them, about `_PIECES` or twice as many pieces as there are."""
     pieces = knots.size - 1
-    wanted = min(max(_PIECES, 2 * pieces), max(x.size // _PIECE_PULSES, 1))
-    length = (knots[-1] - knots[0]) / wanted
+    required = min(max(_PIECES, 2 * pieces), max(x.size // _PIECE_PULSES, 1))
+    length = (knots[-1] - knots[0]) / required
     parts = [knots[:1]]
     for begin, end in pairwise(knots):
         count = max(1, int(np.ceil((end - begin) / length - 0.25)))
@@ -389,7 +389,7 @@ def _judged(
     x: Floats, knots: Floats, at: Floats, values: Floats, residuals: Floats, inside: Bools,
     sigma: float, resolution: float, bend_per_ns: float,
 ) -> ClockLine:  # fmt: skip
-    """The line with its uncertainty; `at` are the knots whose places the pulses told."""
+    """The line with its uncertainty; `at` are the knots whose places were fitted to the pulses."""
     inner, n = residuals[inside], knots.size
     piece, share = places_of(x[inside], knots)
     none = np.zeros(inner.size)
@@ -425,9 +425,9 @@ def _judged(
 
 
 def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Floats:
-    """Covariance of the values at knots, for pulses of variance 1; twice where a place is told.
+    """Covariance of the values at knots, for pulses of variance 1; twice where a place was fitted.
 
-    A knot that lies a little aside makes the line wrong by a step there, to first order (Seber and
+    A knot that is slightly off makes the line wrong by a step there, to first order (Seber and
     Wild 1989, section 9.4): it has one value before and one behind. `matrix` are the normal
     equations of the values, `places` (p,) which knots these are.
     """
@@ -443,12 +443,12 @@ def _with_places(matrix: Floats, piece: Ints, share: Floats, places: Ints) -> Fl
     whole = np.zeros((n + count, n + count))
     whole[:n, :n], whole[n:, :n], whole[:n, n:] = matrix, behind, behind.T
     whole[n:, n:] = pulses[np.maximum.outer(np.arange(count), np.arange(count))]
-    told = np.eye(n + count)
-    told[:n, n:] = np.arange(n)[:, None] > places
+    transform = np.eye(n + count)
+    transform[:n, n:] = np.arange(n)[:, None] > places
     # behind each place: the value of its knot, and all steps up to its own
-    told[n:, n:] = np.tri(count)
-    told[n + np.arange(count), places] = 1.0
-    result: Floats = told @ np.linalg.inv(_held(whole)) @ told.T
+    transform[n:, n:] = np.tri(count)
+    transform[n + np.arange(count), places] = 1.0
+    result: Floats = transform @ np.linalg.inv(_held(whole)) @ transform.T
     return result
 
 

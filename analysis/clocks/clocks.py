@@ -45,16 +45,16 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 CHANCE = 1e-5
-"""Probability that a train whose bad pulses lie anywhere is taken for one whose clock jumped."""
+"""Probability that scattered bad pulses are mistaken for a jump of the clock."""
 BURST = 9
 """Pulses in a row that may be bad at once for another reason, as when a device is busy."""
 BURST_AT_END = 2
-"""The same at the trains' ends, where nothing after it vouches for the line. A clock that jumps at
-the last two pulses cannot be told from two late pulses."""
+"""The same at the trains' ends, where nothing later confirms the line. A clock that jumps at
+the last two pulses cannot be distinguished from two late pulses."""
 _WIDTHS = (16, 24, 32, 48, 64, 96, 128)
 _WIDTHS_AT_END = (8, 12, 16, 24, 32)
 _LEAST, _MOST_DEVICE, _MOST_REFERENCE = 0.02, 0.25, 0.4
-"""Shares of bad pulses that are assumed at least and at most: a jump must not vouch for itself."""
+"""Shares of bad pulses that are assumed at least and at most: a jump must not confirm itself."""
 _MOST_LOSSY = 0.48
 """The same where both trains have more bad ones than that, which then is asked of their best
 quarters."""
@@ -140,7 +140,7 @@ def _best_quarter(on_line: Ints) -> float:
 
 
 def unevenness(on_line: Ints) -> float:
-    """By how many standard deviations the share of pulses on the line differs before and after.
+    """Change of the share of pulses on the line from before to after, standard deviations.
 
     The largest of all times that leave 16 pulses on either side.
     """
@@ -158,7 +158,7 @@ def unevenness(on_line: Ints) -> float:
 
 @lru_cache(maxsize=4096)
 def _limit(width: int, device: float, reference: float, log_places: int) -> int:
-    """As many of `width` pulses may be off the line by chance, in one of 2**log_places windows."""
+    """Return how many of `width` pulses may be off by chance, in one of 2**log_places windows."""
     k = np.arange(width)
     both = special.bdtrc(k, width, device) * special.bdtrc(k, width, reference)
     return int((both * 2.0**log_places * 10 > CHANCE).sum())
@@ -181,12 +181,12 @@ UNEVEN = 3.5
 MIN_EITHER = 0.75
 """Both trains lost many pulses where less than this share of each fits."""
 UNVOUCHED = 3
-"""A clock that jumps at the last two pulses cannot be told from two late ones, and a second report
+"""A clock that jumps at the last two pulses looks the same as two late ones, and a second report
 of one of three may stand where that pulse belongs."""
 UNDISTURBED = "let nothing set or restart a clock during a trial, and take it again"
 SAME_TRIAL = "check that both recordings are of the same trial, and the cable of the sync line"
 BEND_PPM_S = 2.0
-"""By how much a clock's drift may change in a second without being taken for a jump; a crystal that
+"""Largest change of a clock's drift in a second that does not count as a jump; a crystal that
 warms up by 10 K in a minute makes 0.4."""
 
 
@@ -349,7 +349,7 @@ def _fit(
         clock = ClockMap.through(
             [device_0 + int(knot) for knot in knots], [reference_0 + int(image) for image in images]
         )
-    # what lies at the edge of chance does not vouch for what comes before it
+    # what lies at the edge of chance does not confirm what comes before it
     begin, end = line.span
     vouched = (px >= begin) & (px <= end)
     seen = px[inside & vouched & (np.abs(line.residuals) <= 3 * line.sigma)]

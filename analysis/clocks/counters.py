@@ -1,7 +1,7 @@
 """Device counters as times: wrapped counters made whole, and restarts found.
 
 Cameras count in 32 bits: microseconds wrap after 71 minutes, 8 ns ticks after 34 seconds. A counter
-that falls back has wrapped or its device has begun anew; the two are told apart by how long the
+that falls back has wrapped or its device has restarted; the two are distinguished by how long the
 step would have taken. After a restart nothing that was known of a clock holds, so a trial is split
 there and each part is fitted by itself.
 """
@@ -56,7 +56,7 @@ def unwrap(
     Args:
         counts: (n,) unsigned stamps in the order in which they came, each below 2**bits.
         bits: width of the counter, 1 to 62.
-        tick_ns: what a count is worth, ns.
+        tick_ns: duration of a count, ns.
         max_gap_ns: the longest silence to be expected within a trial, ns; below a turn.
         host_ns: (n,) when each stamp arrived, host clock, ns.
         host_error_ns: by how much host intervals may be wrong; below a quarter turn.

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def median(values):  # type: ignore[no-untyped-def]
-    """As np.median, of floats of which there is at least one and none is NaN."""
+    """Return the same as np.median for at least one float and no NaN."""
     half = values.size // 2
     parted = np.partition(values, half)
     middle = parted[half]
@@ -23,7 +23,7 @@ def median(values):  # type: ignore[no-untyped-def]
 
 
 def quantile(values: NDArray[np.float64 | np.int64], share: float) -> float:
-    """As np.quantile, of numbers of which there is at least one and none is NaN."""
+    """Return the same as np.quantile for at least one number and no NaN."""
     place = (values.size - 1) * share
     below = int(place)
     above = min(below + 1, values.size - 1)
@@ -91,7 +91,7 @@ def partners(predicted, y, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fullest(ordered, window):  # type: ignore[no-untyped-def]
-    """Of ascending numbers the first from which on the most lie within `window`; 0 of none."""
+    """Return the first ascending number from which the most lie within `window`; 0 of none."""
     best, start, end = 0, 0.0, 0
     for k in range(ordered.size):
         while end < ordered.size and ordered[end] <= ordered[k] + window:
@@ -103,7 +103,7 @@ def fullest(ordered, window):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def places_of(x, knots):  # type: ignore[no-untyped-def]
-    """The piece between two knots on which each of rising x lies, and where on it, from 0 to 1."""
+    """Return the piece between two knots for each rising x, and its place on it, from 0 to 1."""
     piece, share = np.empty(x.size, np.int64), np.empty(x.size)
     k = 0
     for j in range(x.size):
@@ -115,7 +115,7 @@ def places_of(x, knots):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(piece, share, y, residuals, gate, limit, n):  # type: ignore[no-untyped-def]
-    """Of the values at n knots: the matrix (n, n) and the right side (n,).
+    """Normal equations of the values at n knots: matrix (n, n) and right side (n,).
 
     Args:
         piece, share: (m,) see `places_of`.
@@ -169,11 +169,11 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
     residuals = y - line
     inside = np.ones(y.size, np.bool_)
     diagonal, right = np.empty(k), np.empty(k)
-    beside = np.empty(k - 1)
+    off_diagonal = np.empty(k - 1)
     for _ in range(20):
         sizes = np.abs(residuals)
         sigma = max(1.4826 * median(sizes), floor)
-        diagonal[:], right[:], beside[:] = 0.0, 0.0, 0.0
+        diagonal[:], right[:], off_diagonal[:] = 0.0, 0.0, 0.0
         for j in range(y.size):
             inside[j] = sizes[j] <= gate * sigma
             if inside[j]:
@@ -182,22 +182,22 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
                 before = weight - after
                 diagonal[p] += before * (1.0 - share[j])
                 diagonal[p + 1] += after * share[j]
-                beside[p] += before * share[j]
+                off_diagonal[p] += before * share[j]
                 right[p] += before * y[j]
                 right[p + 1] += after * y[j]
         # a piece with a single pulse in it hangs on its neighbours
         held = 1e-12 * diagonal.sum() / k
         for a in range(k):
             diagonal[a] += held
-        # the matrix has a diagonal and one beside it on either side
+        # the matrix is symmetric and tridiagonal
         for a in range(1, k):
-            share_of = beside[a - 1] / diagonal[a - 1]
-            diagonal[a] -= share_of * beside[a - 1]
+            share_of = off_diagonal[a - 1] / diagonal[a - 1]
+            diagonal[a] -= share_of * off_diagonal[a - 1]
             right[a] -= share_of * right[a - 1]
         new = np.empty(k)
         new[k - 1] = right[k - 1] / diagonal[k - 1]
         for a in range(k - 2, -1, -1):
-            new[a] = (right[a] - beside[a] * new[a + 1]) / diagonal[a]
+            new[a] = (right[a] - off_diagonal[a] * new[a + 1]) / diagonal[a]
         moved = np.abs(new - values).max()
         values = new
         residuals = residuals_at(piece, share, y, values)
@@ -210,7 +210,7 @@ def robust_values(piece, share, y, line, values, floor, gate, huber, until):  # 
 def changes(x, piece, share, residuals, gate, limit, clip, inverse, every, apart):  # type: ignore[no-untyped-def]
     """Test the residuals of a line with knots for a change of its slope, and for a step.
 
-    Each is tried at pulse after pulse, beside all that the line may do by itself: what is left of
+    Each is tried at pulse after pulse, in addition to the line's own freedom: what is left of
     it then, times the residuals, has a standard deviation that chance explains.
 
     Args:
@@ -309,7 +309,7 @@ def changes(x, piece, share, residuals, gate, limit, clip, inverse, every, apart
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def largest_sizes(draws, root):  # type: ignore[no-untyped-def]
-    """Of each of (m, k) draws the largest absolute part of its product with a lower triangle."""
+    """Return the largest absolute element of each of (m, k) draws times a lower triangle."""
     result = np.zeros(draws.shape[0])
     for j in range(draws.shape[0]):
         for a in range(root.shape[0]):

@@ -38,7 +38,7 @@ from sliplab.storage.trials.recording import Recording
 I64 = npt.NDArray[np.int64]
 
 VERSION = 4
-"""Of what fitting does; results of another version are stale."""
+"""Version of the fit; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
 """A clock that falls back by more than this began anew, or jumped."""

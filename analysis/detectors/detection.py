@@ -1,4 +1,4 @@
-"""From spike counts of consecutive windows to two estimated onsets.
+"""Estimate two onsets from spike counts of consecutive windows.
 
 A single window is a weak witness. The paper averages counts over a sliding window and believes
 a class only when it leads by a margin; this file is that rule, with each of its edges decided:
@@ -91,7 +91,7 @@ def detect(
 
 
 def lead_of(
-    counts: npt.NDArray[np.integer], smoothing: int, wanted: int
+    counts: npt.NDArray[np.integer], smoothing: int, target: int
 ) -> npt.NDArray[np.float64]:
     """Lead of a class's mean count over every other, float64 (n,); negative where it trails.
 
@@ -101,11 +101,11 @@ def lead_of(
     Args:
         counts: raw output spikes, integer (n, 3), windows in the order of time.
         smoothing: windows over which counts are averaged.
-        wanted: the class.
+        target: the class.
     """
     trailing, _ = _trailing(counts, smoothing)
-    rivals = np.delete(trailing, wanted, axis=1).max(axis=1, initial=0)
-    lead: npt.NDArray[np.float64] = (trailing[:, wanted] - rivals) / smoothing
+    rivals = np.delete(trailing, target, axis=1).max(axis=1, initial=0)
+    lead: npt.NDArray[np.float64] = (trailing[:, target] - rivals) / smoothing
     lead[: smoothing - 1] = -np.inf
     return lead
 

@@ -146,9 +146,9 @@ def _forward(stay: Any, go: Any, seen: Any, out: Any) -> None:
 
 
 def log_odds(log_probability: FloatArray, state: int) -> FloatArray:
-    """Log odds of having come to `state` or beyond, float64 (n,), from `forward`; may be -inf.
+    """Log odds of having reached `state` or a later one, float64 (n,), from `forward`; may be -inf.
 
-    From logarithms, so that a belief next to certainty is still told from one nearer to it.
+    Computed from logarithms, so that probabilities close to 1 remain distinct.
     """
     before = np.logaddexp.reduce(log_probability[:, :state], axis=1)
     after: FloatArray = np.logaddexp.reduce(log_probability[:, state:], axis=1) - before
@@ -213,7 +213,7 @@ class Histograms:
     table: FloatArray
 
     def log(self, features: Array) -> FloatArray:
-        """As `Likelihood.log`; features are whole numbers from 0."""
+        """Return the same as `Likelihood.log`; features are whole numbers from 0."""
         bins = np.clip(np.asarray(features, np.int64), 0, self.table.shape[2] - 1)
         out = np.zeros((len(bins), self.table.shape[1]))
         for column, table in zip(bins.T, self.table, strict=True):
@@ -257,7 +257,7 @@ class Logistic:
     scale: FloatArray
 
     def log(self, features: Array) -> FloatArray:
-        """As `Likelihood.log`."""
+        """Return the same as `Likelihood.log`."""
         scaled = (np.asarray(features, np.float64) - self.mean) / self.scale
         # not a matrix product, whose rounding depends on how many windows there are: a detector
         # must say the same of a window whatever comes after it
@@ -460,7 +460,7 @@ class Levels:
 
 
 def decide(evidence: Evidence, levels: Levels) -> Found:
-    """First incipient, then gross slip; each dated by the end of the window that told."""
+    """Return incipient, then gross slip, each at the end of the window that detected it."""
     first = first_above(evidence.incipient, levels.incipient)
     if first is None:
         return Found(None, None)
@@ -470,13 +470,13 @@ def decide(evidence: Evidence, levels: Levels) -> Found:
 
 
 def first_above(evidence: FloatArray, level: float, start: int = 0) -> int | None:
-    """The first window from `start` on whose evidence exceeds the level."""
+    """Return the first window from `start` on whose evidence exceeds the level."""
     found = np.flatnonzero(evidence[start:] > level)
     return start + int(found[0]) if len(found) else None
 
 
 def features(predictions: Predictions, events: bool) -> FloatArray:
-    """The counts; if wanted, the logarithm of one plus the events, and all products of two.
+    """Return the counts; with `events` also log(1 + events), and all products of two.
 
     float64 (n, 3), or (n, 14) with events; the counts come first.
     """

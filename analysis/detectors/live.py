@@ -299,9 +299,9 @@ class LiveDetector:
         return made
 
     def advance(self, to_us: int) -> list[Decision]:
-        """The camera's clock has come to `to_us`, and all events before it are here.
+        """Advance the clock to `to_us`, up to which all events have arrived; return new decisions.
 
-        A time before the latest known one tells nothing.
+        A time before the latest known one has no effect.
         """
         if self._now_us is not None and to_us <= self._now_us:
             return []
@@ -315,7 +315,7 @@ class LiveDetector:
     # -- events ------------------------------------------------------------------------------
 
     def _ordered(self, chunk: EventChunk) -> EventChunk:
-        """The chunk in the order of time; what came out of order is counted."""
+        """Return the chunk sorted by time, and count events that arrived out of order."""
         t_us = chunk.t_us
         newest = int(t_us[0]) if self._now_us is None else self._now_us
         if int(t_us.min()) < newest - self._back_us:
@@ -407,7 +407,7 @@ class LiveDetector:
         )
 
     def _come_to(self, t_us: int) -> None:
-        """Time goes on to `t_us`: the grid begins with the first, and a gap is dealt with."""
+        """Advance to `t_us`: the first time starts the grid, and gaps are handled."""
         if self._starts is None:
             stride_us = self._stride_us
             self._starts = lambda number: t_us + number * stride_us

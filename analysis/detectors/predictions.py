@@ -61,8 +61,8 @@ def count_spikes(
         how many trials were counted.
     """
     counting = _Counting(model.read_bytes(), windows, threads)
-    wanted = [TrialWork(recording, name, key, counting) for name, recording, key in trials]
-    work = stale_trials(store, COUNTS, wanted)
+    required = [TrialWork(recording, name, key, counting) for name, recording, key in trials]
+    work = stale_trials(store, COUNTS, required)
     if work:
         keep(COUNTS, work, _count)
     return len(work)
@@ -84,44 +84,44 @@ PREDICTIONS = "heard"
 PREDICTIONS_VERSION = 1
 
 
-def predictions_step(stride_ms: int, carried: bool = False) -> str:
+def predictions_step(stride_ms: int, stateful: bool = False) -> str:
     """Name of a stride's step: results of different strides do not displace each other."""
-    return f"{PREDICTIONS}_{'carried_' if carried else ''}{stride_ms}ms"
+    return f"{PREDICTIONS}_{'carried_' if stateful else ''}{stride_ms}ms"
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """Windows of one trial at one stride.
+class PredictionRequest:
+    """Inference on the windows of one trial at one stride.
 
     Attributes:
-        carried: stateful inference; neurons keep their states from each window to the next.
-        key: what the result must have been made with.
+        stateful: neurons keep their states from each window to the next.
+        key: of the inputs; a stored result with another key is stale.
     """
 
     campaign: str
     recording: Recording
     stride_ms: int
-    carried: bool
+    stateful: bool
     key: str
 
     @property
     def step(self) -> str:
         """Name of the step that keeps the result."""
-        return predictions_step(self.stride_ms, self.carried)
+        return predictions_step(self.stride_ms, self.stateful)
 
 
-def want(
+def prediction_request(
     campaign: str,
     recording: Recording,
     model_key: str,
     windows: Windows,
     stride_ms: int,
-    carried: bool = False,
-) -> Wanted:
+    stateful: bool = False,
+) -> PredictionRequest:
     """Windows at a stride, with the key of the model that counts them."""
-    inputs = [model_key, recording.checksum, stride_ms, carried]
+    inputs = [model_key, recording.checksum, stride_ms, stateful]
     key = make_key(PREDICTIONS, PREDICTIONS_VERSION, inputs, windows.model_dump(mode="json"))
-    return Wanted(campaign, recording, stride_ms, carried, key)
+    return PredictionRequest(campaign, recording, stride_ms, stateful, key)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class _Inference:
     model: bytes
     windows: Windows
     stride_ms: int
-    carried: bool
+    stateful: bool
     threads: int | None
 
 
@@ -139,7 +139,7 @@ def predict_trials(
     store: Store,
     model: Path,
     windows: Windows,
-    wanted: Sequence[Wanted],
+    requests: Sequence[PredictionRequest],
     keep: KeepTrials,
     threads: int | None = None,
 ) -> int:
@@ -149,16 +149,16 @@ def predict_trials(
         keep, threads: as for `count_spikes`.
     """
     content, made = model.read_bytes(), 0
-    for step in sorted({item.step for item in wanted}):
+    for step in sorted({item.step for item in requests}):
         work = stale_trials(
             store,
             step,
             [
                 TrialWork(
                     item.recording, item.campaign, item.key,
-                    _Inference(content, windows, item.stride_ms, item.carried, threads),
+                    _Inference(content, windows, item.stride_ms, item.stateful, threads),
                 )
-                for item in wanted
+                for item in requests
                 if item.step == step
             ],
         )  # fmt: skip
@@ -168,9 +168,9 @@ def predict_trials(
     return made
 
 
-def predictions(store: Store, wanted: Wanted) -> dict[str, npt.NDArray[Any]]:
+def predictions(store: Store, request: PredictionRequest) -> dict[str, npt.NDArray[Any]]:
     """Return ``counts`` int64 (n, 3), ``events`` int64 (n,) and ``end_ns`` int64 (n,)."""
-    return Derived.of(store, wanted.step, wanted.campaign).arrays(wanted.recording.folder.name)
+    return Derived.of(store, request.step, request.campaign).arrays(request.recording.folder.name)
 
 
 def _infer(
@@ -179,7 +179,7 @@ def _infer(
     if inference.threads is not None:
         training.limit_threads(inference.threads)
     fitted = _fitted(inference.model)
-    return {}, _stateful(recording, inference, fitted) if inference.carried else _stateless(
+    return {}, _stateful(recording, inference, fitted) if inference.stateful else _stateless(
         recording, inference, fitted
     )
 

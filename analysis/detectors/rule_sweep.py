@@ -127,7 +127,7 @@ def sweep(
     """
     found = np.full((len(smoothings), len(margins), 2), NEVER, np.int64)
     for s, smoothing in enumerate(smoothings):
-        slips = [lead_of(counts, smoothing, wanted) for wanted in (INCIPIENT, GROSS)]
+        slips = [lead_of(counts, smoothing, target) for target in (INCIPIENT, GROSS)]
         for m, margin in enumerate(margins):
             first = _first(slips[0], margin, 0)
             if first is None:

@@ -1,7 +1,7 @@
 """Stateful inference: the network runs through a whole trial and its neurons are never reset.
 
 Everywhere else a window is a sample of its own and every neuron starts it at zero. Here each step
-goes on from the last, as it would on a chip that nobody resets, and the spikes of the last 30 ms
+continues from the last, as it would on a chip without resets, and the spikes of the last 30 ms
 are counted whenever one likes, at no more cost. The weights were trained with resets, and these
 neurons neither leak nor have a lower bound, so what a quiet second adds up is still there in the
 next; docs/detection.md says what that does.

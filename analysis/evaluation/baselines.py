@@ -27,7 +27,7 @@ EVALUATION = "evaluation"
 """Step and name of what it is compared with."""
 VERSION = 3
 SEEDS = (0, 1, 2)
-"""Of every ordinary network; other methods have nothing random."""
+"""Seed of every ordinary network; other methods have nothing random."""
 NAMES: dict[str, Any] = {
     "logistic_cells": RIDGE,
     "boosting": ROUNDS,
@@ -37,7 +37,7 @@ NAMES: dict[str, Any] = {
 
 
 def baseline_key(store: Store, name: str) -> str:
-    """By the samples as they stand in the store."""
+    """Return the key of results on the samples in the store."""
     kept = Derived.of(store, SAMPLES)
     samples = [kept.key(split) for split in ("train", "validation", "test")]
     return make_key(STEP, VERSION, samples, [name, NAMES[name]])

@@ -9,7 +9,11 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.detectors.detector_comparison import Parts, compare
 from sliplab.analysis.detectors.detectors import Labelled, Predictions
 from sliplab.analysis.detectors.latency import TrueSlip, true_slip
-from sliplab.analysis.detectors.predictions import Wanted, predictions, want
+from sliplab.analysis.detectors.predictions import (
+    PredictionRequest,
+    prediction_request,
+    predictions,
+)
 from sliplab.analysis.detectors.rule_sweep import Counted, choose_smoothing
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.protocols.settings import AnalysisSettings, Detection
@@ -19,10 +23,10 @@ from sliplab.storage.trials.store import Store, StoreError
 
 
 @dataclass(frozen=True)
-class Known:
-    """A trial with both onsets, and the windows of it that are wanted."""
+class KnownTrial:
+    """A trial with both onsets, and the inference that it needs."""
 
-    wanted: Wanted
+    request: PredictionRequest
     label: str
     slip: TrueSlip
 
@@ -36,23 +40,23 @@ class DetectorWork:
         choosing: by campaign, the trials that choose its smoothing and margin; empty where the
             protocol says them.
         compared: ``train``, ``validation`` and ``test`` trials of the comparison; None without.
-        carried: the same by stateful inference; None without.
+        stateful: the same by stateful inference; None without.
     """
 
-    scored: list[Wanted]
-    choosing: dict[str, list[Known]]
-    compared: dict[str, list[Known]] | None
-    carried: dict[str, list[Known]] | None
+    scored: list[PredictionRequest]
+    choosing: dict[str, list[KnownTrial]]
+    compared: dict[str, list[KnownTrial]] | None
+    stateful: dict[str, list[KnownTrial]] | None
 
     @property
-    def wanted(self) -> list[Wanted]:
-        """Windows of all of them, each once."""
+    def requests(self) -> list[PredictionRequest]:
+        """Inference that all of them need, each once."""
         known = [
             *self.choosing.values(),
             *(self.compared or {}).values(),
-            *(self.carried or {}).values(),
+            *(self.stateful or {}).values(),
         ]
-        every = [*self.scored, *(trial.wanted for trials in known for trial in trials)]
+        every = [*self.scored, *(trial.request for trials in known for trial in trials)]
         unique = {(item.campaign, item.recording.folder.name, item.step): item for item in every}
         return list(unique.values())
 
@@ -60,15 +64,15 @@ class DetectorWork:
     def inputs(self) -> list[Any]:
         """Inputs of the results, for a key."""
 
-        def keys(trials: list[Known]) -> list[list[str]]:
-            return [[trial.wanted.key, trial.label] for trial in trials]
+        def keys(trials: list[KnownTrial]) -> list[list[str]]:
+            return [[trial.request.key, trial.label] for trial in trials]
 
         return [
             [item.key for item in self.scored],
             {name: keys(trials) for name, trials in self.choosing.items()},
             *(
                 None if parts is None else {name: keys(trials) for name, trials in parts.items()}
-                for parts in (self.compared, self.carried)
+                for parts in (self.compared, self.stateful)
             ),
         ]
 
@@ -90,17 +94,17 @@ class DetectorWork:
         """Compare detectors; None where nothing is to be compared.
 
         Args:
-            settings: windows and strides; detection: what the paper's rule is set to.
+            settings: windows and strides; detection: the paper's rule.
         """
         fine = settings.fine_stride_ms
         parts = _parts(store, self.compared)
         if parts is None or fine is None:
             return None
         found = compare(parts, settings.windows, detection, fine, settings.most_spikes)
-        carried = _parts(store, self.carried)
-        if found is None or carried is None:
+        stateful_parts = _parts(store, self.stateful)
+        if found is None or stateful_parts is None:
             return found
-        stateful = compare(carried, settings.windows, detection, fine, settings.most_spikes)
+        stateful = compare(stateful_parts, settings.windows, detection, fine, settings.most_spikes)
         ours = () if stateful is None else stateful.detectors
         return found.model_copy(update={"carried": ours})
 
@@ -108,7 +112,7 @@ class DetectorWork:
 def detector_work(
     labels: Labels, campaigns: list[Collected], detection: dict[str, Detection], model_key: str
 ) -> DetectorWork:
-    """Find it.
+    """Find the trials and windows that detectors need.
 
     Raises:
         StoreError: smoothing and margin are to be chosen, and there is no trial to choose by.
@@ -117,13 +121,15 @@ def detector_work(
     settings = used[0].settings
     length = settings.windows.length_ms
 
-    def wanted_of(name: str, recording: Recording, stride_ms: int, carried: bool = False) -> Wanted:
-        return want(name, recording, model_key, settings.windows, stride_ms, carried)
+    def request(
+        name: str, recording: Recording, stride_ms: int, stateful: bool = False
+    ) -> PredictionRequest:
+        return prediction_request(name, recording, model_key, settings.windows, stride_ms, stateful)
 
     def known(
-        split: str, stride_ms: int, most: int | None = None, carried: bool = False
-    ) -> list[Known]:
-        found: list[Known] = []
+        split: str, stride_ms: int, most: int | None = None, stateful: bool = False
+    ) -> list[KnownTrial]:
+        found: list[KnownTrial] = []
         for item in used:
             for _, recording in item.of_split(split):
                 slip = true_slip(labels.read(item, recording))
@@ -132,15 +138,15 @@ def detector_work(
                 if most is not None and len(found) >= most:
                     return found
                 found.append(
-                    Known(
-                        wanted_of(item.name, recording, stride_ms, carried),
+                    KnownTrial(
+                        request(item.name, recording, stride_ms, stateful),
                         labels.key(item, recording),
                         slip,
                     )
                 )
         return found
 
-    choosing: dict[str, list[Known]] = {}
+    choosing: dict[str, list[KnownTrial]] = {}
     scored = []
     for item in campaigns:
         ours = detection[item.name]
@@ -153,33 +159,33 @@ def detector_work(
                     "and no kinematic one has both onsets"
                 )
         if ours.stride_ms is not None:
-            scored += [wanted_of(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
+            scored += [request(item.name, r, ours.stride_ms) for _, r in item.of_split("test")]
     fine, asked = settings.fine_stride_ms, settings.detection.compare
 
-    def compared(carried: bool) -> dict[str, list[Known]] | None:
-        if fine is None or asked is None or (carried and not asked.carried):
+    def compared(stateful: bool) -> dict[str, list[KnownTrial]] | None:
+        if fine is None or asked is None or (stateful and not asked.carried):
             return None
         return {
-            "train": known("train", length, asked.train_trials, carried),
-            "validation": known("validation", fine, None, carried),
-            "test": known("test", fine, None, carried),
+            "train": known("train", length, asked.train_trials, stateful),
+            "validation": known("validation", fine, None, stateful),
+            "test": known("test", fine, None, stateful),
         }
 
     return DetectorWork(scored, choosing, compared(False), compared(True))
 
 
-def _parts(store: Store, known: dict[str, list[Known]] | None) -> Parts | None:
+def _parts(store: Store, known: dict[str, list[KnownTrial]] | None) -> Parts | None:
     """The trials of a comparison, read; None without one."""
     if known is None:
         return None
     return Parts(**{name: [_labelled(store, t) for t in trials] for name, trials in known.items()})
 
 
-def _labelled(store: Store, trial: Known) -> Labelled:
-    arrays = predictions(store, trial.wanted)
+def _labelled(store: Store, trial: KnownTrial) -> Labelled:
+    arrays = predictions(store, trial.request)
     return Labelled(Predictions(arrays["counts"], arrays["events"], arrays["end_ns"]), trial.slip)
 
 
-def _counted(store: Store, trial: Known) -> Counted:
-    arrays = predictions(store, trial.wanted)
+def _counted(store: Store, trial: KnownTrial) -> Counted:
+    arrays = predictions(store, trial.request)
     return Counted(arrays["counts"], arrays["end_ns"], trial.slip)

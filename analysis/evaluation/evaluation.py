@@ -43,7 +43,7 @@ class Job:
     labels: Labels
     model: Model
     models: list[Model]
-    """Of all seeds, the chosen one among them."""
+    """Models of all seeds, the chosen one included."""
     detection: dict[str, Detection]
     trials: list[tuple[Collected, Trial, Recording, str]]
     """Campaign, trial, recording and key of its spike counts, of every trial that is scored."""
@@ -95,7 +95,7 @@ def make_job(
             inputs.append([item.name, trial.id, label, counts])
     used = {name: value.model_dump(mode="json") for name, value in detection.items()}
     detectors = detector_work(labels, campaigns, detection, model.key)
-    # what people decided on trials beside the test trials is counted in the result
+    # decisions on trials other than test trials are counted in the result
     states = labels.states(campaigns)
     of_review = [] if states is None else [states]
     key = make_key(STEP, VERSION, [model.key, inputs, detectors.inputs, *of_review], used)

@@ -95,13 +95,13 @@ def _weights_file(whole: Quantised) -> bytes:
 
 def _made_from_these(source: _Source) -> bool:
     """Return True where `train` would make this model of the store now. Raises StoreError."""
-    wanted = {
+    current = {
         model.key
         for make in (wanted_models, comparison_models)
         for model in make(source.store, source.campaigns)
     }
     try:
-        return TrainedModel.load(source.path.with_suffix(".json")).key in wanted
+        return TrainedModel.load(source.path.with_suffix(".json")).key in current
     except (OSError, ValueError):
         return False
 

@@ -49,7 +49,7 @@ I64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class OtherNetwork:
-    """A network that is judged beside the store's own.
+    """A network that is evaluated in addition to the store's own.
 
     Attributes:
         name: of what is kept, safe as a file's name.
@@ -72,7 +72,7 @@ class OtherNetwork:
 
     @cached_property
     def key(self) -> str:
-        """Of the file and the engine, on which its counts depend."""
+        """Hash of the file and the engine, on which its counts depend."""
         said = None if self.description is None else self.description.model_dump(mode="json")
         return hash_data([self.content.hex(), said, self.engine])
 
@@ -83,7 +83,7 @@ class _Judging:
 
     network: OtherNetwork
     label: TrialLabel | None
-    """Of a trial whose windows are samples, too."""
+    """Label of a trial that samples are taken from as well; None for others."""
     samples: Samples
     seed: int
     stride_ms: int
@@ -94,8 +94,8 @@ def network_of(path: Path, engine: Engines | None = None) -> OtherNetwork:
     """A model file of this program, or a state_dict with its description, as a network to judge.
 
     Args:
-        path: the model file, the description (YAML or JSON), or the weights that a description of
-            the same name stands beside.
+        path: the model file, the description (YAML or JSON), or the weights with a description of
+            the same name in the same folder.
         engine: by default the kernels where they give Sinabs' counts by arithmetic, else Sinabs.
 
     Raises:
@@ -153,12 +153,12 @@ class Judgement:
 
     @property
     def data_key(self) -> str:
-        """Of the trials and labels alone."""
+        """Key of the trials and labels alone."""
         return data_key(self.labels, self.campaigns)
 
     @property
     def key(self) -> str:
-        """Of all that the result depends on."""
+        """Key of all inputs of the result."""
         network = self.network
         rules = {name: rule.model_dump(mode="json") for name, rule in self.rules.items()}
         return make_key(
@@ -218,10 +218,10 @@ def kept(
 ) -> dict[str, OtherEvaluation]:
     """Results on the trials and labels of today, by name."""
     folder = Derived.of(store, STEP)
-    wanted = data_key(Labels(store, reviewed), campaigns)
+    key = data_key(Labels(store, reviewed), campaigns)
     found = {}
     for path in sorted(folder.folder.glob("*.json")):
-        if folder.read(path.stem).get("data_key") == wanted:
+        if folder.read(path.stem).get("data_key") == key:
             found[path.stem] = folder.load(path.stem, OtherEvaluation)
     return found
 

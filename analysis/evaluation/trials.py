@@ -77,7 +77,7 @@ def summaries(rows: Sequence[TrialScore]) -> dict[str, ExperimentScores]:
 
 
 Latency = dict[str, Any]
-"""By experiment: ``trials`` with both onsets, and ``latency_ms`` as `summarise_latency` has it."""
+"""For each experiment ``trials`` with both onsets, and ``latency_ms`` of `summarise_latency`."""
 
 
 def latencies(

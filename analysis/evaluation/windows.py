@@ -1,6 +1,6 @@
 """The chosen windows of test trials: figures of the network, by class, condition, phase and trial.
 
-All trained seeds stand beside the chosen one, with the reliability of its leads and what it
+All trained seeds are scored like the chosen one, with the reliability of its leads and what it
 computes. Everything that is fitted here is fitted on training or validation trials.
 """
 

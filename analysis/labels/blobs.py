@@ -103,7 +103,7 @@ def match_layout(
         layout_px[None] + shifts[:, None], distance_upper_bound=tolerance_px
     )
     near = np.isfinite(distance)
-    # a found marker is worth more than any distance within the tolerance
+    # a found marker outweighs any distance within the tolerance
     loss = np.where(near, distance, 2 * m * tolerance_px).sum(axis=1)
     shift = shifts[int(loss.argmin())]
     for _ in range(3):

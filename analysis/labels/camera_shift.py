@@ -94,5 +94,5 @@ def camera_shift(away: Floats) -> CameraShift:
 
 
 def no_shift(n: int) -> CameraShift:
-    """Of a camera that stood still for n frames."""
+    """Return the motion of a camera that stood still for n frames."""
     return CameraShift(np.zeros((n, 2)), np.zeros(n, np.bool_), np.zeros(n))

@@ -34,7 +34,7 @@ class Doubts:
     gross: str | None
 
     def or_else(self, other: Doubts) -> Doubts:
-        """These, and where there are none, those."""
+        """Return these doubts, and the other's for an onset without one."""
         return Doubts(self.incipient or other.incipient, self.gross or other.gross)
 
 
@@ -124,11 +124,11 @@ def uncertain(
 
 
 def slipped_in_hold(hold_slip_px: Floats, limit_px: float | None) -> Doubts:
-    """Doubts of a trial whose hold was none: both onsets, where a marker moved in it by too much.
+    """Return doubts of both onsets where a marker moved too far during the hold.
 
     Args:
-        hold_slip_px: (m,) how far each marker moved in the hold, NaN where unknown.
-        limit_px: None where no slip is too much.
+        hold_slip_px: (m,) displacement of each marker in the hold, NaN where unknown.
+        limit_px: None for no limit.
     """
     known = np.nan_to_num(hold_slip_px)
     if limit_px is None or not (known > limit_px).any():

@@ -47,7 +47,7 @@ def label_errors(store: Store, campaigns: list[Collected]) -> LabelErrors:
 
 
 def rules_compared(store: Store, campaigns: list[Collected]) -> RuleErrors:
-    """Both rules: each less its truth, and the paper's less the change point; ms."""
+    """Errors of both rules against the truth, and the paper's less the change point's onset, ms."""
     found: dict[str, dict[str, list[float]]] = {
         name: {kind: [] for kind in KINDS} for name in ("paper", "change_point", "apart")
     }

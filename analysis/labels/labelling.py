@@ -1,6 +1,6 @@
 """Ground truth of one recorded trial: its markers' places, and its onsets by both rules.
 
-The places come from the trial's video, tracked once, or from a camera that handed over tracks. The
+The positions come from the trial's video, tracked once, or from a camera that provides tracks. The
 paper's rule and the change points are both kept; the protocol says which of them rules.
 """
 
@@ -85,12 +85,12 @@ class Label:
 
     @property
     def paper(self) -> Onsets:
-        """By the paper's rule, counted from the reference."""
+        """Onsets by the paper's rule, counted from the reference."""
         return self.references[self.reference].onsets
 
     @property
     def paper_doubts(self) -> Doubts:
-        """Of those."""
+        """Doubts of the paper's onsets."""
         return self.references[self.reference].doubts
 
     @property
@@ -100,12 +100,12 @@ class Label:
 
     @property
     def onsets(self) -> Onsets:
-        """The ones that rule."""
+        """Onsets by the protocol's rule."""
         return self.paper if self.rule == "paper" else self.slips.onsets
 
     @property
     def doubts(self) -> Doubts:
-        """Of the ones that rule."""
+        """Doubts of the onsets by the protocol's rule."""
         return self.paper_doubts if self.rule == "paper" else self.slip_doubts
 
     @property
@@ -151,7 +151,7 @@ class Label:
         return found
 
     def document(self) -> TrialLabel:
-        """Return the label as it is kept: an onset in doubt is none, its reason beside it."""
+        """Return the stored label: an onset in doubt is null, with its reason in `doubts`."""
         onsets, doubts = self.onsets, self.doubts
         return TrialLabel(
             rule=self.rule,
@@ -214,7 +214,7 @@ def label_recording(recording: Recording, settings: Labelling) -> Label:
     """Find a trial's onsets in its video, or in its tracks where there is no video.
 
     Raises:
-        ValueError: the trial has neither video nor tracks, or its markers cannot be told apart.
+        ValueError: the trial has neither video nor tracks, or its markers cannot be distinguished.
     """
     frame_ns = recording.frame_times()
     motion_ns = recording.step(recording.motion_phase)
@@ -240,7 +240,7 @@ def label_places(
     exposure_ns: int,
     source: str,
 ) -> Label:
-    """Both rules over a trial's places.
+    """Apply both rules to a trial's positions.
 
     Displacements count from the markers' mean positions over the first part of the hold, with
     which the recording begins, or over its last; in trials with a sliding plate they are taken

@@ -1,6 +1,6 @@
-"""From a frame and where the markers should be to where they are: the compiled part of tracking.
+"""Locate markers in a frame near their predicted positions: the compiled part of tracking.
 
-Each marker has a square box of its own. Grey levels are taken relative to the ground beside it and
+Each marker has a square box of its own. Grey levels are taken relative to the ground around it and
 the white in its middle, cut off just above the one and just below the other, and summed with their
 places: noise and light on the ground or inside the disc then weigh nothing, and the sum is the
 disc's area to a twentieth of a percent, which is how a hidden part is noticed. Where boxes would
@@ -227,22 +227,22 @@ def _one(
 
 @numba.njit(cache=True, nogil=True)
 def follow(
-    frame: Any, xy: Any, wanted: Any, radius: float, margin: float, area: Any, tolerance: float,
+    frame: Any, xy: Any, selected: Any, radius: float, margin: float, area: Any, tolerance: float,
     state: Any, found: Any,
 ) -> Any:  # fmt: skip
-    """Move the markers `wanted` of `xy` from their predictions to their centroids.
+    """Move the markers `selected` of `xy` from their predictions to their centroids.
 
     Args:
         frame: (h, w) uint8.
-        xy: (m, 2), changed. wanted: (m,) bool.
-        radius, margin: of the discs, and what is looked at around them, px.
+        xy: (m, 2), changed. selected: (m,) bool.
+        radius, margin: of the discs, and of the area searched around them, px.
         area: (m,) what each usually covers, px; follows what is measured, slowly.
         tolerance: share of it by which a marker may differ.
         state: (m,) int64, changed to LOST, WHOLE or PARTIAL (cut by the picture's edge).
         found: (m, 5), changed; the last two columns are read, as they were a frame before.
 
     Returns:
-        how many of those wanted are lost, and how many of all are whole.
+        how many of those selected are lost, and how many of all are whole.
     """
     predicted = xy.copy()
     known = state != LOST
@@ -252,7 +252,7 @@ def follow(
     for _ in range(3):
         farthest = 0.0
         for k in range(xy.shape[0]):
-            if not wanted[k]:
+            if not selected[k]:
                 continue
             x, y, state[k] = _one(
                 frame, xy, k, known, radius, margin, found, area[k], tolerance, cuts, c, y_sums
@@ -275,7 +275,7 @@ def follow(
     whole = 0
     for k in range(xy.shape[0]):
         whole += state[k] == WHOLE
-        if wanted[k]:
+        if selected[k]:
             lost += state[k] == LOST
             if state[k] == WHOLE:
                 area[k] += _KEEPS_UP * (found[k, AREA] - area[k])

@@ -225,15 +225,15 @@ class MarkerTracker:
         result: Floats = np.median((self._xy - before)[of], axis=0)
         return result
 
-    def _look(self, frame: Frame, wanted: NDArray[np.bool_], tolerance: float) -> int:
+    def _look(self, frame: Frame, selected: NDArray[np.bool_], tolerance: float) -> int:
         lost, self._whole = follow(
-            frame, self._xy, wanted, self._radius, self._margin, self._area, tolerance,
+            frame, self._xy, selected, self._radius, self._margin, self._area, tolerance,
             self._state, self._measured,
         )  # fmt: skip
         return int(lost)
 
     def _recover(self, frame: Frame, i: int) -> None:
-        """Look for a lost marker around where the others' motion has carried it."""
+        """Search a lost marker around its position as predicted by the others' motion."""
         reach = int(self._spacing)
         x, y = (round(float(v)) for v in self._xy[i])
         left, top = max(0, x - reach), max(0, y - reach)

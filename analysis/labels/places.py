@@ -17,7 +17,7 @@ F64 = npt.NDArray[np.float64]
 SURE_PX = 0.25
 """A place with a larger standard deviation is no measurement: it could be a part of a slip."""
 TRACKS_PX, TRACKS_PLATE_PX = 0.006, 0.04
-"""Standard deviations taken for tracks that a camera hands over without saying."""
+"""Standard deviations assumed for tracks that a camera provides without them."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Places:
 
     @property
     def plate_lost(self) -> int:
-        """In how many frames the plate's marker was not seen."""
+        """Number of frames in which the plate's marker was not seen."""
         return 0 if self.plate is None else int(np.count_nonzero(~self.plate.ok))
 
     @property

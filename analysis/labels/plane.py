@@ -1,4 +1,4 @@
-"""From the picture back to the plate's plane, by the plate's own marker.
+"""Map the image back to the plate's plane, by the plate's own marker.
 
 Seen askew, a plate that falls takes the papillae's markers and its own by different ways, and their
 difference is not the motion on the plate. The marker is a square of one size wherever the plate is,
@@ -23,7 +23,7 @@ _STRETCH = 0.1
 """Priors: perspective a pixel (30 degrees at 300 mm and 20 px/mm are 1e-4), and stretch."""
 _FRAMES = 16
 _SURE = 25.0
-"""Fall of chi squared that perspective has to be worth; of four parameters' noise it is 4."""
+"""Reduction of chi squared required to fit perspective; noise of four parameters gives 4."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def plane_of(corners: Floats, seen: NDArray[np.bool_], size_px: tuple[int, int])
         size_px: width and height of the picture.
 
     Returns:
-        None where the camera looks straight on, as far as can be told.
+        None where no tilt of the camera can be detected.
     """
     here = np.flatnonzero(seen & np.isfinite(corners).all(axis=(1, 2)))
     if len(here) < 2:

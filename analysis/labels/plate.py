@@ -28,9 +28,9 @@ from the straight line, and that grows with the square of the gap."""
 _BENT_PX = 1.5
 """Corners that move more than this apart from each other are not those of a stiff square."""
 _LIKE = 0.7
-"""Correlation of a marker's cells with what they were."""
+"""Least correlation of a marker's cells with those of the last frame."""
 _DETECTED_SIGMA_PX = 0.1
-"""Of a centre from a detector's corners alone (a plate in fast fall is a blur)."""
+"""Standard deviation of a centre from the detector's corners alone (a fast plate is blurred)."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ class PlateTracker:
         """Its sides where they must be; None where they are not, or it is not sure to be it."""
         if self._last is None or self._cells is None or not self._here:
             return None
-        guess = self._last + self._velocity + self._gain
-        corners, sigma = refine_square(frame, guess, 3)
+        predicted = self._last + self._velocity + self._gain
+        corners, sigma = refine_square(frame, predicted, 3)
         if not np.isfinite(sigma):
             return None
         moved = corners - self._last
@@ -205,7 +205,7 @@ def track_video(
     marker_id: int | None = None,
     max_bridged: int = MAX_BRIDGED,
 ) -> VideoTracks:
-    """Papillae and, if wanted, the plate in one pass over the frames.
+    """Track papillae and, on request, the plate in one pass over the frames.
 
     Args:
         frames: (h, w) uint8 frames in order; each is looked at once, and none is kept.

@@ -2,7 +2,7 @@
 
 The class of a sample is the one whose output neurons spike most. A network that never fires gives
 (0, 0, 0) everywhere; an ordinary argmax calls that class 0 and looks good on a quiet recording.
-So a tie is shared here, accuracies with a unique winner and with a margin stand beside it, and
+So a tie is shared here, accuracies with a unique winner and with a margin are also given, and
 nothing depends on the order of the classes.
 """
 

@@ -32,7 +32,7 @@ _SEED = 20_261
 _TAIL = 0.025
 _QUANTILES = (_TAIL, 1 - _TAIL)
 _FEWEST = 2
-"""Trials of which a spread can be told: one says nothing about the next."""
+"""Fewest trials from which a spread can be estimated."""
 _SHARES = {"median": 0.5, "p95": 0.95}
 _FEWEST_DRAWN = {"median": 12, "p95": 72}
 """Trials from which on a difference that is drawn holds the truth often enough; the 95th percentile
@@ -178,7 +178,7 @@ def share_difference(first: tuple[Values, Values], second: tuple[Values, Values]
 
 
 def between_seeds(first: Values, second: Values) -> float | None:
-    """By how much two means over seeds may differ by chance, 95 %, Student's t.
+    """Return by how much two means over seeds may differ by chance, 95 %, Student's t.
 
     The spread of single seeds is pooled from the sets that have several; a set of one borrows it.
 

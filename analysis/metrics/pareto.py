@@ -1,4 +1,4 @@
-"""The Pareto front: what nothing else is at least as good as in everything, and better in one.
+"""The Pareto front: rows that no other row dominates.
 
 Exact, by comparing. Rows in the order of their first objective can only be beaten by rows before
 them, and whoever is beaten at all is beaten by a row of the front; so each row is held against the

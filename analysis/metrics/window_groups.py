@@ -45,7 +45,7 @@ def strict_hits(counts: Counts, labels: Labels) -> FloatArray:
 
 
 def share(values: FloatArray, trial: IntArray) -> Share:
-    """Share that `values` come to, its interval over trials, windows and trials.
+    """Share of `values`, its interval over trials, and the numbers of windows and trials.
 
     Args:
         values: (n,), what a window counts, 0..1.

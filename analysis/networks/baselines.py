@@ -1,6 +1,6 @@
 """Simple methods on the same samples, so that the network's accuracy means something.
 
-Event rate alone tells much about slip. The report prints three beside the network: the commonest
+Event rate alone tells much about slip. The report compares three with the network: the commonest
 class, two thresholds on the number of events, and a logistic regression on it. They take a second
 and are always there. Where the events are tells more: a logistic regression on the events of each
 cell, gradient boosting on the counts of cells and steps, and ordinary networks
@@ -263,7 +263,7 @@ def boosted(
         n_iter_no_change=PATIENCE,
         random_state=_SEED,
     )
-    # in one thread: its threads wait for each other busily, 30 times slower beside other work
+    # in one thread: its threads wait for each other busily, 30 times slower under other load
     with threadpool_limits(1):
         model.fit(
             features(train.windows),

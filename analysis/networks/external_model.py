@@ -47,7 +47,7 @@ class Conv(StrictModel):
 
     kind: Literal["conv"]
     name: Name
-    """Of the layer in the state_dict: ``conv1`` for ``conv1.weight``."""
+    """Name of the layer in the state_dict: ``conv1`` for ``conv1.weight``."""
     stride: Side = 1
     padding: Annotated[int, Field(ge=0, le=512)] = 0
 
@@ -66,7 +66,7 @@ class Pool(StrictModel):
     how: Literal["sum", "average", "max"]
     size: Side
     stride: Side | None = None
-    """By default the size."""
+    """Equal to the size by default."""
 
 
 class Flatten(StrictModel):
@@ -80,7 +80,7 @@ class Neurons(StrictModel):
 
     kind: Literal["iaf", "lif"]
     name: Name | None = None
-    """Of the layer in the state_dict, where that has its threshold."""
+    """Name of the layer in the state_dict, where that has its threshold."""
     threshold: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """Potential at which a neuron fires; by default that of the state_dict."""
     spikes: Literal["single", "multi"]
@@ -94,7 +94,7 @@ class Neurons(StrictModel):
     tau_mem: Annotated[float, Field(gt=0, le=1e6)] | None = None
     """Time constant of a lif's potential, steps; by default that of the state_dict."""
     norm_input: bool = True
-    """Of a lif: currents are weighted so that a constant one is approached."""
+    """For a lif, scale currents so that the potential approaches a constant one."""
 
 
 Layer = Annotated[Conv | Linear | Pool | Flatten | Neurons, Field(discriminator="kind")]
@@ -102,7 +102,7 @@ register_tags("conv", "linear", "pool", "flatten", "iaf", "lif")
 
 
 class Description(StrictModel):
-    """The file beside a state_dict: it says what that does not."""
+    """The description file of a state_dict."""
 
     model: Literal[1]
     """Version of the file format."""

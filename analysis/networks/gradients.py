@@ -143,13 +143,13 @@ def _backward(
     by_spikes: torch.Tensor, potentials: torch.Tensor, threshold: float, width: float, scale: float
 ) -> torch.Tensor:
     """The gradient by currents; see `analysis.networks.spiking_gradients` for the formula."""
-    carried = torch.zeros_like(by_spikes[:, 0])
+    carry = torch.zeros_like(by_spikes[:, 0])
     found = []
     for t in reversed(range(by_spikes.shape[1])):
         over = potentials[:, t] - threshold
         slope = scale / width * torch.exp(-over.abs() / width)
-        carried = by_spikes[:, t] * slope + torch.where(over >= 0, 0.0, carried)
-        found.append(carried)
+        carry = by_spikes[:, t] * slope + torch.where(over >= 0, 0.0, carry)
+        found.append(carry)
     return torch.stack(found[::-1], dim=1)
 
 
@@ -198,7 +198,7 @@ class ExactConvolution(nn.Conv2d):
     """A convolution as one product of matrices: sums of its own terms and of nothing else."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """As of `torch.nn.Conv2d`, in whole float32."""
+        """Return the convolution of `torch.nn.Conv2d`, in full float32."""
         size, stride = self.kernel_size, self.stride
         pads = cast(tuple[int, int], self.padding)
         rows, columns = (
@@ -316,14 +316,14 @@ class OnDevice:
             loss = nn.functional.cross_entropy(
                 self._gain * counts.double(), target, reduction="sum"
             )
-            wanted = parameters(self._net)
-            grads = torch.autograd.grad(loss, list(wanted.values()))
+            trained = parameters(self._net)
+            grads = torch.autograd.grad(loss, list(trained.values()))
         reset_states(self._net)
         return Batch(
             loss.item(),
             counts.detach().cpu().numpy().astype(np.int64),
             {name: float(rate) * len(rows) for name, rate in self._fired.items()},
-            {name: grad.cpu() for name, grad in zip(wanted, grads, strict=True)},
+            {name: grad.cpu() for name, grad in zip(trained, grads, strict=True)},
         )
 
 

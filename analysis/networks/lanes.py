@@ -107,7 +107,7 @@ def fires(typing: Any, current: Any, v: Any, at: Any, threshold: Any) -> Any:
 
 @intrinsic
 def fires_kept(typing: Any, current: Any, v: Any, u: Any, at: Any, threshold: Any) -> Any:
-    """As `fires`, and ``u[at:at + BLOCK]`` is filled with the potentials before the reset."""
+    """Like `fires`; fills ``u[at:at + BLOCK]`` with the potentials before the reset."""
     return types.uint64(current, v, u, at, threshold), _fires
 
 

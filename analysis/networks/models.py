@@ -31,12 +31,12 @@ class Model:
 
     @property
     def info_path(self) -> Path:
-        """The JSON beside the model file; written last, it decides."""
+        """The model file's JSON document; written last, it marks the model as complete."""
         return self.path.with_suffix(".json")
 
     @property
     def info(self) -> TrainedModel:
-        """The document beside the model file.
+        """The model file's document.
 
         Raises:
             OSError: there is none.

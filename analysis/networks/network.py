@@ -243,8 +243,8 @@ def by_parameter(values: list[npt.NDArray[np.float32]]) -> dict[str, torch.Tenso
 
 def set_matrices(net: nn.Sequential, values: list[npt.NDArray[np.float32]]) -> None:
     """Put `matrices` into a network of their shape; biases that it has not are left out."""
-    wanted = parameters(net)
-    set_weights(net, {name: w for name, w in by_parameter(values).items() if name in wanted})
+    trained = parameters(net)
+    set_weights(net, {name: w for name, w in by_parameter(values).items() if name in trained})
 
 
 def on_grid(values: list[npt.NDArray[np.float32]]) -> list[npt.NDArray[np.float32]]:

@@ -23,7 +23,7 @@ from sliplab.protocols.settings import Windows
 
 OPSET = 17
 IR_VERSION = 8
-"""Both old enough for runtimes of 2022."""
+"""Versions that runtimes of 2022 support."""
 INPUT, OUTPUT = "windows", "counts"
 
 

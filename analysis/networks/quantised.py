@@ -121,7 +121,7 @@ class ChipRun:
 
     Attributes:
         counts: output spikes, int64 (n, 3).
-        potentials: lowest and highest that a potential of each spiking layer wanted to be.
+        potentials: lowest and highest potential of each spiking layer before saturation.
         saturated: share of each layer's potentials, over neurons and steps, that were cut off.
     """
 

@@ -109,8 +109,8 @@ def _through(
     height, inverse = scale / width, _F1 / width
     for j in range(begin, end):
         over = u[j] - threshold
-        carried = _F0 if over >= _F0 else du[j]
-        du[j] = g[j] * (height * _exp(-abs(over) * inverse)) + carried
+        carry = _F0 if over >= _F0 else du[j]
+        du[j] = g[j] * (height * _exp(-abs(over) * inverse)) + carry
 
 
 @njit(cache=True, nogil=True)

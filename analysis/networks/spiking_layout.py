@@ -132,7 +132,7 @@ class Table:
 
 
 def first_convolution(channels: int, cells: int, kernel: int, plane: Plane) -> Table:
-    """From the input's cells (channel, y, x); torch's weight is (c1, channels, kernel, kernel).
+    """Connect the input's cells (channel, y, x); torch's weight is (c1, channels, kernel, kernel).
 
     A unit at (y, x) reaches outputs y + kernel // 2 - d by tap d, for each d: in the order of
     outputs the taps are reversed.
@@ -174,7 +174,7 @@ def strided_plane(cells: int, c2: int, kernel: int) -> Plane:
 
 
 def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
-    """From layer 1, stride 2; torch's weight is (c2, c1, kernel, kernel)."""
+    """Connect layer 1, stride 2; torch's weight is (c2, c1, kernel, kernel)."""
     taps, first = strided_taps(kernel)
     c1, c2 = below.channels, plane.channels
     most = max(map(len, taps))
@@ -198,7 +198,7 @@ def second_convolution(below: Plane, kernel: int, plane: Plane) -> Table:
 
 
 def full_layer(below: Plane, n: int) -> Table:
-    """From all of a layer; the matrix is (n, channels * side * side + 1), channels first."""
+    """Connect a whole layer; the matrix is (n, channels * side * side + 1), channels first."""
     plane = Plane(1, n, 0, 1)
     index = below.index()
     sources = index.transpose(2, 0, 1).ravel()  # in the order in which torch flattens

@@ -1,4 +1,4 @@
-"""Synaptic operations of a window, counted exactly, beside the dense multiply-adds.
+"""Exact synaptic operations of a window, compared with dense multiply-adds.
 
 A spike costs one addition at each neuron it reaches, and nothing is done where nothing happens;
 that is what spiking buys. How many neurons it reaches depends on where it fired: near the border a

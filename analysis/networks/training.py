@@ -43,7 +43,7 @@ from sliplab.protocols.settings import Network, Training, Windows
 
 
 def learning_rate(training: Training, done: int, step: int = 0, steps: int = 1) -> float:
-    """Of a step in the epoch after `done` epochs.
+    """Return the learning rate of a step in the epoch after `done` epochs.
 
     Constant, or falling from the full rate to nothing along half a cosine over all steps of all
     epochs (Loshchilov and Hutter, 2017, without restarts); and at the very beginning rising in a
@@ -284,7 +284,7 @@ def fit(
 
     The best epoch has the highest STRICT validation accuracy on raw spike counts: a unique winner
     that is right. Argmax would give a silent network something for its ties, and a detection
-    needs a winner. Equal epochs are told apart by argmax accuracy (ties shared), then by the lower
+    needs a winner. Equal epochs are ranked by argmax accuracy (ties shared), then by the lower
     validation loss; the earlier one stays. Training ends after ``training.epochs`` or when
     ``training.patience`` epochs in a row were no better. It uses as many threads as torch may.
 
@@ -297,9 +297,9 @@ def fit(
         network, windows, training: the settings; ``training.seeds`` is the caller's to loop over.
         seed: decides the first weights and the order of the samples.
         on_epoch: called with each record as soon as it is there, in the calling thread.
-        on_state: called after each epoch with all that is needed to go on from there.
-        state: what `on_state` was given last, by a call with the same arguments: training goes on
-            there and ends with the same bits. Records of the epochs before are told again.
+        on_state: called after each epoch with all that is needed to resume there.
+        state: last state passed to `on_state` by a call with the same arguments: training resumes
+            there and ends with the same bits. Records of earlier epochs are reported again.
 
     Raises:
         ValueError: no samples, shapes that do not fit, a label that is no class, a state of

@@ -3,7 +3,7 @@
 Permuted classes: which class is called 0 is a convention, so renaming classes in the network's
 outputs and in the labels must change no figure (a silent network once looked 96 % right by its
 class 0). Shuffled labels: a network that learned from labels dealt out at random must be at
-chance, or something else than the training labels told it the answer.
+chance, or something other than the training labels leaks the answer.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ Part = tuple[SparseWindows, IntArray]
 
 
 def balanced(part: Part, per_class: int, seed: int) -> Part:
-    """As many windows of each class, at most `per_class`, drawn at random, in mixed order.
+    """Draw equally many windows of each class, at most `per_class`, in shuffled order.
 
     Raises:
         ValueError: a class has none.

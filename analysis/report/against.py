@@ -1,7 +1,7 @@
 """Two reports compared: what changed, whether it is noise, and the page about it.
 
 A figure that differs says nothing by itself: another seed, or other trials, would have changed it
-as well. So each difference stands beside what chance alone would do. Where networks of several
+as well. So each difference is compared with what chance alone would do. Where networks of several
 seeds were trained that is the spread between them; else that between trials, one by one in
 both reports where both judged the same. Both summaries hold all that is needed.
 """
@@ -108,7 +108,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Both reports side by side.
+    """Compare two reports.
 
     Attributes:
         simulated: here, and there.

@@ -22,7 +22,7 @@ from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
 
 FEWEST = 3
-"""Reference trials from which a slope can be told."""
+"""Fewest reference trials from which a slope can be estimated."""
 WEAR = {
     "hold_events_per_s": ("event rate in the hold", "events in the hold\n(1/s)"),
     "first_slip_ms": ("time to the first slip", "motion to first slip\n(ms)"),
@@ -32,7 +32,7 @@ WEAR = {
 
 @dataclass(frozen=True)
 class CollectedSection(Content):
-    """Committed trials beside the plans.
+    """Committed trials compared with the plans.
 
     Attributes:
         source: what was kept of the outside camera, in words.

@@ -14,7 +14,7 @@ from sliplab.storage.schema.summary import Sync
 from sliplab.storage.schema.trial import DEVICES
 
 PAGE = "sync.html"
-"""The page about clocks, beside the report."""
+"""File of the page about clocks, in the report's folder."""
 
 
 def frames_grade(sync: Sync) -> str:
@@ -88,7 +88,7 @@ def clock_section(
     """Draw the clocks of all trials.
 
     Args:
-        page: the page about clocks stands beside the report.
+        page: the page about clocks exists in the report's folder.
     """
     figure = _figure(campaigns, sync, simulated) if sync.grades else None
     return ClockSection(sync, figure, PAGE if page else None)

@@ -1,4 +1,4 @@
-"""The hold-out campaign in the report, beside the test trials; nothing was chosen by it."""
+"""The hold-out campaign in the report, compared with test trials; nothing was chosen by it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Pages: what their sections show, and one self-contained HTML file of it.
 
 Each section has a template in `templates/sections` that holds its words. Python hands it values: a
-dataclass that names the template and whose figures are also written beside the page.
+dataclass that names the template; its figures are also written to the page's folder.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Figure:
     """A picture (SVG text) and its data; what to see in it is said by a template.
 
     Attributes:
-        name: of its files beside the page, without an ending; none are written without a name.
+        name: of its files in the page's folder, without an ending; none are written without a name.
         data: what is drawn, columns by their headings, units in these; they may differ in length.
     """
 

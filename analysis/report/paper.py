@@ -1,4 +1,4 @@
-"""The report's figures beside those of the paper, in one table.
+"""Table of the report's figures and those of the paper.
 
 The paper's were measured on a real robot with a real skin. Nothing here says that a simulated
 figure near a published one is right, or that one far from it is wrong.
@@ -22,7 +22,7 @@ _SCANNED = ["windows scanned", "to past gross slip", "to the recording's end", "
 
 @dataclass(frozen=True)
 class Row:
-    """One published figure beside one network's."""
+    """One published figure and the same figure of one network."""
 
     name: str
     paper: str
@@ -38,7 +38,7 @@ class Row:
 
 @dataclass(frozen=True)
 class PaperSection(Content):
-    """Every published figure beside this one's.
+    """Return every published figure with this report's.
 
     Attributes:
         networks: others on the same trials: title, network and its margins.

@@ -35,7 +35,7 @@ FILES = {
     "labels_truth": "derived/tradeoff/labels_truth.json",
     "detector": "report/detector_tradeoff.json",
 }
-"""By name, where each stands in the store."""
+"""File in the store, by name."""
 
 COMMANDS = {
     "generalisation": "sliplab generalise {store}",

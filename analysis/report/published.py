@@ -1,8 +1,8 @@
-"""Published figures of the paper, which stand beside those of a report.
+"""Published figures of the paper, to compare with those of a report.
 
 Lu, Deng, Redmond, Psomopoulou and Ward-Cherrier, "A Neuromorphic Incipient Slip Detection System
 using Papillae Morphology". All of it was measured on the authors' own robot and skin; a figure of a
-simulated rig beside it compares two different things, and the report says so.
+simulated rig with them compares two different things, and the report says so.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PAPER = {
         "one after another, low in steady gross slip",
     ),
 }
-"""By name."""
+"""Published figures, by name."""
 
 DISTURBANCE_LEAD_STD_MS = 118.0
 """The spread that the paper gives with its mean lead under disturbance."""

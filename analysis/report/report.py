@@ -37,10 +37,10 @@ from sliplab.storage.schema.summary import SeedsUsed, Summary
 
 @dataclass(frozen=True)
 class Shown:
-    """Material of the page beside the summary's numbers.
+    """Material of the page besides the summary's numbers.
 
     Attributes:
-        example: the trial that is looked at, with its `counts` and `end_ns`.
+        example: the trial shown in detail, with its `counts` and `end_ns`.
         distances: of each trial's onset from the truth, ms, by rule and onset.
     """
 

@@ -231,13 +231,13 @@ def sync_part(campaigns: Sequence[Collected]) -> Sync:
 
 
 def _quality(campaigns: Sequence[Collected]) -> Quality:
-    aside = [known for item in campaigns for known in item.campaign.quarantined()]
-    broken_off = sum(known["cause"] == "interrupted" for known in aside)
+    quarantined = [known for item in campaigns for known in item.campaign.quarantined()]
+    broken_off = sum(known["cause"] == "interrupted" for known in quarantined)
     return Quality(
         planned=sum(len(item.plan) for item in campaigns),
         committed=sum(len(item.trials) for item in campaigns),
-        retaken=sum(str(known["cause"]).startswith("gate") for known in aside),
-        quarantined=len(aside) - broken_off,
+        retaken=sum(str(known["cause"]).startswith("gate") for known in quarantined),
+        quarantined=len(quarantined) - broken_off,
         interrupted=broken_off,
     )
 

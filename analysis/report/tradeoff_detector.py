@@ -24,7 +24,7 @@ from sliplab.analysis.sweeps.detector_rows import (
 )
 
 MOST_ROWS = 40
-"""Of the front on the page; the table as CSV has all."""
+"""Most rows of the front on the page; the table as CSV has all."""
 COLUMNS = (
     "network", "precision", "stride (ms)", "windows", "margin (spikes)", "strict (%)",
     "mean latency (ms)", "95 % (ms)", "false early (%)", "missed or late (%)", "µs a window",
@@ -200,10 +200,10 @@ def ordered_front(rows: Sequence[Row], most: int | None = None) -> list[Row]:
 def short_table(result: Result) -> tuple[Sequence[str], list[list[str]]]:
     """Return the paper's row and the short list for a terminal: columns and rows; means only."""
     rows = rows_of(result)
-    wanted = [("paper's", row) for row in rows if row.paper]
-    wanted += [(percent(budget, 0), row) for budget, row in short_list(rows)]
+    listed = [("paper's", row) for row in rows if row.paper]
+    listed += [(percent(budget, 0), row) for budget, row in short_list(rows)]
     table = []
-    for name, row in wanted:
+    for name, row in listed:
         setting, test = row.setting, row.test
         network = f"{setting.length_ms}/{setting.step_ms}/{setting.pool_px}/{setting.width:g}"
         table.append(

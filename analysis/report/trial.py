@@ -30,7 +30,7 @@ from sliplab.storage.trials.store import Store
 F64 = npt.NDArray[np.float64]
 
 BIN_S = 0.03
-"""Of the event rate: a window of the network."""
+"""Bin of the event rate, s: a window of the network."""
 _PHASES = (
     "at rest", "from the start of the motion to the first slip", "in incipient slip",
     "in gross slip",

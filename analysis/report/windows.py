@@ -1,4 +1,4 @@
-"""Windows in the report: the network beside other methods, where it errs, and what it costs."""
+"""Windows in the report: the network against other methods, its errors and its cost."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ WORST = 10
 
 @dataclass(frozen=True)
 class NetworkSection(Content):
-    """Accuracy on windows of test trials, with the other methods beside it."""
+    """Accuracy on windows of test trials, compared with other methods."""
 
     template: ClassVar[str] = "network.html"
     length_ms: int
@@ -258,7 +258,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class WorkSection(Content):
-    """Computation of the network, and its accuracy beside the best other method.
+    """Computation of the network, and its accuracy compared with the best other method.
 
     Attributes:
         seeds: of the spiking network.

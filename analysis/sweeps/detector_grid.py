@@ -115,9 +115,9 @@ def make_grid(axes: Axes, windows: Windows, network: Network, full: bool = False
     """
     for field in fields(axes):
         for value in getattr(axes, field.name):
-            wanted = _requirement(field.name, value, windows, network)
-            if wanted:
-                raise InputError(f"--{field.name.split('_')[0]}", "", value, wanted)
+            requirement = _requirement(field.name, value, windows, network)
+            if requirement:
+                raise InputError(f"--{field.name.split('_')[0]}", "", value, requirement)
     settings, left_out = [], {}
     for setting in axes.full if full else axes.default:
         if setting.length_ms % setting.step_ms:

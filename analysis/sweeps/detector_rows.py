@@ -3,7 +3,7 @@
 A row is a network's setting, a precision, a stride and a rule. The rule is the paper's pair of
 smoothing and margin, or a pair that validation trials of all seeds together choose. Test trials
 only judge. The front is over figures of test trials; which rows would be on it by validation
-trials stands beside, because a front picked by test trials flatters whoever is on it.
+trials is also given, because a front chosen on test trials is biased in its favour.
 
 Factors are compared one at a time with the paper's value: which differences are more than seed
 noise. Differences are taken seed by seed; the intervals are each by itself, so of twenty one would
@@ -37,7 +37,7 @@ from sliplab.analysis.sweeps.runner import Json
 
 SMOOTHINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 MARGINS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0, 24.0, 30.0, 40.0)
-"""In spikes for each of a class's output neurons."""
+"""Margins, in spikes for each of a class's output neurons."""
 PAPER_PAIR = (SMOOTHINGS.index(4), MARGINS.index(2.0))
 LOOSE = 0.1
 """Share of validation trials that the looser choice may leave false early, for either onset."""

@@ -86,7 +86,7 @@ class ResultFile:
         return self.all()[name]
 
     def write(self, name: str, key: str, data: Json, arrays: Json | None = None) -> None:
-        """Keep a result beside the others; it has no arrays."""
+        """Store a result with the others; it has no arrays."""
         make_folder(self.path.parent)
         found = {**self.all(), name: {"key": key, **data}}
         write_json(self.path, {**self.head, self.field: found})

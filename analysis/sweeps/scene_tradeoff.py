@@ -1,7 +1,7 @@
 """The scene's trade-off: variants of one simulated scene, each with its cost and its error.
 
 Every variant is run on the same trials with the same seeds and compared with the dearest one, so
-that the scene alone differs. What runs a variant is handed in.
+that the scene alone differs. The function that runs a variant is an argument.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def compare_variants(
     Args:
         seed: of the random windows in incipient slip.
     """
-    wanted = dict.fromkeys([REFERENCE, *variants(families), OTHER_SEED])
-    seen = {variant: run(variant) for variant in wanted}
+    compared = dict.fromkeys([REFERENCE, *variants(families), OTHER_SEED])
+    seen = {variant: run(variant) for variant in compared}
     reference, windows = seen[REFERENCE], settings.windows
     levels = [seen[variant] for variant in families["levels"].values()]
     return Compared(

@@ -28,15 +28,15 @@ class SceneWindows:
     """Counts of one trial."""
 
     samples: tuple[int, int, int]
-    """By class, by the protocol's own rule."""
+    """Number of samples by class, by the protocol's own rule."""
     silent: tuple[int, int, int]
-    """Those without a single event."""
+    """Number of samples without a single event, by class."""
     in_hold: int
     """No-slip samples that end before the motion begins."""
     seconds: tuple[float, float, float, float]
     """Recorded seconds of each phase; see `PHASES`."""
     events: tuple[int, int, int, int]
-    """Events of the wanted polarity inside the crop, by phase."""
+    """Events of the selected polarity inside the crop, by phase."""
 
 
 def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWindows:
@@ -64,8 +64,8 @@ def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWind
     in_hold = np.count_nonzero(chosen[NO_SLIP] + windows.length_ms * 1_000_000 <= 0)
     incipient, gross = (end_ns if onset is None else onset for onset in seen.markers)
     borders = np.array([begin_ns, 0, incipient, gross, end_ns]) // 1000
-    wanted = seen.events.t_us[_wanted(seen, windows)]
-    counts = np.diff(np.searchsorted(wanted, borders))
+    selected = seen.events.t_us[_selected(seen, windows)]
+    counts = np.diff(np.searchsorted(selected, borders))
     return SceneWindows(
         samples=(len(chosen[0]), len(chosen[1]), len(chosen[2])),
         silent=(silent[0], silent[1], silent[2]),
@@ -75,8 +75,8 @@ def look(seen: Seen, windows: Windows, samples: Samples, seed: int) -> SceneWind
     )
 
 
-def _wanted(seen: Seen, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Mask of events that have the wanted polarity and lie in the centred crop, (n,)."""
+def _selected(seen: Seen, windows: Windows) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Mask of events that have the selected polarity and lie in the centred crop, (n,)."""
     assert seen.events is not None
     kept = np.ones(len(seen.events), np.bool_)
     for place, size in zip((seen.events.x, seen.events.y), seen.size_px, strict=True):

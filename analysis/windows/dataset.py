@@ -1,4 +1,4 @@
-"""From labelled recordings to samples: windows chosen by the 50/50/50 rule and binned."""
+"""Make samples of labelled recordings: windows chosen by the 50/50/50 rule and binned."""
 
 from __future__ import annotations
 

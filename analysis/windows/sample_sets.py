@@ -23,13 +23,13 @@ from sliplab.storage.trials.recording import Recording
 STEP = "samples"
 _FORMAT = "trials by name"
 _BY_PLACE = "numbered by place"
-"""In keys of what was made of several campaigns since windows are told apart by their trial."""
+"""Part of keys over several campaigns, since windows are identified by their trial."""
 TrialRef = tuple[Collected, Trial, Recording]
 """A trial with its campaign and its recording."""
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _SampleInputs:
     """Inputs of a trial's samples besides the trial; see `dataset.trial_samples`."""
 
     label: TrialLabel
@@ -95,7 +95,7 @@ def _make(labels: Labels, trials: list[TrialRef], windows: Windows, each: EachTr
     work = [
         TrialWork(
             recording, item.name, "",
-            _Wanted(
+            _SampleInputs(
                 labels.read(item, recording), TrialId(item.name, trial.id), windows,
                 item.settings.samples, hash_integer("samples", trial.id),
             ),
@@ -107,7 +107,7 @@ def _make(labels: Labels, trials: list[TrialRef], windows: Windows, each: EachTr
     return SampleSet.join([parts[number] for number in range(len(work))], windows)
 
 
-def _samples(recording: Recording, wanted: _Wanted) -> SampleSet:
+def _samples(recording: Recording, inputs: _SampleInputs) -> SampleSet:
     return dataset.trial_samples(
-        recording, wanted.label, wanted.trial, wanted.windows, wanted.samples, wanted.seed
+        recording, inputs.label, inputs.trial, inputs.windows, inputs.samples, inputs.seed
     )

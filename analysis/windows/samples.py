@@ -67,7 +67,7 @@ def choose_windows(
         start_ns, end_ns: the recording, on the trial's time line, ns.
         incipient_ns, gross_ns: the true onsets, ns.
         window_ns: a window's length.
-        per_class: windows wanted of each class.
+        per_class: number of windows of each class.
         seed: of the random windows (PCG64).
 
     Returns:

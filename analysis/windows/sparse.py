@@ -42,7 +42,7 @@ class SparseWindows:
 
     @staticmethod
     def of(x: npt.NDArray[Any]) -> SparseWindows:
-        """From counts (n, steps, channels, rows, columns), uint8.
+        """Make it of counts (n, steps, channels, rows, columns), uint8.
 
         Raises:
             ValueError: not five axes, or not uint8.

@@ -269,11 +269,11 @@ def _list(
                 i += 1
                 # half of the events have the other polarity, in no order that a processor could
                 # guess: they go on a last place that nobody reads, without a branch
-                wanted = (column >= 0) & (row >= 0) & (both | (positive == asked))
-                place = ((both & positive) * cells + row) * cells + column if wanted else nowhere
+                selected = (column >= 0) & (row >= 0) & (both | (positive == asked))
+                place = ((both & positive) * cells + row) * cells + column if selected else nowhere
                 found = plane[place]
                 touched[m] = place
-                m += (found == 0) & wanted
+                m += (found == 0) & selected
                 plane[place] = found + (found < 255)
             for k in range(m):
                 # few, and nearly sorted: each goes down to where it belongs
@@ -305,7 +305,7 @@ def _total(
         stop = np.searchsorted(t, starts[n] + length_us)
         for i in range(np.searchsorted(t, starts[n]), stop):
             inside = of_x[x[i]] >= 0 and of_y[y[i]] >= 0
-            wanted = polarity == 2 or (p[i] != 0) == (polarity == 1)
-            total += inside and wanted
+            selected = polarity == 2 or (p[i] != 0) == (polarity == 1)
+            total += inside and selected
         out[n] = total
     return 0

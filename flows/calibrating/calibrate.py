@@ -34,7 +34,7 @@ def see_boards(session: CalibrationSession, views: int) -> list[npt.NDArray[np.u
 
     Raises:
         StopRequested: the person said stop.
-        RigError: the camera hands over tracks, or no frame came.
+        RigError: the camera provides tracks, or no frame arrived.
     """
     rig, camera = session.rig, session.file.frame_camera
     rig.frames.set_region(camera.width_px, camera.height_px)
@@ -184,7 +184,7 @@ _MARGIN_MM = 12.0
 
 
 def print_board(board: Board, path: Path) -> dict[str, float]:
-    """Write the board with a ruler beside it; return sizes in mm.
+    """Write the board with a ruler; return sizes in mm.
 
     Raises:
         InputError: the file's name ends in neither .pdf nor .png, or its folder is missing.

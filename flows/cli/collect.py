@@ -118,7 +118,7 @@ def collect(
         console.say(f"note: {warning}")
     check_disk([run_request])
     prepare_store(store)
-    if run_request.wanted(Store(store).campaign(run_request.campaign)):
+    if run_request.due_trials(Store(store).campaign(run_request.campaign)):
         orchestration.begin()  # starts while the imports below load
     from sliplab.flows.collect import collect as run
 

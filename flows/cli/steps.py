@@ -123,8 +123,8 @@ def evaluate(
         raise InputError("--engine", "", engine.value, "belongs to --model")
     folder = located(store)
     if model is not None:
-        for name, wanted in (("--baselines", baselines), ("--checks", checks)):
-            if wanted:
+        for name, chosen in (("--baselines", baselines), ("--checks", checks)):
+            if chosen:
                 raise InputError(name, "", None, "is for the store's own network")
         options |= {"model": model, "engine": None if engine is None else engine.value}
         result = run_step(folder, campaign, "judge_model", dask, **options)
@@ -136,8 +136,8 @@ def evaluate(
         return
     result = run_step(folder, campaign, "evaluate", dask, **options)
     more = {"window_baselines": baselines, "window_checks": checks}
-    for name, wanted in more.items():
-        if wanted:
+    for name, chosen in more.items():
+        if chosen:
             result[name] = run_step(folder, campaign, name, reviewed=reviewed)
     finish(result, f"evaluate {store}", as_json)
 

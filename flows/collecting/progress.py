@@ -259,9 +259,9 @@ class _Page:
         """Return plan numbers from 1, and events per second, of evenly spread trials."""
         campaign = Store(self._run_request.store).campaign(self._run_request.campaign)
         there = campaign.committed()
-        wanted = [(n, t) for n, t in enumerate(self._run_request.plan, 1) if t.id in there]
+        taken = [(n, t) for n, t in enumerate(self._run_request.plan, 1) if t.id in there]
         numbers, rates = [], []
-        for number, trial in wanted[:: -(-len(wanted) // MOST_POINTS) or 1]:
+        for number, trial in taken[:: -(-len(taken) // MOST_POINTS) or 1]:
             with suppress(StoreError):
                 record = campaign.recording(trial.id).record
                 numbers.append(number)

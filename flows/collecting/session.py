@@ -58,7 +58,7 @@ _PACKAGES = ("sliplab", "numpy", "numba", "h5py", "hdf5plugin", "av")
 
 
 class WindowOver(CampaignStopped):
-    """The time window of the collection is over; the next collection goes on."""
+    """The time window of the collection is over; the next collection resumes it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def run_session(run_request: RunRequest) -> Iterator[RunSession]:
         with held(run_request.rig, store.folder):
             rig = build_rig(run_request.rig)
             rig.should_stop = stopping.requested
-            trials = run_request.wanted(campaign)
+            trials = run_request.due_trials(campaign)
             left_out = len(pending_trials(run_request.plan, campaign)) - len(trials)
             campaign.add_bench_record(_session_record(run_request))
             session = Session(
@@ -419,7 +419,7 @@ class TrialGate:
         self._seen: frozenset[str] = frozenset()
         self._paused: Request | None = None
         self._skipped = frozenset(control.skipped(campaign))
-        self._wanted: set[str] = set()
+        self._retakes: set[str] = set()
 
     def begin(self) -> None:
         """Check reference trials before the first trial.
@@ -458,10 +458,12 @@ class TrialGate:
     def more(self) -> list[Trial]:
         """Return pending trials that were asked for again meanwhile, in the plan's order."""
         self._look()
-        wanted, self._wanted = self._wanted, set()
-        if not wanted:
+        retakes, self._retakes = self._retakes, set()
+        if not retakes:
             return []
-        return [t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in wanted]
+        return [
+            t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in retakes
+        ]
 
     def _look(self) -> Request | None:
         """Carry out new requests; return the one by which the store is paused, if it is."""
@@ -482,7 +484,7 @@ class TrialGate:
             return
         self._skipped = frozenset(control.skipped(self._campaign))
         if request.kind == "again":
-            self._wanted |= set(request.trials)
+            self._retakes |= set(request.trials)
         for trial, did in answer["did"].get("trials", {}).items():
             console.say(f"{request.kind} {trial}: {did}")
 

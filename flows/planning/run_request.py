@@ -57,7 +57,7 @@ class RunRequest:
     until: float | None = None
     only: frozenset[str] | None = None
 
-    def wanted(self, campaign: Campaign) -> list[Trial]:
+    def due_trials(self, campaign: Campaign) -> list[Trial]:
         """Return the trials to take now, in the plan's order."""
         pending = pending_trials(self.plan, campaign)
         return [t for t in pending if self.only is None or t.id in self.only][: self.most]
@@ -220,7 +220,7 @@ def describe_campaign(store: Store, run_request: RunRequest) -> Campaign:
 
 def missing_bytes(run_request: RunRequest) -> float:
     """Return the bytes that the trials still to take are expected to need."""
-    pending = run_request.wanted(Store(run_request.store).campaign(run_request.campaign))
+    pending = run_request.due_trials(Store(run_request.store).campaign(run_request.campaign))
     done = {trial.id for trial in run_request.plan} - {trial.id for trial in pending}
     return plan_bytes(run_request.rig, run_request.plan, done)
 

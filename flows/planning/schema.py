@@ -104,7 +104,7 @@ def _finished(schema: Schema, title: str) -> Schema:
 
 
 def _plain(part: Any) -> Any:
-    """In the words of draft 7, without whole sections as defaults."""
+    """Return the schema in draft 7, without whole sections as defaults."""
     if isinstance(part, list):
         return [_plain(item) for item in part]
     if not isinstance(part, dict):
@@ -120,7 +120,7 @@ def _plain(part: Any) -> Any:
 
 
 def _partial(part: Any) -> Any:
-    """As `part`, with nothing required and only such models below it."""
+    """Return the schema of `part` with nothing required, and only such models below it."""
     if isinstance(part, list):
         return [_partial(item) for item in part]
     if not isinstance(part, dict):

@@ -211,7 +211,7 @@ def _run(client: Any, question: Callable[[Any], None], about: Any) -> dict[str, 
 
 
 async def in_thread(question: Callable[[Any], None], about: Any) -> None:
-    """Asked of a worker: `question`, while the worker goes on talking to its scheduler."""
+    """Run `question` on a worker in a thread, so that the worker still answers its scheduler."""
     await asyncio.to_thread(question, about)
 
 
@@ -233,8 +233,8 @@ def _source() -> str:
     return hash_text("\n".join(sorted(f"{file.name} {sha256(file)}" for file in files)))[:12]
 
 
-def same_program(wanted: dict[str, str]) -> None:
-    """Asked of a worker: does it run what the asking program runs?
+def same_program(expected: dict[str, str]) -> None:
+    """Check on a worker that it runs the same program.
 
     Raises:
         ClusterError: it does not.
@@ -242,7 +242,7 @@ def same_program(wanted: dict[str, str]) -> None:
     ours = this_program()
     differ = [
         f"{name} {ours.get(name)} instead of {value}"
-        for name, value in wanted.items()
+        for name, value in expected.items()
         if ours.get(name) != value
     ]
     if differ:
@@ -250,7 +250,7 @@ def same_program(wanted: dict[str, str]) -> None:
 
 
 def reach_server(url: str) -> None:
-    """Asked of a worker: does it reach the Prefect server?
+    """Check on a worker that it reaches the Prefect server.
 
     Raises:
         ClusterError: it does not.
@@ -269,7 +269,7 @@ def reach_server(url: str) -> None:
 
 
 def report_all(limit_s: float = REPORT_S) -> None:
-    """Asked of a worker: send what Prefect has not reported yet, and then report anew.
+    """Send a worker's pending Prefect events, and start a new reporter.
 
     The next command may have another server, of which a worker that reports already would not know.
     """

@@ -53,7 +53,7 @@ _HEADLESS = {"PREFECT_UI_ENABLED": "0", "PREFECT__SERVER_EPHEMERAL": "1"}
 _RAISED = re.compile(r"[\w.]*(Error|Exception|Interrupt)\b")
 """The line of a traceback that says what was raised."""
 _direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Asks the loopback itself, whatever proxy the environment names."""
+"""Opener for the loopback, which ignores proxies of the environment."""
 
 
 class ServerError(RuntimeError):
@@ -214,7 +214,7 @@ def _closed(port: int, password: str) -> dict[str, str]:
 
 
 def _serve(handle: int, parent: int, home: Path) -> None:
-    """Be the server until told to end, or until the parent dies."""
+    """Run the server until it is asked to end, or until the parent dies."""
     if not die_with(parent):
         return  # it died before it could be watched
     collect_garbage_seldom()
@@ -296,22 +296,25 @@ def _make() -> None:
 
 def _keep(made: Path, template: Path) -> None:
     template.parent.mkdir(parents=True, exist_ok=True)
-    aside = template.with_name(f".{template.name}.{os.getpid()}.tmp")
+    temporary = template.with_name(f".{template.name}.{os.getpid()}.tmp")
     try:
-        with closing(sqlite3.connect(made)) as source, closing(sqlite3.connect(aside)) as target:
+        with (
+            closing(sqlite3.connect(made)) as source,
+            closing(sqlite3.connect(temporary)) as target,
+        ):
             source.backup(target)
-        os.replace(aside, template)
+        os.replace(temporary, template)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _copy(template: Path, target: Path) -> None:
-    aside = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        shutil.copyfile(template, aside)
-        os.replace(aside, target)
+        shutil.copyfile(template, temporary)
+        os.replace(temporary, target)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ EXTRAS = {
     "view": ("rerun",),
     "onnx": ("onnx", "onnxruntime"),
 }  # fmt: skip
-"""By extra, the modules that are imported of what it brings."""
+"""Modules that each extra installs."""
 
 _BRINGS = {module: extra for extra, modules in EXTRAS.items() for module in modules}
 

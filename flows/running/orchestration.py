@@ -326,7 +326,7 @@ def _reported(
     store, run_id = _store, str(flow_run.id)
     if store is not None:
         work.began = lambda: run_records.begin(store, run_id, flow.name, link.server)
-    told: Any = Flow(
+    reported_flow: Any = Flow(
         do,
         name=flow.name,
         version=flow.version,
@@ -338,7 +338,7 @@ def _reported(
     interrupted: BaseException | None = None
     delivered = False
     try:
-        run_flow(told, flow_run=flow_run, parameters={"argument": argument})
+        run_flow(reported_flow, flow_run=flow_run, parameters={"argument": argument})
         delivered = True
     except Exception as error:
         if not work.begun:
@@ -362,7 +362,7 @@ def _reported(
 
 
 def _without_server(work: _Work, argument: Any) -> Any:
-    """Do the work where no server can be told of it."""
+    """Do the work without a server that records it."""
     from prefect.context import SyncClientContext
     from prefect.events.clients import NullEventsClient
     from prefect.events.worker import EventsWorker

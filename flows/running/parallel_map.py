@@ -46,7 +46,7 @@ Done = Callable[[int, Any], None]
 
 
 class WorkerKilled(RuntimeError):
-    """A worker process was killed; what it and the others had handed over is kept."""
+    """A worker process was killed; results that were returned before are kept."""
 
 
 def parallel_map(
@@ -88,18 +88,18 @@ def parallel_map(
 
 @flow(name="pieces", validate_parameters=False, persist_result=False)
 def parallel_map_flow(
-    wanted: Opaque[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
+    argument: Opaque[tuple[str, Piece, Sequence[Any], Done, Cluster | None]],
 ) -> int:
     """`spread` for who has no flow. In a module: Prefect sends a flow along with its tasks."""
-    parallel_map(*wanted.content)
-    return len(wanted.content[2])
+    parallel_map(*argument.content)
+    return len(argument.content[2])
 
 
 @task(name="chunk of trials", cache_policy=NO_CACHE, persist_result=False)
 def _local_chunk(
     argument: Opaque[tuple[Piece, Sequence[Any], int, ProcessPoolExecutor, Done]],
 ) -> int:
-    """Some pieces on all cores; each is handed over as soon as it is there."""
+    """Run some pieces on all cores; each result is passed on as soon as it is ready."""
     piece, jobs, start, pool, done = argument.content
     futures = {pool.submit(piece, job): start + k for k, job in enumerate(jobs)}
     for future in as_completed(futures):
@@ -196,9 +196,9 @@ def run_trials(
 
 
 @flow(name="trials", validate_parameters=False, persist_result=False)
-def _trials_flow(wanted: Opaque[_Step]) -> int:
+def _trials_flow(argument: Opaque[_Step]) -> int:
     """All that is stale."""
-    step = wanted.content
+    step = argument.content
     with timed(step.store, step.title):
         keep_trials(step.store, step.name, step.title, step.work, step.make, step.cluster)
     return len(step.work)
@@ -214,7 +214,7 @@ def keep_trials(
     *,
     processes: bool = True,
 ) -> None:
-    """As `run_trials`, inside a flow that runs already."""
+    """Do the work of `run_trials` inside a flow that runs already."""
     with console.bar(f"{title} (trials)", len(work)) as bar:
 
         def keep(number: int, result: tuple[Json | Document, dict[str, Any]]) -> None:
@@ -263,7 +263,7 @@ def each_trial(
 
 
 def _find(job: _Job) -> None:
-    """Asked of a worker: is the trial there?
+    """Check on a worker that it can read the trial.
 
     Raises:
         StoreError: it is not, or is another take of it.

@@ -110,7 +110,7 @@ def open_runs(store: Path) -> list[Json]:
 def close_dead(store: Path, server: str, client: Any = None) -> list[Json]:
     """Close what killed processes of this machine left open on `server`, and report owed ends.
 
-    Prefect is told first: a program that dies in between does both again.
+    Prefect gets the report first: a program that dies in between does both again.
 
     Args:
         client: Prefect's, a synchronous one; a new one by default.

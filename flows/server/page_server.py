@@ -1,7 +1,7 @@
 """The Prefect server of a service: its page, its password, and what is done when it is lost.
 
 A service outlives its server. A server of our own that ended, or does not answer, is started anew
-at its port; once a server answers again it is told what ended meanwhile.
+at its port; once a server answers again, the runs that ended meanwhile are reported to it.
 """
 
 from __future__ import annotations

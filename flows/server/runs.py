@@ -161,7 +161,7 @@ def _carry_out_here(flow: Any, run: Any) -> None:
 
 
 def _carry_out(run_id: str, flow_name: str) -> None:
-    """Carry out one run in this process; its end is kept in the store and told to the server."""
+    """Execute one run in this process; its end is stored and reported to the server."""
     collect_garbage_seldom()
     from prefect.exceptions import Abort, Pause
     from prefect.flow_engine import run_flow

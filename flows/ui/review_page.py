@@ -54,7 +54,7 @@ class Page:
         self._background = Background(doc, pool, self._say)
         self.shown: ShownTrial | None = None
         self._rows: list[Row] = []
-        self._wanted: tuple[str, str] | None = None
+        self._requested: tuple[str, str] | None = None
         self._frame: int | None = None
         self._drawing = False
         self._close_by = False
@@ -114,10 +114,10 @@ class Page:
 
     def _place(self) -> int | None:
         names = [item.name for item in self._rows]
-        return names.index(self._wanted) if self._wanted in names else None
+        return names.index(self._requested) if self._requested in names else None
 
     def _mark(self) -> None:
-        """Mark the row of the wanted trial, and no other."""
+        """Mark the row of the requested trial, and no other."""
         here = self._place()
         self.see.source.selected.indices = [] if here is None else [here]
 
@@ -161,13 +161,13 @@ class Page:
 
     def _choose(self, item: Row) -> None:
         """Read a trial in the background, then show it."""
-        self._wanted = item.name
+        self._requested = item.name
         self._mark()
         campaign = self.trials.items[item.campaign]
         self._background.run(lambda: load_trial(self.trials.store, campaign, item), self._show)
 
     def _show(self, found: ShownTrial) -> None:
-        if found.row.name != self._wanted:
+        if found.row.name != self._requested:
             self._drop(found)
             return
         again = self.shown is not None and self.shown.row.name == found.row.name
@@ -237,7 +237,7 @@ class Page:
             self._draw()
 
     def _draw(self) -> None:
-        """Read the wanted frame in the background; the newest request counts."""
+        """Read the requested frame in the background; the newest request counts."""
         shown, index = self.shown, self._frame
         if shown is None or index is None:
             return

@@ -1,4 +1,4 @@
-"""The evaluation of a network: windows, trials, detectors, and what stands beside it.
+"""The evaluation of a network: windows, trials, detectors, and baselines.
 
 Shares, accuracies and rates run from 0 to 1. Intervals are 95 % over trials. Times and latencies
 are in milliseconds unless a name ends in `_ns`: integer nanoseconds on the trial's time line. A
@@ -172,7 +172,7 @@ class WindowWork(Part):
 
 
 class Baseline(Part):
-    """Another method beside the network, on the same windows."""
+    """Another method on the same windows as the network."""
 
     argmax: Number | None
     """Accuracy of the method."""

@@ -1,6 +1,6 @@
 """The label of a trial: its onsets by both rules, why one is in doubt, and how well it was seen.
 
-Times are integer nanoseconds on the trial's time line. The arrays beside it hold the markers'
+Times are integer nanoseconds on the trial's time line. The arrays next to it hold the markers'
 places and displacements.
 """
 

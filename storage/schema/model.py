@@ -1,4 +1,4 @@
-"""The document beside a model file: what the network was trained on, and how it did."""
+"""The document of a model file: training data, settings and accuracy."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ class Difference(Part):
 
 
 class Paper(Part):
-    """The network's settings beside the paper's."""
+    """The network's settings and the paper's."""
 
     preset: str | None
     differences: tuple[Difference, ...]
@@ -275,7 +275,7 @@ class Quality(Part):
 
 
 class Planned(Part):
-    """A campaign's plan beside what was taken."""
+    """A campaign's plan and the trials taken."""
 
     seconds: Number
     seconds_collected: Number

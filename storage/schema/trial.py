@@ -1,4 +1,4 @@
-"""The record of a trial, the provenance beside it, and its clocks where they were fitted again.
+"""The record of a trial, its provenance, and its clocks where they were fitted again.
 
 The record holds all that follows from protocol, seed and versions, and is under the trial's
 checksums. Who, when and where stand in the provenance, outside of them.

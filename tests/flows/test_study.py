@@ -24,7 +24,7 @@ from sliplab.analysis.windows.sample_sets import by_id, load_samples, split_tria
 from sliplab.flows import evaluate as evaluate_flows
 from sliplab.flows.collect import collect
 from sliplab.flows.evaluate import evaluate
-from sliplab.flows.label import check_folder, check_labels, check_wanted
+from sliplab.flows.label import check_folder, check_labels, check_required
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.flows.report import report
 from sliplab.flows.running import parallel_map
@@ -65,7 +65,7 @@ def test_labels_of_tracks_are_checked_with_video(
 ) -> None:
     run_request = replace(ran[0][0], store=tmp_path / "store")
     shutil.copytree(store_of(ran).folder, run_request.store)
-    assert check_wanted(run_request)
+    assert check_required(run_request)
     assert check_labels(run_request, 2)["done"] == 2
     found = read_check(Store.open(run_request.store))
     assert found is not None

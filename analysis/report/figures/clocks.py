@@ -197,10 +197,12 @@ def over_trials(
 
 
 def _panel(axes: Any, panel: OverTrials) -> None:
-    beside = 0.15 * (np.arange(len(panel.series)) - (len(panel.series) - 1) / 2)
-    for (device, (name, numbers, values)), aside in zip(panel.series.items(), beside, strict=True):
+    offsets = 0.15 * (np.arange(len(panel.series)) - (len(panel.series) - 1) / 2)
+    for (device, (name, numbers, values)), offset in zip(
+        panel.series.items(), offsets, strict=True
+    ):
         axes.plot(
-            np.asarray(numbers) + aside, values, MARKS[device], ms=4, mew=0, alpha=0.75,
+            np.asarray(numbers) + offset, values, MARKS[device], ms=4, mew=0, alpha=0.75,
             color=COLOURS[device], label=name, rasterized=len(numbers) > DENSE,
         )  # fmt: skip
     for gate in panel.gates:

@@ -43,7 +43,7 @@ class Panel:
 def by_condition(
     rows: Sequence[str], panels: Sequence[Panel], *, simulated: bool, breaks: Sequence[int] = ()
 ) -> str:
-    """Panels beside each other that share their rows, as SVG.
+    """Draw panels side by side that share their rows, as SVG.
 
     Args:
         rows: names, from top to bottom.
@@ -208,7 +208,7 @@ class ChangePanel:
 def lowered_and_raised(
     rows: Sequence[str], panels: Sequence[ChangePanel], *, simulated: bool, percent: float
 ) -> str:
-    """Panels beside each other that share their rows: changes with intervals, as SVG.
+    """Draw panels side by side that share their rows: changes with intervals, as SVG.
 
     Args:
         rows: names, from top to bottom.

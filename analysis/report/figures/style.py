@@ -1,6 +1,6 @@
 """Colours and style of all figures, and the SVG text of a picture.
 
-Colours are told apart by the colour-blind (Okabe and Ito's palette), and a simulated figure says so
+Colours are distinct for the colour-blind (Okabe and Ito's palette), and a simulated figure says so
 in the picture itself, so that it still says so when somebody copies it out of its page.
 """
 
@@ -29,9 +29,9 @@ Array = npt.NDArray[Any]
 CLASS_COLOURS = (BLUE, ORANGE, RED)
 CLASS_WORDS = ("no slip", "incipient slip", "gross slip")
 WIDTH = 6.4
-"""Inches: what still can be read when a telephone shrinks it."""
+"""Inches: still readable when a telephone shrinks it."""
 _DPI = 150
-"""Of what is rasterised."""
+"""Resolution of rasterised parts."""
 STYLE = {
     "font.size": 9,
     "font.family": "DejaVu Sans",
