@@ -32,9 +32,9 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store
+from tests.analysis.labels.reviewable import Reviewable, label
 from tests.command_line import here
 from tests.conftest import ROOT
-from tests.flows.reviewable import Reviewable, label
 
 SIZE = SearchSize(samples=40, epochs=2, trials=2, seeds=2, stride_ms=15)
 AXES = Axes(length_ms=(15, 30), step_ms=(1,), pool_px=(20,), width=(0.5, 1.0))

@@ -11,7 +11,7 @@ from sliplab.analysis.labels.label_errors import distances, holds_compared
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.recording import Recording
-from tests.flows.reviewable import NAME, Reviewable, label
+from tests.analysis.labels.reviewable import NAME, Reviewable, label
 
 MS = 1_000_000
 

@@ -19,9 +19,9 @@ from urllib.request import Request, urlopen
 import pytest
 
 from sliplab.storage.trials import review
+from tests.analysis.labels.reviewable import DOUBTFUL, NAME, Reviewable, label
 from tests.conftest import ROOT
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser, sync_api
-from tests.flows.reviewable import DOUBTFUL, NAME, Reviewable, label
 
 TRIALS = 864
 pytestmark = needs_browser

@@ -21,8 +21,7 @@ from sliplab.storage.errors import StoreError
 from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.review import Onsets
-from tests.flows.listening import listening
-from tests.flows.reviewable import (
+from tests.analysis.labels.reviewable import (
     EVENTS,
     FRAMES,
     NAME,
@@ -34,6 +33,7 @@ from tests.flows.reviewable import (
     pictures,
     places,
 )
+from tests.flows.listening import listening
 
 chunks = pytest.importorskip("rerun.chunk", reason="Rerun is not installed (sliplab[view])")
 

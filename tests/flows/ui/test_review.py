@@ -1,4 +1,4 @@
-"""What people decided, applied to labels: only on the label they saw, and only when asked."""
+"""Trials, labels and decisions as the review page lists and shows them."""
 
 from __future__ import annotations
 
@@ -7,24 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from sliplab.analysis.evaluation import evaluation as evaluate
 from sliplab.analysis.labels.reviewed import Labels
-from sliplab.analysis.networks import models as train
 from sliplab.flows.label import report_states
 from sliplab.flows.ui.review import TrialList, filtered_rows, load_trial, reasons_for_doubt
 from sliplab.protocols.errors import InputError
-from sliplab.storage.errors import StoreError
 from sliplab.storage.formats.import_trials import import_trials, trials_in
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.label import TrialLabel
-from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
-from sliplab.storage.trials.recording import Recording
-from sliplab.storage.trials.review import Onsets, Verdict
-from tests.flows.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
+from sliplab.storage.trials.review import Onsets
+from tests.analysis.labels.reviewable import EVENTS, NAME, Reviewable, displacements, label, places
 from tests.storage.formats.files import lab_hdf5
-
-NEW = Onsets(300_000_000, 500_000_000)
 
 
 @pytest.fixture
@@ -33,73 +26,17 @@ def made(tmp_path: Path) -> Reviewable:
     return Reviewable(tmp_path / "s", 12)
 
 
-def decide(made: Reviewable, trial: str, verdict: Verdict, new: Onsets = NEW) -> None:
-    known = label()
-    old = Onsets(known["incipient_ns"], known["gross_ns"])
-    seen = review.counts(made.store, NAME).get(trial, 0)
-    review.decide(
-        made.store, NAME, trial, verdict, label=made.keys[trial], old=old, new=new, seen=seen,
-        who="anna", why="because",
-    )  # fmt: skip
-
-
-def recording(made: Reviewable, trial: str) -> Recording:
-    return made.item.campaign.recording(trial)
-
-
-def test_decisions_count_only_when_asked(made: Reviewable) -> None:
-    one, two, three, four = made.ids[:4]
-    decide(made, one, "adjust")
-    decide(made, two, "reject", Onsets())
-    decide(made, three, "accept", Onsets())
-    decide(made, four, "reject", Onsets())
-    decide(made, four, "reopen", Onsets())
-    plain, reviewed = Labels(made.store), Labels(made.store, reviewed=True)
-    for trial in made.ids[:5]:
-        found = plain.read(made.item, recording(made, trial))
-        assert found.to_json() == {"key": made.keys[trial], **label()}
-        assert plain.key(made.item, recording(made, trial)) == made.keys[trial]
-    assert plain.states([made.item]) is None
-    assert report_states(plain, [made.item]) == {}
-
-    found = reviewed.read(made.item, recording(made, one))
-    assert (found.incipient_ns, found.gross_ns) == (NEW.incipient_ns, NEW.gross_ns)
-    assert list(found.per_marker_ns) == label()["per_marker_ns"]
-    found = reviewed.read(made.item, recording(made, two))
-    assert (found.incipient_ns, found.gross_ns) == (None, None)
-    assert found.doubts.incipient == "rejected: because"
-    for trial in made.ids[2:5]:
-        assert reviewed.read(made.item, recording(made, trial)).gross_ns == label()["gross_ns"]
-        assert reviewed.key(made.item, recording(made, trial)) == made.keys[trial]
-    assert reviewed.states([made.item]) == {
-        "open": 9, "accepted": 1, "adjusted": 1, "rejected": 1, "stale": 0
-    }  # fmt: skip
-
-
-def test_keys_follow_from_the_onsets_that_were_decided(made: Reviewable) -> None:
-    labels, trial = Labels(made.store, reviewed=True), made.ids[0]
-    keys = [labels.key(made.item, recording(made, trial))]
-    for verdict, new in (
-        ("adjust", NEW), ("adjust", Onsets(300_000_000, 500_000_001)), ("adjust", NEW),
-        ("reject", Onsets()), ("accept", Onsets()),
-    ):  # fmt: skip
-        decide(made, trial, verdict, new)  # type: ignore[arg-type]  # of the two verdicts
-        keys.append(labels.key(made.item, recording(made, trial)))
-    assert keys[0] == keys[5] == made.keys[trial]
-    assert keys[1] == keys[3]
-    assert len(set(keys)) == 4
-
-
 def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     made: Reviewable, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trial = made.ids[0]
     made.keys[trial] = "of an older label"
-    decide(made, trial, "adjust")
+    made.decide(trial, "adjust")
     labels = Labels(made.store, reviewed=True)
-    found = labels.read(made.item, recording(made, trial))
+    found = labels.read(made.item, made.recording(trial))
     assert found.incipient_ns == label()["incipient_ns"]
     assert report_states(labels, [made.item])["reviewed"]["stale"] == 1
+    assert report_states(Labels(made.store), [made.item]) == {}
     assert (
         "decisions on 1 trials were made on labels that have changed since"
         in capsys.readouterr().err
@@ -109,26 +46,9 @@ def test_a_decision_on_a_label_that_changed_is_stale_and_not_applied(
     assert filtered_rows(rows, state="stale") == [rows[0]]
 
 
-def test_models_and_evaluation_know_whose_labels_they_stand_on(made: Reviewable) -> None:
-    items = [made.item]
-    used = next(t for t, _ in made.item.trials if t.split == "train").id
-    before = train.wanted_models(made.store, items)[0].key
-    assert train.wanted_models(made.store, items, reviewed=True)[0].key == before
-    decide(made, used, "adjust")
-    assert train.wanted_models(made.store, items)[0].key == before
-    assert train.wanted_models(made.store, items, reviewed=True)[0].key != before
-    with pytest.raises(StoreError, match="with `--reviewed`"):
-        evaluate.make_job(made.store, items, reviewed=True)
-
-
-def test_a_damaged_decision_stops_what_would_use_it(made: Reviewable) -> None:
-    trial = made.ids[0]
-    decide(made, trial, "adjust")
-    path = made.store.folder / "review" / NAME / trial / "000001.json"
-    path.write_text("{")
-    with pytest.raises(StoreError, match=r"000001\.json"):
-        Labels(made.store, reviewed=True).key(made.item, recording(made, trial))
-    assert Labels(made.store).key(made.item, recording(made, trial)) == made.keys[trial]
+def test_the_list_shows_a_damaged_decision(made: Reviewable) -> None:
+    made.decide(made.ids[0], "adjust")
+    (made.store.folder / "review" / NAME / made.ids[0] / "000001.json").write_text("{")
     assert "000001.json" in TrialList(made.store).rows[0].problem
 
 
@@ -146,7 +66,7 @@ def test_the_list_follows_the_store(made: Reviewable) -> None:
     assert [row.trial for row in trials.rows] == made.ids
     assert {(row.label, row.state, row.severity) for row in trials.rows} == {("fresh", "open", 0)}
     assert not trials.refresh()
-    decide(made, made.ids[3], "adjust")  # by another program
+    made.decide(made.ids[3], "adjust")  # by another program
     assert trials.refresh()
     assert (trials.rows[3].state, trials.rows[3].who) == ("adjusted", "anna")
     derived = Derived.of(made.store, STEP, NAME)

@@ -16,7 +16,10 @@ from sliplab.storage.files import sha256
 from sliplab.storage.schema.label import LABELS as STEP
 from sliplab.storage.schema.trial import Provenance, TrialRecord
 from sliplab.storage.streams import EventChunk, FrameChunk, PoseChunk, PulseChunk
+from sliplab.storage.trials import review
 from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.recording import Recording
+from sliplab.storage.trials.review import Onsets, Verdict
 from sliplab.storage.trials.store import Campaign, Store
 from tests.conftest import ROOT
 
@@ -33,6 +36,8 @@ SKIN_MM = [[0.0, 0.0], *([5.6 * np.cos(a), 5.6 * np.sin(a)] for a in np.arange(6
 EVENTS = 3000
 DOUBTFUL = 700
 """Place in the plan of the trial whose label is in doubt."""
+ADJUSTED = Onsets(300_000_000, 500_000_000)
+"""Onsets of an adjusted label."""
 
 
 def frame_times() -> np.ndarray:
@@ -132,6 +137,20 @@ class Reviewable:
     def item(self) -> Collected:
         """The campaign as the steps see it."""
         return Collected(self.store.campaign(NAME))
+
+    def recording(self, trial: str) -> Recording:
+        """Open a trial."""
+        return self.item.campaign.recording(trial)
+
+    def decide(self, trial: str, verdict: Verdict, new: Onsets = ADJUSTED) -> None:
+        """Write a reviewer's decision on a trial's label as it is now."""
+        known = label()
+        old = Onsets(known["incipient_ns"], known["gross_ns"])
+        seen = review.counts(self.store, NAME).get(trial, 0)
+        review.decide(
+            self.store, NAME, trial, verdict, label=self.keys[trial], old=old, new=new, seen=seen,
+            who="anna", why="because",
+        )  # fmt: skip
 
     def _write(self, campaign: Campaign, trial: str, condition: dict[str, str]) -> None:
         writer = campaign.begin(trial, (SIZE, SIZE), 100)
