@@ -191,7 +191,7 @@ class Trial:
         return Onsets(self.label["incipient_ns"], self.label["gross_ns"])
 
     def displacements(self) -> tuple[I64, F64]:
-        """Displacement of each of m markers, from which slip is found.
+        """Displacement of each of m markers, from which slip is detected.
 
         Returns:
             times of n frames on the time line, int64 nanoseconds, shape (n,); displacements in

@@ -1,8 +1,8 @@
-"""`sliplab guesses`: what a study's figures owe to the assumed numbers of its simulated scene.
+"""`sliplab guesses`: sensitivity of a study's figures to assumed parameters of the scene.
 
-Some of a study's test trials are taken again on the same simulated rig with one assumed number 20 %
+Some of a study's test trials are repeated on the same simulated rig with one parameter 20 %
 lower, then 20 % higher. They are labelled anew and judged by the study's own network and detection
-settings. Each setting is a small store, which goes when its figures are kept; so the sweep may be
+settings. Each setting is a small store, deleted once its figures are kept; so the sweep may be
 stopped anywhere, and resumes.
 """
 

@@ -33,8 +33,8 @@ from sliplab.storage.trials.store import Store, StoreError
 
 STEP, NAME, VERSION = "holdout", "results", 1
 PROTOCOL_SEED, SKIN_SEED = 904_117_233, 730_915_402
-"""Of trials and of the skin. They must not stand anywhere else: not in a protocol, a rig file, a
-test, or a search. Whoever has looked at single trials of it replaces both."""
+"""Seeds of trials and of the skin. They must not be used anywhere else: not in a protocol, a rig, a
+test, or a search. Replace both after looking at single trials of it."""
 
 Json = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""Trials on a simulated rig that nobody stores: their cost, and what they left in memory.
+"""Trials on a simulated rig that are not stored: their cost, and their data in memory.
 
 The rig's own code runs the trial's own program; only the sink is memory, and no pictures are
 taken. A run that is compared has perfect clocks, no noise, no faults and no read-out, so that two
@@ -94,7 +94,7 @@ class _Memory(NullSink):
 
 
 def run(rig: RigFile, plan: Plan, trial: Trial, seed: int) -> Seen:
-    """Simulate a trial; return what it left, on a time line that begins with its motion.
+    """Simulate a trial; return its data, on a time line that begins with its motion.
 
     Args:
         rig: with perfect clocks (`ideal`, `with_true_times`): device times are true times then.

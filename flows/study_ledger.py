@@ -23,8 +23,8 @@ TO_DO, RUNNING, STOPPED, DONE = "to do", "running", "stopped", "done"
 LEAST, MOST = 0.2, 5.0
 """Limits of the pace: the seconds of the steps that are over, by the expected ones."""
 BELIEF_S = 60.0
-"""Weight of the expectation, as work already done at its pace: the first step also compiles the
-kernels, once in an installation, and says little about the others if it is short."""
+"""Weight of the estimate, as work already done at its pace: the first step also compiles the
+kernels, once in an installation, and predicts little about the others if it is short."""
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,11 @@ class CameraShift:
     px: Floats
     unsure: NDArray[np.bool_]
     sigma: Floats
-    """(n,) what taking it out adds to a coordinate's standard deviation, px."""
+    """(n,) standard deviation that its correction adds to a coordinate, px."""
 
     @property
     def largest_px(self) -> float:
-        """Over the trial."""
+        """Largest shift over the trial, px."""
         return float(np.hypot(*self.px.T).max(initial=0.0))
 
 

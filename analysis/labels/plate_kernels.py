@@ -24,7 +24,7 @@ _KEPT = 0.6
 
 @numba.njit(cache=True, nogil=True)
 def _grey(frame: Any, x: float, y: float) -> float:
-    """Bilinear; NaN outside."""
+    """Return the bilinear grey level; NaN outside the image."""
     if not (0.0 <= x < frame.shape[1] - 1 and 0.0 <= y < frame.shape[0] - 1):
         return np.nan
     j, i = int(x), int(y)

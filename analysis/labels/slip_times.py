@@ -35,7 +35,7 @@ class SlipTimes:
 
     @property
     def onsets(self) -> Onsets:
-        """The first papilla's and the centre's."""
+        """Onsets of the first papilla and of the centre."""
         slipped = self.at_ns != NO_ONSET
         if not slipped.any():
             return Onsets(None, None, None, self.at_ns)

@@ -60,7 +60,7 @@ class Linear(StrictModel):
 
 
 class Pool(StrictModel):
-    """Spikes of square patches added up, averaged, or the largest."""
+    """Sum, average or maximum of spikes over square patches."""
 
     kind: Literal["pool"]
     how: Literal["sum", "average", "max"]
@@ -70,7 +70,7 @@ class Pool(StrictModel):
 
 
 class Flatten(StrictModel):
-    """Channels and cells in one row."""
+    """Flatten channels and cells into one axis."""
 
     kind: Literal["flatten"]
 
@@ -137,12 +137,12 @@ class ExternalModel:
 
     @property
     def windows(self) -> Windows:
-        """The windows that it takes."""
+        """Windows that the network expects."""
         return self.description.windows
 
     @property
     def outputs_per_class(self) -> float:
-        """Output neurons of a class, in the mean."""
+        """Mean number of output neurons of a class."""
         return len(self.description.outputs) / len(CLASSES)
 
     def sinabs(self) -> SinabsNet:
@@ -294,7 +294,7 @@ class _Entries:
         return found
 
     def perhaps(self, entry: str) -> torch.Tensor | None:
-        """An entry if it is there, finite; nobody else gets it."""
+        """Return and remove an entry, checked to be finite; None where it is missing."""
         found = self._left.pop(entry, None)
         if found is not None and not found.isfinite().all():
             wrong = int((~found.isfinite()).sum())

@@ -60,7 +60,7 @@ class Batch:
 
 
 class Work(Protocol):
-    """Something that computes batches with the weights that it was last given."""
+    """Engine that computes batches with the weights set last."""
 
     def take(self, weights: list[npt.NDArray[np.float32]]) -> None:
         """Use these (`analysis.networks.network.matrices`) from now on."""
@@ -101,7 +101,7 @@ class EventDriven:
         self._trainer.take(weights)
 
     def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
-        """Parts are computed in any order and added up in theirs: the same bits on any threads."""
+        """Compute parts in any order and sum them in theirs: the same bits with any threads."""
         leaves = self._trainer.leaves
 
         def compute(some: IntArray) -> tuple[float, Job, tuple[torch.Tensor, ...]]:
@@ -191,7 +191,7 @@ class CompiledNeurons(nn.Module):
         return cast(torch.Tensor, spikes).reshape(current.shape)
 
     def reset_states(self) -> None:
-        """There are none between calls."""
+        """Do nothing: there are no states between calls."""
 
 
 class ExactConvolution(nn.Conv2d):
@@ -306,7 +306,7 @@ class OnDevice:
         set_matrices(self._net, weights)
 
     def batch(self, x: SparseWindows, y: IntArray, rows: IntArray, pool: Executor) -> Batch:
-        """The whole batch at once; the pool has nothing to do."""
+        """Compute the whole batch at once; the pool is not used."""
         dense = torch.from_numpy(x.take(rows).dense()).to(self._device, torch.float32)
         reset_states(self._net)
         with _exact_sums():
@@ -334,7 +334,7 @@ def _check(device: str) -> None:
 
 @contextmanager
 def _exact_sums() -> Iterator[None]:
-    """Whole float32: a GPU's shorter TF32 would not hold the grid."""
+    """Force full float32: a GPU's shorter TF32 cannot represent the grid."""
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
     try:

@@ -47,7 +47,7 @@ def _store(builder: Any, value: Any, place: Any) -> None:
 
 
 def _all(builder: Any, value: Any, lanes: int) -> Any:
-    """One number in all lanes."""
+    """Broadcast one number to all lanes."""
     nothing = ir.Constant(_vector(lanes), ir.Undefined)
     first = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
@@ -113,7 +113,7 @@ def fires_kept(typing: Any, current: Any, v: Any, u: Any, at: Any, threshold: An
 
 @intrinsic
 def lowest(typing: Any, bits: Any) -> Any:
-    """The place of a uint64's lowest set bit, uint64; any number where none is set."""
+    """Return the index of a uint64's lowest set bit, uint64; undefined where none is set."""
 
     def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))

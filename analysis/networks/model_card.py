@@ -1,4 +1,4 @@
-"""The model card: what a model is, what it was made of and how well it does, on one page."""
+"""The model card: a model, its training data and its accuracy on one page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sliplab.analysis.networks.training import Fitted
 
 FORMAT = "sliplab-model-card-1"
 FEW_TRIALS = 10
-"""Test trials below which a figure is little more than an anecdote."""
+"""Fewest test trials for a meaningful figure."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _warnings(
 
 
 def card_markdown(card: Mapping[str, Any]) -> str:
-    """The card for people."""
+    """Return the card as Markdown."""
     model, data, simulated = card["model"], card["data"], card["simulated"]
     said = " (simulated)" if simulated else ""
     text = [f"# {model['file']}{said}", ""]

@@ -1,4 +1,4 @@
-"""The trained models of a store: what they have to be made of, and which of them is evaluated."""
+"""The trained models of a store: their inputs, and the one that is evaluated."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Quantised:
     scales: dict[str, float]
 
     def rounding(self, net: nn.Sequential) -> dict[str, float]:
-        """RMS of what rounding changed in each layer, as a share of the RMS of its weights."""
+        """RMS of each layer's rounding error, as a share of the RMS of its weights."""
         found = {}
         for name in WEIGHTED:
             real = _numbers(net, name)

@@ -201,12 +201,12 @@ def _layer(
 
 
 def _bits(count: int) -> int:
-    """Address bits for so many things: the memory is addressed by whole bits."""
+    """Return the address bits for a number of things: the memory is addressed by whole bits."""
     return (count - 1).bit_length()
 
 
 def _assign(layers: tuple[SpeckLayer, ...]) -> dict[str, int]:
-    """A core of its own for each layer, as many as there can be (augmenting paths)."""
+    """Assign a core to each layer, as many as possible (augmenting paths)."""
     taken: dict[int, SpeckLayer] = {}
 
     def place(layer: SpeckLayer, seen: set[int]) -> bool:

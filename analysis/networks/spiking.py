@@ -85,7 +85,7 @@ class Engine:
         return out, fired
 
     def stream(self) -> Stream:
-        """The network step by step, from rest."""
+        """Return the network as a stepper that starts at rest."""
         return Stream(self)
 
     def sparse(self, x: Samples) -> SparseWindows:
@@ -104,7 +104,7 @@ class Engine:
         return x
 
     def _borrow(self) -> tuple[Any, Any]:
-        """Memory for one thread, to be put back into `_idle`."""
+        """Borrow memory for one thread; return it to `_idle`."""
         try:
             return self._idle.pop()
         except IndexError:
@@ -138,7 +138,7 @@ class Stream:
         return np.bincount(classes.astype(np.int64), minlength=len(CLASSES)).astype(np.uint8)
 
     def reset(self) -> None:
-        """Back to rest."""
+        """Reset the potentials to rest."""
         for state, rest in zip(self._state, self._engine._layout.rest, strict=True):
             state[:] = rest
 
@@ -261,14 +261,14 @@ class Trainer:
             return layout.state(), layout.scratch(), kept, planes, row
 
     def give_back(self, memory: tuple[Any, Any, Any, Any, F32]) -> None:
-        """For the next to borrow."""
+        """Return borrowed memory."""
         self._idle.append(memory)
 
 
 def side_by_side(
     work: Callable[[int], None], items: Iterable[int], threads: int | None = None
 ) -> None:
-    """Do all of the work, in as many threads as torch may use or as are given."""
+    """Do all of the work, in as many threads as given or as torch may use."""
     items = list(items)
     count = min(threads or torch.get_num_threads(), len(items))
     if count <= 1:

@@ -27,10 +27,10 @@ from sliplab.analysis.networks.spiking_kernels import add_bias, fire, scatter, s
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 _U0, _LANES = np.uint64(0), np.uint64(LANES)
 _AT_ONCE = 4
-"""Steps that one product of matrices takes: few enough for the library not to ask other threads."""
+"""Steps per matrix product: few enough for the library to use a single thread."""
 
 _LEAST = np.float32(-80.0)
-"""exp below it is nothing (and would make denormal numbers, which are slow)."""
+"""Arguments below which exp counts as 0; it would give denormal numbers, which are slow."""
 
 
 @njit(cache=True, nogil=True)

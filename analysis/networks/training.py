@@ -91,7 +91,7 @@ class EpochRecord:
 
     @property
     def merit(self) -> tuple[float, float, float]:
-        """The key by which epochs are compared, the larger the better: see `fit`."""
+        """Key by which epochs are compared, larger is better; see `fit`."""
         return (self.val_strict, self.val_argmax, -self.val_loss)
 
 
@@ -140,7 +140,7 @@ class Run:
         self.training = training
         self.fine = build(network, windows, seed)
         self.trained = build(network, windows, seed)
-        """Has the fine weights at their points of the grid, between epochs."""
+        """Network with the fine weights rounded to the grid, between epochs."""
         self.parameters = parameters(self.fine)
         self.optimizer = torch.optim.Adam(
             self.parameters.values(), training.learning_rate, fused=True
@@ -154,11 +154,11 @@ class Run:
         self.kept = weights(self.trained)
 
     def to_grid(self) -> None:
-        """Let the spikes be those of the fine weights as they are now."""
+        """Round the fine weights to the grid, and use them for spikes."""
         self.work.take(on_grid(matrices(self.fine)))
 
     def settle(self) -> None:
-        """Let `trained` have the weights that the spikes are of."""
+        """Copy the rounded weights to `trained`."""
         set_matrices(self.trained, on_grid(matrices(self.fine)))
 
     @property
@@ -195,13 +195,13 @@ class Run:
         return loss / len(x), counts, {name: total / len(x) for name, total in fired.items()}
 
     def keep(self, record: EpochRecord) -> None:
-        """An epoch is over; its weights are kept if it is the best yet."""
+        """Record an epoch; keep its weights if it is the best so far."""
         self.history.append(record)
         if self.best == 0 or record.merit > self.history[self.best - 1].merit:
             self.best, self.kept = record.epoch, weights(self.trained)
 
     def state(self) -> bytes:
-        """Everything that the epochs to come depend on."""
+        """State on which the following epochs depend."""
         buffer = io.BytesIO()
         content = {
             "fine": weights(self.fine),
@@ -234,7 +234,7 @@ class Run:
 
 
 VERSION = 8
-"""Raised when the same samples, settings and seed give other weights."""
+"""Version; incremented when the same samples, settings and seed give other weights."""
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def balanced(part: Part, per_class: int, seed: int) -> Part:
 
 
 def shuffle(labels: IntArray, seed: int) -> IntArray:
-    """The same labels, dealt out to the windows at random."""
+    """Return the labels, shuffled over the windows."""
     return np.random.Generator(np.random.PCG64(seed)).permutation(labels)
 
 

@@ -89,7 +89,7 @@ class Change:
         name: str, unit: str, here: float, there: float, span: tuple[float, float] | None,
         basis: Basis,
     ) -> Change:  # fmt: skip
-        """Hold a difference against its interval; without one, nothing is known of its noise."""
+        """Compare a difference with its interval; without one, its noise is unknown."""
         gap = here - there
         if span is None:
             return Change(name, unit, here, there, gap, None, None, "none", None)

@@ -32,7 +32,7 @@ from sliplab.storage.schema.trial import DEVICES, Gate, TrialRecord
 from sliplab.storage.trials.checksums import RECORD
 
 WORST = 10
-"""So many of the worst trials are shown."""
+"""Number of worst trials that are shown."""
 
 
 def render(

@@ -161,7 +161,7 @@ class DeviceNumbers:
 
 @dataclass(frozen=True)
 class CampaignClocks:
-    """A campaign's clocks: how many trials were fitted again now, and what came of it."""
+    """A campaign's clocks: the number of trials fitted again now, and the results."""
 
     refitted: int
     trials: int

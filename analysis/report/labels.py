@@ -1,4 +1,4 @@
-"""Labels in the report: how far both rules are apart, and each from the simulation's truth."""
+"""Labels in the report: differences between the rules, and of each from the simulated truth."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _figure(
 
 
 def _holds(holds: Mapping[str, Hold]) -> Table:
-    """List slips in the hold, and what it would matter from which end displacements count."""
+    """List slips in the hold, and how the onsets depend on the reference end of the hold."""
     columns = (
         "campaign", "trials", "slipped in the hold", "most (px)", "incipient apart, median (ms)",
         "largest (ms)", "gross apart, median (ms)", "largest (ms)",

@@ -307,7 +307,7 @@ def _rival(kinematic: Kinematic) -> Rival | None:
 
 
 def _others(baselines: Mapping[str, TrainedBaseline]) -> Table:
-    """List what the other methods are."""
+    """List the other methods."""
     rows = []
     for name, found in baselines.items():
         made, shares = found.made, _shares(found.made)

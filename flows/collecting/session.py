@@ -3,8 +3,8 @@
 `run_session` opens a session: it holds the store and the rig, cleans up what a crash left, and
 builds the rig. `Session` takes trials and commits the good ones; `TrialGate` decides between two
 trials whether the next one may begin. None of them knows Prefect: `flows.collect` decides in what
-batches trials are taken. What is done is what the store holds, so a session may die at any
-instruction and the next one goes on.
+batches trials are taken. The store is the only record of progress, so a session may die at any
+instruction and the next one resumes.
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ class Session:
         return True
 
     def _abandon(self, writer: TrialWriter, error: BaseException) -> None:
-        """Quarantine what was written of a trial, with the cause, as far as the disk allows.
+        """Quarantine the data written of a trial, with the cause, as far as the disk allows.
 
         What cannot be moved now is quarantined by the recovery of the next session.
         """
@@ -446,7 +446,7 @@ class TrialGate:
         return True
 
     def after(self, trial: Trial, outcome: str) -> None:
-        """Learn from a trial that is over.
+        """Update the disk estimate and the drift check after a trial.
 
         Raises:
             CampaignStopped: it was a reference trial, and drifted.

@@ -1,4 +1,4 @@
-"""`sliplab check`: everything that can be known before anything moves.
+"""`sliplab check`: all checks that are possible before anything moves.
 
 Protocol and limits, region of the outside camera, disk space, calibration; then the devices: do
 they answer, what do they report of themselves, and can their clocks be fitted.

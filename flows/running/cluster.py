@@ -64,7 +64,7 @@ class Cluster:
         return DaskTaskRunner(address=self.address)
 
     def check_server(self, url: str) -> None:
-        """See that workers reach the Prefect server, to which they report.
+        """Check that workers reach the Prefect server, to which they report.
 
         Raises:
             ClusterError: one does not.
@@ -75,7 +75,7 @@ class Cluster:
         )  # fmt: skip
 
     def check_store(self, look: Callable[[Any], None], job: Any) -> None:
-        """See that each worker finds a trial: `look(job)` says there what is wrong.
+        """Check that each worker finds a trial: `look(job)` raises there if it does not.
 
         Raises:
             ClusterError: one does not.
@@ -87,19 +87,19 @@ class Cluster:
         )  # fmt: skip
 
     def report(self) -> None:
-        """Have the workers tell Prefect's server what they did, while it is there."""
+        """Have the workers send their reports while Prefect's server still runs."""
         with suppress(Exception):  # nothing but Prefect's own view depends on it
             _run(self.client, report_all, REPORT_S)
 
     def gather(self, futures: list[Any], done: Callable[[int, Any], None]) -> None:
-        """Hand over the result of each of Prefect's futures as it comes.
+        """Pass on the result of each of Prefect's futures as soon as it is ready.
 
         Args:
             done: called in this thread with the number of a future and its result.
 
         Raises:
             ClusterError: no worker is left, or the scheduler is gone.
-            KeyboardInterrupt: a stop was requested; what is queued is cancelled.
+            KeyboardInterrupt: a stop was requested; queued tasks are cancelled.
         """
         ready: queue.SimpleQueue[int] = queue.SimpleQueue()
         for number, future in enumerate(futures):

@@ -198,10 +198,10 @@ class Bar:
         self._said_s = time.monotonic()
 
     def advance(self, count: float = 1, note: str = "", left: str = "") -> None:
-        """`count` more are done; a stop request is answered here.
+        """Advance by `count`; a stop request raises here.
 
         Args:
-            left: the time that is left in words, for a bar that was told it would be.
+            left: the time left in words, for a bar that was created to show it.
 
         Raises:
             KeyboardInterrupt: somebody asked the program to stop.

@@ -234,7 +234,7 @@ _MADE = "alembic_version"
 
 
 def prepare_database(home: Path) -> None:
-    """Have the tables in Prefect's home; do nothing where the user has set another database.
+    """Create the tables in Prefect's home; do nothing where the user has set another database.
 
     Prefect makes the tables of a new file by all migrations since its first version, which takes
     half of the server's start. So the first file that is made with a version of Prefect is copied,

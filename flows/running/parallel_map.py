@@ -1,4 +1,4 @@
-"""Work that falls into independent jobs, on all cores of this machine or on a Dask cluster.
+"""Independent jobs on all cores of this machine or on a Dask cluster.
 
 `parallel_map` takes any jobs. `each_trial` makes something of every trial by itself, and
 `run_trials` keeps it among the derived results. Labels and clocks are made this way, samples and
@@ -142,7 +142,7 @@ def _remote_chunk(payload: Pickled[tuple[Piece, Sequence[Any], dict[str, str]]])
 
 
 START_S = 3.0
-"""Work goes on in this process for so long before others are started, which takes as long: what is
+"""Time for which work runs in this process before others are started, which takes as long: what is
 short is done by then, and what is long takes two starts at the most."""
 
 
@@ -236,10 +236,10 @@ def each_trial(
     *,
     processes: bool = True,
 ) -> None:
-    """Hand over what `make` gives of every trial, in any order. Stands in a flow.
+    """Pass on the result of `make` for every trial, in any order. Call it inside a flow.
 
     Args:
-        done: called with the number of an item of `work` and what came of it.
+        done: called with the number of an item of `work` and its result.
         processes: without a cluster, use all cores; False where `make` does that by itself, or
             takes little time. Either way the first ones are made here, for `START_S`.
     """

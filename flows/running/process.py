@@ -169,7 +169,7 @@ def _limit(kind: int, option: str, unit: int = 1) -> str:
 
 
 def too_few_threads() -> str | None:
-    """Say that threads cannot be started, where they cannot; libraries start some when loaded.
+    """Return the reason if threads cannot be started; libraries start some when loaded.
 
     OpenBLAS sends the process SIGINT then, which would pass for Ctrl-C.
     """
@@ -190,13 +190,13 @@ def too_few_threads() -> str | None:
 
 
 def run_in_child() -> str | None:
-    """Go on in a child process where memory is limited: there libraries crash instead of failing.
+    """Continue in a child where memory is limited: libraries crash there instead of failing.
 
     The parent passes signals on to the child, which ends with it. In a program that has loaded
     libraries already nothing is done.
 
     Returns:
-        None in the process that is to go on. The parent ends with its child's exit code, or gets
+        None in the process that is to continue. The parent ends with its child's exit code, or gets
         the reason here if the child crashed, or if memory is too little to start one.
     """
     if (
@@ -238,23 +238,23 @@ def run_in_child() -> str | None:
 
 
 def die_with(parent: int) -> bool:
-    """Have this process told to stop (SIGTERM) when the one that started it ends, however it ends.
+    """Ask the kernel to send this process SIGTERM when its parent ends, however it ends.
 
     Returns:
-        False if that one has ended already.
+        False if the parent has ended already.
     """
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     return os.getppid() == parent
 
 
 THRESHOLDS = (50_000, 20, 100)
-"""New objects before the youngest are looked through, and how often the older ones then are."""
+"""Thresholds of `gc.set_threshold`."""
 
 
 def collect_garbage_seldom() -> None:
-    """Have this process look for garbage seldom from here on.
+    """Reduce the frequency of garbage collection from here on.
 
-    Nearly all that it holds are its modules. With Python's own thresholds it looks through them
-    again and again while more is imported, which is a fifth of a start.
+    Nearly all objects are modules. With Python's own thresholds the collector traverses them
+    again and again while more is imported, which takes a fifth of the start-up time.
     """
     gc.set_threshold(*THRESHOLDS)

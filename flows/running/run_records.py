@@ -38,7 +38,7 @@ _OWED = re.compile(rf"({_ID})\.owed\.json")
 
 
 def server_name(url: str | None) -> str:
-    """A Prefect server's address without the secrets that an address may hold."""
+    """Return a Prefect server's address without the secrets that it may contain."""
     if not url:
         return EMBEDDED
     parts = urlsplit(url)

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP that cannot get lost.
+"""Reliable handling of Ctrl-C, SIGTERM and SIGHUP.
 
 Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
 reference's callback that exception is printed and dropped, and the program goes on, which an arm
@@ -28,9 +28,9 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 def leave_to_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; only the parent answers it.
+    """Ignore Ctrl-C, which reaches every process of a terminal: only the parent handles it.
 
-    A parent that is killed answers nothing: its children end with it. By themselves they would
+    A parent that is killed handles nothing: its children end with it. By themselves they would
     stay, each waiting at a pipe whose other end the next one holds open.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -75,7 +75,7 @@ def stop() -> None:
 
 
 def wait(seconds: float) -> None:
-    """Let time pass; a stop request is answered here.
+    """Wait for some time; a stop request raises here.
 
     Raises:
         KeyboardInterrupt: somebody asked the program to stop.

@@ -141,7 +141,7 @@ def _prefects(schedules: list[Scheduled]) -> list[Any]:
 
 
 async def _refuse_another(flow: str, name: str, store: Path) -> None:
-    """Two programs under one name would take each other's runs.
+    """Check that no other program serves this name; two would take each other's runs.
 
     Raises:
         InputError: the name is another store's, and is being served.

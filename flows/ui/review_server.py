@@ -1,4 +1,4 @@
-"""Serves the review page on this computer only, until somebody ends it.
+"""Serve the review page on this computer only, until it is stopped.
 
 Anybody who reaches the page can decide. So it listens on the loopback address, has a path that
 cannot be guessed, is listed nowhere, and answers neither another page's scripts nor a foreign host
