@@ -166,7 +166,7 @@ def _sync_gates(
 
 
 def _unvouched_s(sync: TrialSync, recorded_ns: tuple[int, int]) -> float:
-    """Return how long the recording goes on, at either end, beyond the pulses of a clock's fit, s.
+    """Return how long the recording extends, at either end, beyond the pulses of a clock's fit, s.
 
     -1 where the arm's clock is not known.
     """

@@ -3,7 +3,7 @@
 For a level of a factor a network is trained without its trials and tested on them. For other
 skins, which differ by the scatter of their making (`mock.scene.skin.seed`), some of the same trials
 are taken on each and the store's own network is tested on them. Each result is kept as soon as it
-is there; a training goes on after a stop at its last epoch, a collection at its last trial.
+is there; after a stop a training resumes at its last epoch, a collection at its last trial.
 """
 
 from __future__ import annotations

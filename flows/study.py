@@ -1,8 +1,8 @@
 """The whole chain: collect every protocol, synchronise, label, check the labels, train, evaluate,
-judge a campaign that chooses nothing, search if that is asked for, report. Run again it goes on
-where it was, and a step with nothing to do says so.
+evaluate a hold-out campaign, run searches on request, report. Run again it resumes
+where it stopped, and a step with nothing to do says so.
 
-The searches take hours and are done on request only: other methods on the same windows, other skins
+The searches take hours and run on request only: other methods on the same windows, other skins
 and levels left out, the sensitivity to the scene's assumed numbers, and speed against error of the
 scene and of the detector. Each keeps what it made, and the report shows those that are there.
 """

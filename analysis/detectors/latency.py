@@ -1,10 +1,10 @@
 """Latency and lead of a detector against a trial's true slip, without rewarding false alarms.
 
-A detector that cries slip at once would have the best latency and the longest lead. So each
+A detector that always reports slip would have the best latency and the longest lead. So each
 detection is first judged: missed, false early, late, or counted; only the counted ones have times,
 and the four numbers always add up to the trials. Incipient slip ends where gross slip begins, and
 gross slip ends where the sensor and the plate stop moving on each other: a detection after that
-warns of nothing, however long the recording goes on, and without this bound a detector that says
+has no use, however long the recording is, and without this bound a detector that reports
 gross slip for as long as the plate lies still would miss nothing. Each evaluation, choice and
 search judges by `is_false_early` and `is_late`.
 """

@@ -35,7 +35,7 @@ def reference_track(
         seen = index >= 0
         if seen.sum() * 2 >= len(index):
             found[seen] = blobs.xy[index[seen]]
-            # what was not seen goes on with the rest
+            # unseen markers move with the others
             last = np.where(seen[:, None], found, last + shift)
         rows.append(found)
     return np.stack(rows) if rows else np.empty((0, len(layout), 2))

@@ -123,7 +123,7 @@ class SpeckFit:
 
     @property
     def fits(self) -> bool:
-        """True if the whole network goes onto one chip."""
+        """True if the whole network fits on one chip."""
         return not self.problems
 
     def as_json(self) -> dict[str, Any]:

@@ -54,7 +54,7 @@ def resume(
     """Resume after a pause."""
     outcome = _request(store, "resume", who, why, wait)
     running = outcome.answer is not None and outcome.answer["did"].get("running")
-    words = f"{store} is not paused any more" + ("; the collection goes on" if running else "")
+    words = f"{store} is no longer paused" + ("; the collection continues" if running else "")
     _finish([outcome], as_json, words)
 
 
@@ -131,7 +131,7 @@ def _decide(
 def _pause_words(store: Path, outcome: Outcome) -> str:
     did = {} if outcome.answer is None else outcome.answer["did"]
     if did.get("running"):
-        return f"{store} is paused, between two trials; `sliplab resume {store}` goes on"
+        return f"{store} is paused, between two trials; continue with `sliplab resume {store}`"
     return f"{store} is paused; nothing ran, and nothing begins until `sliplab resume {store}`"
 
 

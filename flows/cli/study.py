@@ -57,7 +57,7 @@ def study(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the whole chain: collect, sync, label, train, evaluate, report. Run again, it goes on."""
+    """Run the whole chain: collect, sync, label, train, evaluate, report. Run again to resume."""
     if status:
         _status(folder, as_json)
         return

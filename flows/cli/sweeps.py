@@ -264,7 +264,7 @@ def guesses(
     folder: StoreArgument,
     guess: Annotated[
         list[str] | None,
-        typer.Option("--guess", help="Only this number of the scene. Repeatable."),
+        typer.Option("--guess", help="Only this parameter of the scene. Repeatable."),
     ] = None,
     trials: Annotated[
         int, typer.Option("--trials", min=2, max=1_000_000, help="Test trials of each campaign.")
@@ -272,7 +272,7 @@ def guesses(
     campaign: CampaignOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Take some test trials again with each guess 20 % down and up, and judge them anew."""
+    """Repeat some test trials with each assumed parameter 20 % lower and higher, and evaluate."""
     store, campaigns = _opened(folder, campaign)
     from sliplab.analysis.sweeps.sensitivity import FIGURES, UNITS
     from sliplab.flows.guesses import GUESSES, measure_guesses

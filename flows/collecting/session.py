@@ -499,7 +499,7 @@ class TrialGate:
             raise WindowOver(
                 f"the window of campaign {self._campaign.name} ends "
                 f"{datetime.fromtimestamp(until).astimezone():%Y-%m-%d %H:%M %Z}, too soon for "
-                f"{trial.id}; the next collection goes on"
+                f"{trial.id}; the next collection continues"
             )
 
     def _stand_still(self, trial: Trial) -> None:

@@ -1,7 +1,7 @@
 """Reliable handling of Ctrl-C, SIGTERM and SIGHUP.
 
 Python delivers a signal as an exception wherever it happens to be. Inside a destructor or a weak
-reference's callback that exception is printed and dropped, and the program goes on, which an arm
+reference's callback that exception is printed and dropped, and the program continues, which an arm
 must not. So the handler also raises a flag: the rig looks at it in every poll, progress bars at
 every step.
 """

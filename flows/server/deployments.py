@@ -158,7 +158,7 @@ served: Callable[..., Any] = partial(
 
 @served(name="collect")
 def collect(wanted: Collect) -> Any:
-    """Take the trials that the store lacks; run again, it goes on."""
+    """Take the trials that the store lacks; run again to resume."""
     return run_of(partial(_collect, wanted))
 
 

@@ -137,8 +137,8 @@ def show(subject: Subject) -> None:
 
 
 ALONE = ("--bind", "127.0.0.1", "--port", "auto")
-"""Options of Rerun's viewer. Its server listens on every network of the computer unless told
-otherwise, and hands the file to whatever listens on its usual port, maybe another user's."""
+"""Options of Rerun's viewer. By default its server listens on every network of the computer and
+passes the file to any program that listens on its usual port, maybe another user's."""
 
 
 @contextmanager

@@ -237,7 +237,7 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
             work.session.rig.connect()
             work.session.take(work.trials)
 
-    with pytest.raises(WindowOver, match="the next collection goes on"):
+    with pytest.raises(WindowOver, match="the next collection continues"):
         night()
     store = Store.open(wanted.store).campaign(crash.NAME)
     assert 1 <= len(store.committed()) <= 3  # retakes ask as well
