@@ -36,18 +36,18 @@ Ints = NDArray[np.int64]
 _HUBER = 1.345
 _GATE = 5.0
 _ROUGHLY, _EXACTLY = 1e-2, 1e-3
-"""An estimate is there once a step moves it by less, in standard deviations of a pulse."""
+"""Convergence: largest change of an estimate in a step, standard deviations of a pulse."""
 _MOST_KNOTS = 24
 _PIECE_PULSES = 30
 _PIECES = 4
-"""Into so many pieces a straight clock is cut, and one with knots into twice as many as it has."""
+"""Pieces into which a straight clock is cut; one with knots is cut into twice as many as it has."""
 _MOVED_KNOTS = 4
 """Up to this number of knots, each is moved to its best place when one is added."""
 _BLOCK_PULSES = 12
 _CHANCE = 1e-4
 """Share of straight clocks with locked stamps that are taken for bent."""
 _KNOT = 3.5
-"""A drift that changes by so many standard deviations gets a knot."""
+"""Change of the drift, in standard deviations, that adds a knot."""
 STEP, STEP_AT_END = 5.5, 4.5
 """A clock has jumped where a step stands out by so many, among thousands of places or at an end."""
 _MORE_LIKELY, _MORE = 12.0, 1.1
@@ -57,7 +57,7 @@ much in the median over the places of the jump."""
 _DOUBT, _DOUBT_AT_END = 4.0, 3.0
 """A step of so many may be one: what it would do is added to the uncertainty."""
 _CLIP = 3.0
-"""Residuals at an end count up to so many standard deviations."""
+"""Clip of residuals at an end, standard deviations."""
 _TAIL = 10
 """So many pulses at an end are left out at the most, late ones among them: less than half a second
 at 100 ticks a second."""
@@ -365,7 +365,7 @@ def _robust(
 
 
 def _held(matrix: Floats) -> Floats:
-    """Normal equations in which a piece with a single pulse in it hangs on its neighbours."""
+    """Normal equations in which a piece with a single pulse depends on its neighbours."""
     n = matrix.shape[0]
     matrix.flat[:: n + 1] += 1e-12 * matrix.trace() / n
     return matrix
@@ -466,5 +466,5 @@ def _locked(residuals: Floats, resolution: float) -> float:
 
 @lru_cache(maxsize=128)
 def _draws(n: int) -> Floats:
-    """Normal numbers, the same ones always, (draws, n)."""
+    """Return normal numbers, the same at every call, (draws, n)."""
     return np.random.default_rng(n).standard_normal((_DRAWS, n))

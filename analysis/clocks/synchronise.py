@@ -41,7 +41,7 @@ VERSION = 4
 """Version of the fit; results of another version are stale."""
 HOST_PPM = 200.0
 RESTART_NS = 1_000_000
-"""A clock that falls back by more than this began anew, or jumped."""
+"""A clock that falls back by more than this restarted or jumped."""
 
 
 @dataclass(frozen=True)
@@ -286,7 +286,7 @@ def _by_exposures(begins: I64, streams: SyncStreams, timing: Timing) -> DeviceSy
 
 
 def _arm_by_host(streams: SyncStreams, timing: Timing) -> DeviceSync:
-    """A pose was sent before it arrived, and not longer before than its way takes."""
+    """Bound a pose's time: it was sent before it arrived, at most by its transmission time."""
     delay = timing.pose_delay
     # bounds of some thousand poses say as much as those of all
     some = slice(None, None, max(1, streams.pose_ns.size // 4000))

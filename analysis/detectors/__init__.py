@@ -1,1 +1,1 @@
-"""When slip is seen: from a trial's windows to onsets, detectors side by side, and the live one."""
+"""Slip detection: onsets from a trial's windows, comparison of detectors, and live detection."""

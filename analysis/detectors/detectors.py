@@ -56,7 +56,7 @@ class Chain:
     leave: FloatArray
 
     def __post_init__(self) -> None:
-        """Probabilities that are none are refused."""
+        """Check the probabilities."""
         if self.leave.ndim != 1 or not ((self.leave > 0) & (self.leave < 1)).all():
             raise ValueError(f"leave = {self.leave}: must be probabilities inside 0..1")
 
@@ -330,7 +330,7 @@ class Predictions:
     end_ns: IntArray
 
     def __post_init__(self) -> None:
-        """Columns that do not fit each other are refused."""
+        """Check that the columns have matching shapes."""
         n = len(self.end_ns)
         if self.counts.shape != (n, len(CLASSES)) or self.events.shape != (n,):
             raise ValueError(

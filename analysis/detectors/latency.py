@@ -47,7 +47,7 @@ class TrueSlip:
     end_ns: int
 
     def __post_init__(self) -> None:
-        """The three are in order, or refused."""
+        """Check the order of the three times."""
         if self.gross_ns < self.incipient_ns:
             raise ValueError(
                 f"gross onset {self.gross_ns} ns is before incipient onset {self.incipient_ns} ns"
@@ -149,7 +149,7 @@ def _not_counted(trials: Sequence[TrialLatency], kind: Kind) -> dict[str, int]:
 def _judge(
     found: int | None, onset: int, end: int, tolerance: int
 ) -> tuple[bool, float | None, float | None]:
-    """Tell false early, by how much it was late, and its latency if it counts, in ms."""
+    """Return false early, the delay if late, and the latency if it counts, in ms."""
     if found is None:
         return False, None, None
     if is_false_early(found, onset, tolerance):

@@ -111,7 +111,7 @@ def state_name(valid_class: int) -> str:
 
 @dataclass
 class Losses:
-    """Faults of a stream that a stored trial has not."""
+    """Faults of a live stream that stored trials do not have."""
 
     late: int = 0
     """Events left out: their window had been judged."""
@@ -171,7 +171,7 @@ class StepRule:
         return Step((a, b, c), valid, self._onset(valid))
 
     def interrupt(self) -> None:
-        """Forget the windows so far: the next one does not follow them. Onsets found stay found."""
+        """Reset the windows, as the next one does not follow them; keep the onsets."""
         self._held.clear()
         self._sum = np.zeros(len(CLASSES), np.int64)
 
@@ -193,12 +193,12 @@ BACK_US = 1_000_000
 
 
 class ClockFellBack(ValueError):
-    """The camera's clock is another one than before."""
+    """The camera's clock fell back, so that earlier times cannot be compared."""
 
 
 @dataclass
 class _Open:
-    """A window that is not over."""
+    """A window that is still open."""
 
     start_us: int
     x: npt.NDArray[np.uint8]
@@ -455,7 +455,7 @@ class FreshestArrival:
         self._here: int | None = None
 
     def observe(self, camera_us: int, host_ns: int) -> None:
-        """Something that happened at `camera_us` was here at `host_ns`."""
+        """Record that an event of `camera_us` arrived at `host_ns`."""
         ahead_ns = camera_us * 1000 - host_ns
         if self._began_ns is None or host_ns - self._began_ns >= SPAN_NS:
             self._began_ns, self._before, self._here = host_ns, self._here, ahead_ns
@@ -468,7 +468,7 @@ class FreshestArrival:
         return None if ahead_ns is None else (host_ns + ahead_ns) // 1000
 
     def host_ns(self, camera_us: int) -> int | None:
-        """When a thing of that time could have been here at the earliest."""
+        """Return the earliest arrival of an event of that time."""
         ahead_ns = self._ahead_ns
         return None if ahead_ns is None else camera_us * 1000 - ahead_ns
 

@@ -1,4 +1,4 @@
-"""The trials that detectors learn from, are set by and are judged on, found before any is read."""
+"""Training, validation and test trials of detectors, found before any is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The evaluation of a store: what it depends on, and the figures that it keeps."""
+"""The evaluation of a store: its inputs, and the figures that it keeps."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ from sliplab.storage.trials.store import Store, StoreError
 
 SPLITS = ("train", "validation", "test")
 CHECKED = 256
-"""Windows of the test trials that the ONNX file is held against Sinabs on."""
+"""Windows of the test trials on which the ONNX file is compared with Sinabs."""
 PACKAGES = ("sliplab", "torch", "sinabs", "numpy", "numba")
 SPECK_FORMAT = "sliplab-speck-1"
 
@@ -59,7 +59,7 @@ class ExportFailed(StoreError):
 
 @dataclass(frozen=True)
 class _Source:
-    """A model, and the store that it is looked at on."""
+    """A model, and the store on which it is measured."""
 
     path: Path
     sha256: str
@@ -107,7 +107,7 @@ def _made_from_these(source: _Source) -> bool:
 
 
 def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
-    """The samples that figures are measured on: the test trials', else what else there is."""
+    """Return the samples that figures are measured on: those of test trials, else any others."""
     for split in reversed(SPLITS):
         if len(samples[split]):
             return samples[split]
@@ -115,7 +115,7 @@ def _look_at(samples: dict[str, SampleSet]) -> SampleSet:
 
 
 def _onnx(source: _Source, x: npt.NDArray[np.uint8], checked: int) -> tuple[bytes, int]:
-    """The ONNX file, and on how many windows it was found right."""
+    """Return the ONNX file, and the number of windows on which it was verified."""
     from sliplab.analysis.networks.onnx_file import OnnxDiffers, check_onnx, to_onnx
 
     windows = source.fitted.windows

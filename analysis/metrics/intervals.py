@@ -27,7 +27,7 @@ Values = Sequence[float] | FloatArray
 Span = tuple[float, float]
 
 DRAWS = 2000
-"""Sets of trials that are drawn for a difference of medians or percentiles."""
+"""Bootstrap draws for a difference of medians or percentiles."""
 _SEED = 20_261
 _TAIL = 0.025
 _QUANTILES = (_TAIL, 1 - _TAIL)

@@ -22,7 +22,7 @@ from sliplab.storage.schema.evaluation import Calibration, CalibrationScores, Le
 FloatArray = npt.NDArray[np.float64]
 
 BINS = 15
-"""Of equal width, for the expected calibration error, as Guo et al. take them."""
+"""Bins of equal width for the expected calibration error (Guo et al.)."""
 
 EDGES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 """Leads of a row, from each of these to the next: half octaves, so that rows have windows enough,

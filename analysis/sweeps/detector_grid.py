@@ -86,7 +86,7 @@ class Axes:
 
     @property
     def full(self) -> list[Setting]:
-        """Each value with each."""
+        """All combinations of the values."""
         axes = (self.length_ms, self.step_ms, self.pool_px, self.width)
         return _ordered(Setting(*values) for values in itertools.product(*axes))
 
