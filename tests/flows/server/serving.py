@@ -22,6 +22,7 @@ from typing import Any
 from tests.conftest import ROOT
 
 LIMIT_S = 120.0
+BUSY_S = 10.0
 FINAL = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 
 
@@ -52,21 +53,26 @@ class Page:
         self.url, self.password, self._name, self.log = url, password, name, log
         self._headers: dict[str, str] = {}
 
-    def call(self, path: str, data: Any = None, tries: int = 4) -> Any:
-        """The server's answer, or ``{"status": ..., "detail": ...}`` of its refusal."""
+    def call(self, path: str, data: Any = None) -> Any:
+        """Return the server's answer, or ``{"status": ..., "detail": ...}`` of its refusal.
+
+        A server whose SQLite file is being written to answers 503: Prefect's own clients, and this
+        one, ask again for some seconds.
+        """
         if not self._headers:
             self._headers = access(self.url, self.password)
         body = None if data is None else json.dumps(data).encode()
         headers = {"content-type": "application/json", **self._headers}
         request = urllib.request.Request(f"{self.url}{path}", body, headers)
-        try:
-            with urllib.request.urlopen(request, timeout=30) as answer:
-                return json.loads(answer.read() or b"null")
-        except urllib.error.HTTPError as error:
-            # SQLite was written to meanwhile: Prefect's own clients ask again, too
-            if error.code == 503 and tries > 1:
-                return self.call(path, data, tries - 1)
-            return {"status": error.code, "detail": error.read().decode()}
+        end, pause = time.monotonic() + BUSY_S, threading.Event()
+        while True:
+            try:
+                with urllib.request.urlopen(request, timeout=30) as answer:
+                    return json.loads(answer.read() or b"null")
+            except urllib.error.HTTPError as error:
+                if error.code != 503 or time.monotonic() > end:
+                    return {"status": error.code, "detail": error.read().decode()}
+            pause.wait(0.2)
 
     def deployment(self, flow: str) -> Any:
         """One of the service's."""
