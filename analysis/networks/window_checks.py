@@ -57,7 +57,7 @@ def check_permutations(
 
     Args:
         predict: gives the counts of a network with permuted outputs.
-        score: how counts are scored, `metrics.score` but in tests.
+        score: how counts are scored; `metrics.classification.score` except in tests.
 
     Returns:
         how many orders were tried.
