@@ -13,9 +13,9 @@ STEPS = {
     "label": "sliplab.flows.label",
     "train": "sliplab.flows.train",
     "evaluate": "sliplab.flows.evaluate",
-    "judge_model": "sliplab.flows.evaluate",
-    "window_baselines": "sliplab.flows.evaluate",
-    "window_checks": "sliplab.flows.evaluate",
+    "judge_model": "sliplab.flows.judge_network",
+    "window_baselines": "sliplab.flows.window_checks",
+    "window_checks": "sliplab.flows.window_checks",
     "report": "sliplab.flows.report",
 }
 """The module of each step; its function has the step's name."""

@@ -21,7 +21,7 @@ from sliplab.analysis.sweeps.detector_grid import Axes
 from sliplab.analysis.sweeps.detector_search import SearchSize
 from sliplab.analysis.sweeps.sensitivity import value_of
 from sliplab.flows.collect import collect
-from sliplab.flows.evaluate import evaluate, window_baselines
+from sliplab.flows.evaluate import evaluate
 from sliplab.flows.generalise import SKINS, measure_generalisation
 from sliplab.flows.guesses import GUESSES, TRIALS, measure_guesses
 from sliplab.flows.holdout import STEP, measure_holdout
@@ -33,6 +33,7 @@ from sliplab.flows.sync import sync
 from sliplab.flows.tradeoff_detector import tradeoff_detector
 from sliplab.flows.tradeoff_scene import tradeoff_scene
 from sliplab.flows.train import train
+from sliplab.flows.window_checks import window_baselines
 from sliplab.protocols.errors import InputError
 from sliplab.storage.trials.derived import Derived, make_key
 from sliplab.storage.trials.store import Store

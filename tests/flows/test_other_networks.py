@@ -22,7 +22,8 @@ from sliplab.analysis.networks.network import spike_counts
 from sliplab.analysis.networks.training import restore
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.sample_sets import load_samples
-from sliplab.flows.evaluate import evaluate, judge_model
+from sliplab.flows.evaluate import evaluate
+from sliplab.flows.judge_network import judge_model
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.report import report
 from sliplab.flows.study import Outcome

@@ -1,0 +1,106 @@
+"""Other methods on the same windows, and checks that try to show a figure to be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation import baselines
+from sliplab.analysis.labels.reviewed import Labels
+from sliplab.analysis.metrics import classification as metrics
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import (
+    choose_model,
+    training_settings,
+    wanted_models,
+)
+from sliplab.analysis.networks.window_checks import (
+    CheckFailed,
+    check_chance,
+    check_permutations,
+    permuted,
+    shuffled_chance,
+)
+from sliplab.analysis.windows.sample_sets import load_samples
+from sliplab.flows.running import console
+from sliplab.flows.running.run_records import timed
+from sliplab.storage.schema.evaluation import BaselineResult
+from sliplab.storage.trials.derived import Derived
+from sliplab.storage.trials.store import Store, StoreError
+
+if TYPE_CHECKING:
+    pass
+
+SPLITS = ("train", "validation", "test")
+CHECKED_EPOCHS = 3
+"""Epochs of each training on shuffled labels: enough to beat chance clearly with true labels."""
+CHECKED_WINDOWS = 2000
+"""Number of test windows that are checked, evenly spread over all."""
+
+
+def window_baselines(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> dict[str, Any]:
+    """Train and keep every baseline that is missing or stale.
+
+    Args:
+        reviewed: people's decisions are applied to the labels.
+    """
+    load = partial(load_samples, Labels(store, reviewed), campaigns)
+    train, validation, test = map(load, SPLITS)
+    kept = Derived.of(store, baselines.STEP)
+    keys = {name: baselines.baseline_key(store, name) for name in baselines.NAMES}
+    stale = [name for name, key in keys.items() if not kept.fresh(name, key)]
+    if stale:
+        with timed(store, "baselines"):
+            for name in stale:
+                console.say(f"{name}: {len(train)} training windows")
+                votes, made = baselines.train_baseline(name, train, validation, test, console.say)
+                result = BaselineResult(made=made, argmax=metrics.accuracy(votes, test.y).argmax)
+                kept.write(name, keys[name], result, {"votes": votes})
+    return {
+        "step": "baselines",
+        "done": len(stale),
+        "fresh": len(keys) - len(stale),
+        "argmax": {name: kept.load(name, BaselineResult).argmax for name in keys},
+    }
+
+
+def window_checks(
+    store: Store, campaigns: list[Collected], reviewed: bool = False
+) -> dict[str, Any]:
+    """Check permuted classes, shuffled labels, and that no trial is in two parts of the split.
+
+    Raises:
+        StoreError: a check failed; the message says which figure cannot be trusted.
+    """
+    settings = training_settings(campaigns)
+    load = partial(load_samples, Labels(store, reviewed), campaigns)
+    train, validation, test = map(load, SPLITS)
+    if not len(test):
+        raise StoreError("there are no test samples to check; collect more trials")
+    model = choose_model(wanted_models(store, campaigns, reviewed))
+    rows = np.unique(
+        np.linspace(0, len(test) - 1, min(CHECKED_WINDOWS, len(test))).astype(np.int64)
+    )
+    few = test.windows.take(rows)
+    change = {"epochs": CHECKED_EPOCHS, "patience": CHECKED_EPOCHS}
+    how = settings.training.model_copy(update=change)
+    try:
+        console.say("permuted classes")
+        orders = check_permutations(
+            permuted(model_file.load(model.path), few), test.y[rows], metrics.score
+        )
+        console.say("shuffled labels (nine short trainings)")
+        chance = shuffled_chance(
+            (train.windows, train.y), (validation.windows, validation.y), (few, test.y[rows]),
+            settings.network, settings.windows, how,
+        )  # fmt: skip
+        check_chance(chance)
+    except (CheckFailed, ValueError) as error:
+        raise StoreError(f"{store.folder}: {error}") from None
+    return {"step": "checks", "done": 2, "fresh": 0, "orders": orders, "shuffled": asdict(chance)}
