@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from sliplab.analysis.labels.markers import MarkerTracks, track
-from sliplab.analysis.labels.plate import VideoTracks, track_video
+from sliplab.analysis.labels.plate_tracking import VideoTracks, track_video
 from sliplab.rigs.mock.settings import FrameCamera, MockSettings
 from sliplab.rigs.mock.world import World
 from sliplab.rigs.scene.frames import FrameOptics, PlateView

@@ -26,7 +26,7 @@ from benchmarks.measure import SEED, Figures
 from sliplab.analysis.labels.labelling import Label, label_places
 from sliplab.analysis.labels.markers import MarkerTracker, Measured, stack_tracks
 from sliplab.analysis.labels.places import from_tracks
-from sliplab.analysis.labels.plate import PlatePose, PlateTracker, bridge
+from sliplab.analysis.labels.plate_tracking import PlatePose, PlateTracker, bridge
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.flows.scene_runs import MOTION, changed, with_true_times
 from sliplab.protocols import Plan, Trial

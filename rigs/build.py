@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 DRIVEN_TAIL_S = 0.3
-"""How long real drivers are read after the last pulse, s."""
+"""Time for which real drivers are read after the last pulse, s."""
 
 
 class _MockSimulation:

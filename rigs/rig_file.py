@@ -32,7 +32,7 @@ from sliplab.rigs.mock.settings import MockSettings, check_timing
 from sliplab.rigs.rig_inheritance import read_rig, rig_path
 
 SCALE_ERROR = 0.005
-"""How far a measured scale may be from the true one, as a share."""
+"""Largest relative error of a measured scale."""
 
 
 class RigLimits(StrictModel):
@@ -41,7 +41,7 @@ class RigLimits(StrictModel):
     depth: PositiveMillimetres
     speed: PositiveSpeed
     reach: PositiveMillimetres
-    """How far the sensor's centre may go from the plate's centre."""
+    """Largest distance of the sensor's centre from the plate's centre."""
 
 
 class Skin(StrictModel):
@@ -107,7 +107,7 @@ class RigFile(StrictModel):
     """`mock`: simulated devices in this program, as fast as it goes. `devices`: the real ones.
     `loopback`: the real drivers in real time, with stand-ins that show the simulated scene."""
     poll: PositiveSeconds
-    """How often streams are read and stop requests looked at."""
+    """Period at which streams are read and stop requests checked."""
     sensor: str = Field(min_length=1, max_length=40)
     """Serial number of the event camera and its housing."""
     calibration: Calibration
@@ -116,9 +116,9 @@ class RigFile(StrictModel):
     frame_camera: FrameCameraSpec
     estimates: Estimates
     timing: Timing = Timing()
-    """Which signal reaches which device, and how good their clocks are."""
+    """Signals that reach each device, and the quality of their clocks."""
     devices: DeviceSettings | None = None
-    """Which drivers reach the devices; not for `mock`."""
+    """Drivers of the devices; not for `mock`."""
     mock: MockSettings | None = None
     """The simulated scene and devices; not for `devices`."""
 
@@ -185,12 +185,12 @@ class RigFile(StrictModel):
 
     @property
     def simulated(self) -> bool:
-        """Whether everything that comes from this rig is a simulation."""
+        """True if everything that comes from this rig is simulated."""
         return self.driver != "devices"
 
     @property
     def in_virtual_time(self) -> bool:
-        """Whether its time runs as fast as it can, and not with the clock on the wall."""
+        """True if its time runs as fast as it can, not with the wall clock."""
         return self.driver == "mock"
 
     @property
@@ -206,7 +206,7 @@ class RigFile(StrictModel):
 
     @property
     def has_plate(self) -> bool:
-        """Whether the plate hangs on a slider that can be raised, released and caught."""
+        """True if the plate hangs on a slider that can be raised, released and caught."""
         return self.simulated or (self.devices is not None and self.devices.plate is not None)
 
     @property

@@ -18,8 +18,8 @@ from numba import njit
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from sliplab.analysis.detectors.detection import Found, lead_of
 from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.smoothing_rule import Found, lead_of
 from sliplab.analysis.metrics.classification import CLASSES, GROSS, INCIPIENT, NO_SLIP
 
 FloatArray = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from sliplab.analysis.detectors.detection import Found
+from sliplab.analysis.detectors.smoothing_rule import Found
 from sliplab.storage.schema.evaluation import (
     LatencyByOnset,
     LatencyFigures,

@@ -138,7 +138,7 @@ class Step:
 
 
 class StepRule:
-    """The rule of `analysis.detectors.detection.detect`, window by window, to the bit.
+    """The rule of `analysis.detectors.smoothing_rule.detect`, window by window, to the bit.
 
     `detect` sees a whole trial at once; this holds the last `smoothing` rows and no more.
     """

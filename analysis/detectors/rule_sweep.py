@@ -1,7 +1,7 @@
 """The paper's rule at every smoothing and margin of a grid: detections, scores and the choice.
 
 A search asks for dozens of pairs on every trial of every network, so `sweep` makes the sums over
-windows once for all margins. Tests hold each pair to `analysis.detectors.detection.detect`, each
+windows once for all margins. Tests hold each pair to `smoothing_rule.detect`, each
 figure to `analysis.detectors.latency` and `choose_pair` to `choose_smoothing`.
 
 The paper chose its window by the latency on test trials, and then reported that latency. Here the
@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sliplab.analysis.detectors.detection import detect, lead_of
 from sliplab.analysis.detectors.detector_comparison import allowed_early, merit
 from sliplab.analysis.detectors.latency import (
     NEVER,
@@ -30,6 +29,7 @@ from sliplab.analysis.detectors.latency import (
     score_trial,
     summarise_latency,
 )
+from sliplab.analysis.detectors.smoothing_rule import detect, lead_of
 from sliplab.analysis.metrics.classification import GROSS, INCIPIENT
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.evaluation import Choice

@@ -8,13 +8,13 @@ from typing import Any
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import (
     score_trial,
     summarise_latency,
     summarise_lead,
     true_slip,
 )
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import training
 from sliplab.analysis.networks.models import rules_of

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from sliplab.analysis.labels.markers import MarkerTracks
 from sliplab.analysis.labels.plane import Plane, plane_of
-from sliplab.analysis.labels.plate import PlateTrack, track_video
+from sliplab.analysis.labels.plate_tracking import PlateTrack, track_video
 from sliplab.storage.trials.recording import Recording
 
 F64 = npt.NDArray[np.float64]

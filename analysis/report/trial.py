@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.campaigns import Collected
-from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.report.campaign import tracks_words
 from sliplab.analysis.report.figures import trials as figures
 from sliplab.analysis.report.figures.style import CLASS_WORDS

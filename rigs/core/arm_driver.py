@@ -20,7 +20,7 @@ from sliplab.storage.streams import PoseChunk, PulseChunk
 LEFT_MM = 0.001
 """A segment has begun once the tool centre point is this far from where it stood."""
 NEAR_MM = 0.05
-"""How close to its target a segment may end."""
+"""Largest distance from its target at which a segment may end."""
 REST_SHARE = 0.02
 """Below this share of its speed, near its target, a segment has ended."""
 _LEFT_DEG, _NEAR_DEG = 0.001, 0.1
@@ -37,7 +37,7 @@ class Run:
     cancelled: bool = False
     """Somebody asked for a stop."""
     error: ArmFault | None = None
-    """Why the path was given up, where the arm's state does not tell."""
+    """Reason for which the path was given up, where the arm's state does not show it."""
     thread: threading.Thread | None = None
 
     def progress(self, state: ArmState) -> Progress:
@@ -67,7 +67,7 @@ class ArmDriver:
         self._guard = Guard(limits)
         self._stream = PoseStream()
         self._lost: str | None = "not connected"
-        """Why the arm cannot be reached; None while it can."""
+        """Reason for which the arm cannot be reached; None while it can."""
         self._run = Run((), done=True)
 
     def state(self) -> ArmState:
@@ -149,12 +149,12 @@ class SegmentWatch:
 
     @property
     def done(self) -> bool:
-        """Whether every segment has ended."""
+        """True once every segment has ended."""
         return self._count == len(self._path)
 
     @property
     def begun(self) -> bool:
-        """Whether the arm has left the place where the path begins."""
+        """True once the arm has left the start of the path."""
         return self._count > 0 or self._start_ns is not None
 
     def see(self, t_ns: int, pose: Pose) -> tuple[int, int] | None:

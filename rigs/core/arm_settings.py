@@ -40,11 +40,11 @@ class Limits(StrictModel):
     """Left out, the contact plane that the rig was taught."""
     speed_mm_s: Positive = 50.0
     depth_mm: Finite | None = None
-    """How far beyond the taught plane the tool centre point may go; needs `plate`."""
+    """Largest distance of the tool centre point beyond the taught plane; needs `plate`."""
     tilt_deg: Annotated[float, Field(gt=0, le=180)] = 180.0
-    """How far a move may turn the tool."""
+    """Largest rotation of the tool in a move."""
     singular_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
-    """How close wrist 2 (UR) or joint 5 (ABB) may be to where two axes fall together."""
+    """Least angle of wrist 2 (UR) or joint 5 (ABB) from the singularity."""
 
     @model_validator(mode="after")
     def _makes_sense(self) -> Limits:

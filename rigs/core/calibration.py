@@ -64,7 +64,7 @@ class ContactPlane(StrictModel):
     """Any point at least 5 mm above the centre."""
     taught: date
     residual: Millimetre | None = None
-    """How far a fourth touch was from the plane of the three."""
+    """Distance of a fourth touch from the plane of the three."""
     method: Method | None = None
 
     @model_validator(mode="after")
@@ -87,7 +87,7 @@ class DepthZero(StrictModel):
     """Depth at which the skin first touches, measured from the contact plane into the plate."""
 
     zero: Millimetre
-    """What the rig begins with; a protocol's `rezero` finds it again."""
+    """Depth zero with which the rig begins; a protocol's `rezero` finds it again."""
     by_events: Millimetre | None = None
     by_markers: Millimetre | None = None
     difference: Millimetre | None = None
@@ -119,7 +119,7 @@ class Lens(StrictModel):
     """On the plate's plane, at the picture's centre."""
     focal: tuple[Pixel, Pixel]
     centre: tuple[Pixel, Pixel]
-    """Where the optical axis meets the picture."""
+    """Principal point: the optical axis in the picture."""
     distortion: tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
     """k1, k2, p1, p2, k3."""
     tilt: Degree
@@ -161,7 +161,7 @@ class Calibration(StrictModel):
 
     contact_plane: ContactPlane
     touch_depth: Millimetre = 0.0
-    """How deep the centre papilla is when touching off notices it, found once with a gauge."""
+    """Depth of the centre papilla when touching off notices it, found once with a gauge."""
     depth_zero: DepthZero | None = None
     tool_centre_point: ToolCentrePoint | None = None
     lens: Lens | None = None
@@ -186,7 +186,7 @@ COMMANDS = {
     "lens": "sliplab calibrate lens",
     "event_crop": "sliplab calibrate crop",
 }
-"""Which command mends which entry."""
+"""Commands by the entry that they calibrate."""
 _SAME_SCALE = 1e-3
 
 
@@ -198,7 +198,7 @@ class CalibrationFault:
     value: str | None
     expected: str
     command: str
-    """What mends it, but for ``--rig``."""
+    """Return the command that calibrates it, without ``--rig``."""
 
 
 def find_faults(

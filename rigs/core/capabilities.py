@@ -18,7 +18,7 @@ from sliplab.protocols.timing import Code
 from sliplab.storage.streams import ClockReads, EventChunk, FrameChunk, PoseChunk, PulseChunk, Sink
 
 UNKNOWN = "unknown"
-"""What a device does not say of itself, in `DeviceHealth`."""
+"""Value in `DeviceHealth` of what a device does not report."""
 
 
 class RigError(RuntimeError):
@@ -47,7 +47,7 @@ class ArmState(Enum):
 
     @property
     def healthy(self) -> bool:
-        """Whether the arm may be asked to move."""
+        """True if the arm may be asked to move."""
         return self in {ArmState.READY, ArmState.MOVING}
 
     @property
@@ -101,9 +101,9 @@ class DeviceHealth:
     temperature_c: float | None
     """Degrees Celsius; None where it has no thermometer that can be read."""
     clock: str
-    """What stamps the times of its data."""
+    """Clock that stamps its data."""
     notes: tuple[str, ...] = ()
-    """What else a person may want to see: region, buffers, speed of the link."""
+    """Further details for people: region, buffers, speed of the link."""
 
 
 @runtime_checkable

@@ -21,9 +21,9 @@ from sliplab.rigs.core.fake_motion import ControllerClock, StraightMotion, runni
 T = TypeVar("T")
 Talk = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 START_S = 5.0
-"""How long a fake may take to open its ports, or to close them, s."""
+"""Time limit for a fake to open its ports, or to close them, s."""
 HOME = Pose((400.0, 0.0, 300.0), (180.0, 0.0, 0.0))
-"""Where a fake's tool centre point is at first."""
+"""First position of a fake's tool centre point."""
 
 
 class LoopThread:

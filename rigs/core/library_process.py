@@ -20,7 +20,7 @@ from typing import Any
 from sliplab.rigs.core.host_clock import STEP_S, StallTimer
 
 KILL_S = 2.0
-"""How long a child that was asked to end, or killed, may take to be gone, s."""
+"""Time limit for a child to end once it was asked to, or killed, s."""
 _SAID_BYTES = 2000
 _SAID_CHARACTERS = 160
 

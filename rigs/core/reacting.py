@@ -29,7 +29,7 @@ class Watcher(Sink, Protocol):
     """A sink that looks at the events."""
 
     armed: bool
-    """Whether it may raise `SlipSeen`; set by the run."""
+    """True while it may raise `SlipSeen`; set by the run."""
 
     def step(self, phase: str, acting: bool) -> None:
         """A step of the program begins."""

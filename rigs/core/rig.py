@@ -36,10 +36,10 @@ from sliplab.storage.streams import Json, PathSegment, Sink, StepTimes
 
 RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
-"""How long cameras are read after the last pulse, unless a rig says otherwise."""
+"""Time for which cameras are read after the last pulse, unless a rig says otherwise."""
 _MOVE_GRACE_S = 10.0
 _INTERRUPTIONS = 10
-"""How often a stop that was interrupted is begun again."""
+"""Retries of a stop that was interrupted."""
 
 
 class StopRequested(Exception):
@@ -97,7 +97,7 @@ class Rig:
     should_stop: Callable[[], bool] = field(default=lambda: False)
     ending: tuple[Callable[[], None], ...] = ()
     _reported: str = field(default="", init=False)
-    """Why the arm could not be stopped, as somebody has been told already."""
+    """Failure of a stop that `safely` has raised already."""
     _hangs: bool = field(default=False, init=False)
     """The plate was let go and not caught: it hangs on the sensor, or falls."""
 

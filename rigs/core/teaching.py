@@ -30,12 +30,12 @@ APPROACH_MM_S = 5.0
 """From clear of the plate to where creeping begins; events are watched on the way."""
 MOST_CREEP_MM_S = 1.0
 ASLANT = 0.1
-"""How far a path aslant goes sideways for each mm in."""
+"""Sideways motion of an oblique path for each mm in."""
 _UNTRUE = {ArmState.PROTECTIVE_STOP, ArmState.EMERGENCY_STOP, ArmState.DISCONNECTED}
 _APPROACH_LOOK_S = 0.05
 _GRACE_S = 5.0
 _OVER_MM = 0.05
-"""How far beyond its limit the arm may be seen (poses are noisy) before it is stopped."""
+"""Distance beyond its limit at which the arm is stopped; poses are noisy."""
 
 
 @dataclass(frozen=True)

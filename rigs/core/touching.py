@@ -19,9 +19,9 @@ F64 = npt.NDArray[np.float64]
 TOUCH_HALF_PX = 30
 """Half the side of the square in which touching off looks for the centre papilla."""
 QUIET_S = 0.5
-"""How long the arm stands still to learn what noise is."""
+"""Time for which the arm stands still to measure the noise."""
 LOOK_S = 0.01
-"""How often it is looked while creeping in."""
+"""Period of the checks during the slow approach."""
 
 
 def count_central(

@@ -32,7 +32,7 @@ READY_S = 180.0
 ANSWER_S = 20.0
 """The longest that they take to answer, s."""
 TURN_S = 0.004
-"""How often the scene follows the clock, s."""
+"""Period at which the scene follows the clock, s."""
 END_S = 5.0
 
 

@@ -47,15 +47,15 @@ PULSE_NS = 5_000_000
 """Length of a pulse on the line, as the firmware sends it at 100 ticks a second."""
 I64 = npt.NDArray[np.int64]
 LAG_NS = 20_000_000
-"""How far the world is behind the host's clock: longer than a controller's cycle."""
+"""Delay of the world behind the host's clock: longer than a controller's cycle."""
 REST_S = 2.0
 """The longest that a trial's begin waits for the arm to be at rest."""
 CLEAR_MM = 5.0
 PENDANT_MM_S, PENDANT_MM_S2 = 20.0, 500.0
-"""How far a person moves a stopped arm clear of the plate, and how fast."""
+"""Distance and speed at which a person moves a stopped arm clear of the plate."""
 _NONE = np.empty(0, np.int64)
 NO_FRAMES = FrameChunk(np.empty((0, 0, 0), np.uint8), _NONE, _NONE, _NONE, _NONE.astype(np.uint8))
-"""What is sent when no more frames come."""
+"""Message that ends the frames."""
 
 
 class SimulationServer:

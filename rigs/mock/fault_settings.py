@@ -22,7 +22,7 @@ PulseDevice = Literal["arm", "event_camera", "sync_box"]
 
 class _Fault(StrictModel):
     trial: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    """Which trial begun on this rig, counting from 1; left out, every one."""
+    """Number of the trial begun on this rig, from 1; left out, every one."""
 
 
 class _TimedFault(_Fault):
@@ -51,9 +51,9 @@ class ArmOffPath(_TimedFault):
 
     kind: Literal["arm_off_path"]
     mm: Annotated[float, Field(gt=0, le=10)] = 0.5
-    """How far it gets, in the plate's plane."""
+    """Largest deviation, in the plate's plane."""
     seconds: Seconds = 1.0
-    """How long the deviation grows, evenly; then it stays to the trial's end."""
+    """Time in which the deviation grows evenly; then it stays to the trial's end."""
     direction_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Direction on the plate, from its x towards its y; left out, to the left of the way that the
     tool goes at that moment (the plate's y when it does not move along the plate)."""
@@ -103,7 +103,7 @@ class ClockDrift(_TimedFault):
     kind: Literal["clock_drift"]
     device: Device
     ppm: Annotated[float, Field(ge=-10_000, le=10_000)]
-    """What it gains on what it gained before; negative, it loses."""
+    """Change of its drift; negative, it loses."""
 
 
 class ClockJump(_TimedFault):

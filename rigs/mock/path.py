@@ -146,7 +146,7 @@ class Deviation:
 
 TURN_DEG_PER_S = 30.0
 FADE_NS = 200_000_000
-"""How long a tremor takes to build up and to die away."""
+"""Time in which a tremor builds up and dies away."""
 EVERY = slice(0, 11)
 TOOL, SENSOR = slice(0, 6), slice(6, 11)
 """Columns of a state."""

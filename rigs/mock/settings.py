@@ -70,7 +70,7 @@ class Friction(StrictModel):
 
     kinetic: Positive = 0.85
     static_excess: Share = 0.03
-    """How much more a stuck tip withstands than a slowly sliding one."""
+    """Excess of static over slow kinetic friction of a tip."""
     strengthening: NonNegative = 0.01
     """Friction at sliding speed w is kinetic times 1 + strengthening ln(1 + w / weak_mm_s)."""
     weak_mm_s: Positive = 0.1
@@ -90,7 +90,7 @@ class Plate(StrictModel):
     damping_s: NonNegative = 0.01
     """Damping over stiffness inside each tip's spring; to ground it would hold the plate up."""
     stroke_mm: Positive = 25.0
-    """How far the plate may fall before it meets its stop."""
+    """Distance that the plate may fall before it meets its stop."""
     gravity_m_s2: Positive = 9.81
     marker_id: Annotated[int, Field(ge=0, le=49)] = 0
     """Identity in OpenCV's DICT_4X4_50."""
@@ -110,7 +110,7 @@ class Contact(StrictModel):
     tilt_axis_deg: Finite = 25.0
     """In-plane direction of the axis of the tilt, from the plate's x."""
     offset_mm: Finite = 0.35
-    """How far the true surface lies behind the nominal one, along its normal."""
+    """Distance of the true surface behind the nominal one, along its normal."""
 
     @model_validator(mode="after")
     def _turn(self) -> Contact:
@@ -127,7 +127,7 @@ class Scene(StrictModel):
     """The physics: what is there, whether or not anything looks at it."""
 
     level: Literal["auto", "L1", "L2", "L3"] = "auto"
-    """How much physics the contact has (`rigs.scene.springs`); `auto` takes what a plan needs."""
+    """Level of the contact's physics (`rigs.scene.springs`); `auto` takes what a plan needs."""
     step_ms: Literal[1, 2, 4, 8, 16, 32] = 2
     """Step of the contact while the plate is held; while it may fall, a millisecond."""
     skin: Skin = Skin()
@@ -143,9 +143,9 @@ class EventCamera(StrictModel):
     height: Annotated[int, Field(ge=64, le=4096)] = 480
     px_per_mm: Positive = 14.0
     shift_mm_per_n: Finite = 4.5
-    """How far a marker moves in the image for a tangential force, in mm of the skin."""
+    """Motion of a marker in the image for a tangential force, in mm of the skin."""
     growth_mm_per_n: Finite = 0.4
-    """How much a marker's radius grows with normal force."""
+    """Growth of a marker's radius with normal force."""
     radius_mm: Positive = 1.2
     edge_px: Positive = 0.8
     """Scale of the logistic edge; the profile is cut at five of them."""
@@ -166,7 +166,7 @@ class EventCamera(StrictModel):
     noise_hz: Annotated[float, Field(ge=0, le=100)] = 0.01
     """Noise events a second of a dark pixel."""
     leak: Literal["events", "reference"] = "events"
-    """What leakage does: positive events at random times, or a memorised level that falls steadily,
+    """Effect of leakage: positive events at random times, or a memorised level that falls steadily,
     so that positive events come sooner and negative ones later, as in v2e."""
     leak_share: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of that noise that is leakage (always positive, however bright); the rest is shot noise
@@ -183,9 +183,9 @@ class EventCamera(StrictModel):
     column is read. At most the time from scan to scan, where that is less; 0: all events of a scan
     have the time at which it begins."""
     block_ms: Literal[1, 2, 4, 8, 16, 32, 64] = 32
-    """What the camera sends together: its latency."""
+    """Events that the camera sends together: its latency."""
     path: Literal["cubic", "chord"] = "cubic"
-    """How markers go from one step of the contact to the next: smoothly, or straight."""
+    """Path of markers between two steps of the contact: smooth, or straight."""
 
     @model_validator(mode="after")
     def _scans(self) -> EventCamera:
@@ -227,14 +227,14 @@ class FrameCamera(StrictModel):
     px_per_mm: Positive = 20.0
     """At the picture's centre."""
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
-    """How the plate is turned against the picture: about its x, then about its y."""
+    """Tilt of the plate against the picture: about its x, then about its y."""
     k1: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Radial distortion of the lens, OpenCV's first coefficient."""
     distance_mm: Positive = 300.0
     """From lens to plate; only matters with a tilt or a distortion."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
     exposure_us: Annotated[int, Field(ge=10, le=100_000)] = 2000
-    """What moves while the shutter is open is smeared."""
+    """Exposure; motion while the shutter is open is blurred."""
     tip_radius_mm: Positive = 1.0
     """Of the white spot on each papilla's top. The tips of this scene do not push each other aside,
     so a spot as wide as its papilla (2 mm) would run into its neighbour's."""
@@ -252,7 +252,7 @@ class FrameCamera(StrictModel):
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 4000
     """From the end of exposure to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 5000.0
-    """How much later a frame may come where arrival is all that is known of its time
+    """Delay of a frame where only its arrival time is known
     (`timing.frames: host arrival`); half-normal, four standard deviations wide."""
 
 
@@ -264,7 +264,7 @@ class Arm(StrictModel):
     latency_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1000
     """From a controller's cycle to the host."""
     arrival_jitter_us: Annotated[float, Field(ge=0, le=1_000_000)] = 200.0
-    """How much later a pose may come; half-normal, four standard deviations wide."""
+    """Delay of a pose; half-normal, four standard deviations wide."""
     vibration_um: NonNegative = 15.0
     """Largest tremor along each axis while the arm moves, of which each trial has a random share;
     the reported poses do not show it."""
@@ -273,10 +273,10 @@ class Arm(StrictModel):
     input_sampling_us: Annotated[int, Field(ge=0, le=100_000)] = 0
     """Grid on which the digital input is sampled; 0 stamps each edge when it comes."""
     tip_offset_mm: Triple = (0.0, 0.0, 0.0)
-    """Where the centre papilla's tip truly is from the reported tool centre point, in the tool's
+    """True position of the centre papilla's tip from the reported tool centre point, in the tool's
     axes: what pivoting has to find out."""
     start_xyz_mm: Triple | None = None
-    """Where the arm stands when the rig is switched on; left out, 60 mm clear of the plate."""
+    """Position of the arm when the rig is switched on; left out, 60 mm clear of the plate."""
 
 
 class Clocks(StrictModel):
@@ -295,11 +295,11 @@ class Clocks(StrictModel):
     exposure_jitter_us: NonNegative = 1.0
     """Standard deviation of the sync box's stamp of an exposure that it did not trigger."""
     read_shortest_us: NonNegative = 200.0
-    """What a question for a device's clock takes at least, and its answer."""
+    """Least time of a request for a device's clock, and of its answer."""
     read_spread_us: NonNegative = 100.0
     """Mean of what either takes besides, exponentially distributed."""
     read_longest_us: NonNegative = 5000.0
-    """Where that is cut."""
+    """Limit at which that is cut."""
 
     @model_validator(mode="after")
     def _reads(self) -> Clocks:
@@ -323,7 +323,7 @@ class MockSettings(StrictModel):
     arm: Arm = Arm()
     clocks: Clocks = Clocks()
     faults: tuple[Fault, ...] = ()
-    """What goes wrong on purpose; docs/faults.md lists the kinds."""
+    """Faults to inject; docs/faults.md lists the kinds."""
 
     @model_validator(mode="after")
     def _papillae(self) -> MockSettings:

@@ -61,7 +61,7 @@ class Ticks:
 
     @property
     def ticking(self) -> bool:
-        """Whether a train was begun since the trial did."""
+        """True if a train began since the trial did."""
         return self._period_ns > 0.0
 
     def _last_ns(self, until_ns: int) -> int:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sliplab.analysis.campaigns import Collected, collected
-from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import score_trial, summarise_latency, true_slip
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.labels.reviewed import label_key
 from sliplab.analysis.networks import training
 from sliplab.analysis.sweeps.detector_grid import (

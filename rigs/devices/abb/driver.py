@@ -42,9 +42,9 @@ from sliplab.rigs.devices.abb.watchdog import Watchdog
 from sliplab.storage.streams import Json
 
 ENTRY, MODULES = "motion_program_main", "motion_program"
-"""Where the task begins that runs motion programs, and what the names of its modules begin with."""
+"""Task that runs motion programs, and the prefix of its modules' names."""
 MONITOR_S = 0.2
-"""How often the web services are asked for the state: four requests each time, s."""
+"""Period at which the web services are asked for the state, in four requests, s."""
 FAILURES = 2
 """So many askings in a row without an answer are a lost connection."""
 FIRST_POSE_S = 3.0
@@ -60,9 +60,9 @@ UNSEEN_STILL_S = 0.5
 LOOK_S = MONITOR_S + 2 * STATUS_REQUESTS * REQUEST_S
 """To the answer to a look at the state that has begun after now, s."""
 OVERTIME_S = 5.0
-"""How much longer than half as long again a path may take before it is stopped, s."""
+"""Time beyond 1.5 times its duration after which a path is stopped, s."""
 AGREE_MM = 0.5
-"""How far EGM and the web services may differ in where the arm stands, mm."""
+"""Largest difference between the positions of EGM and the web services, mm."""
 
 
 class AbbArm(ArmDriver):

@@ -33,7 +33,7 @@ LATE_NS = 1_000_000_000
 """A packet this much older than the last one was not delayed: the controller's clock went back."""
 _FURTHEST_MM = 1e5
 _UNIT_TOLERANCE = 0.01
-"""How far a rotation's quaternion may be from length 1; the controller sends doubles."""
+"""Largest deviation of a quaternion from length 1; the controller sends doubles."""
 
 
 class EgmFault(RuntimeError):

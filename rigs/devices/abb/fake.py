@@ -143,7 +143,7 @@ WATCH_S = 0.02
 """Cycle of the watchdog module, s."""
 _SIGNALS = "rw/iosystem/signals/Local/DRV_1/"
 _NO_AXIS = "9E+09"
-"""What RAPID says of an external axis that is not there."""
+"""Value that RAPID gives an external axis that is not there."""
 
 
 class FakeAbb(FakeController):

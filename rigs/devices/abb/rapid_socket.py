@@ -18,7 +18,7 @@ from sliplab.rigs.core.capabilities import UNKNOWN, DeviceHealth
 
 _WORD = struct.Struct(">H")
 _UNIT_TOLERANCE = 0.01
-"""How far a rotation's quaternion may be from length 1; the server sends single floats."""
+"""Largest deviation of a quaternion from length 1; the server sends single floats."""
 
 
 class Command(IntEnum):
@@ -50,10 +50,10 @@ ARGUMENTS = {
     Command.POSE: "",
     Command.CLOSE: "",
 }
-"""What follows a command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
+"""Arguments of a command: joints in degrees; x y z in mm and a quaternion w x y z; mm/s and
 degrees/s; fine point, zone in mm, zone for turns in mm and in degrees."""
 RESULTS = {Command.JOINTS: 6, Command.POSE: 7}
-"""How many numbers follow the reply's first word."""
+"""Count of numbers after the reply's first word."""
 
 
 class RapidError(RuntimeError):

@@ -35,7 +35,7 @@ T = TypeVar("T")
 ANSWER_S = 2.0
 """Connecting, and every request but a move, s."""
 OVERTIME_S = 3.0
-"""How much longer than twice its time a move may take before the arm is taken for lost, s."""
+"""Time beyond twice its duration after which a move's arm is taken for lost, s."""
 TURN_DEG_S = 20.0
 """Speed of turns on the way."""
 ZONE = (0, 0.3, 0.3, 0.03)

@@ -31,7 +31,7 @@ from sliplab.rigs.devices.basler.settings import BaslerSettings
 from sliplab.storage.streams import ClockReads, FrameChunk, Json
 
 TRIGGER_READY_MS = 1000
-"""How long a software trigger waits for the camera to be ready for it, ms."""
+"""Time for which a software trigger waits for the camera to be ready, ms."""
 _LEAST_BUFFERS = 8
 _END_OF_EXPOSURE = "EventExposureEndData"
 

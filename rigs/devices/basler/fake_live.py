@@ -85,7 +85,7 @@ class Setting:
 
     @property
     def simulated(self) -> bool:
-        """Whether the value in force is what the pictures show."""
+        """True if the value in force is the one that the pictures show."""
         return self._simulates(self._value)
 
     def refusal(self, value: Any) -> str:

@@ -107,7 +107,7 @@ class DvxplorerServer:
 
     @property
     def answered(self) -> bool:
-        """Whether it has something to say, so that `finish` need not wait."""
+        """True if it has something to report, so that `finish` need not wait."""
         return self._pipe.poll(0)
 
     def finish(self, timeout_s: float) -> Sent:

@@ -29,9 +29,9 @@ WAIT_S = 0.005
 """A look that would find nothing waits for so long that something comes, s."""
 _LOOK_S = 0.001
 _SELF_END_S = 30.0
-"""How much later than its parent's bound the child ends itself, s: only where no parent is."""
+"""Time after its parent's bound at which the child ends itself, s; only without a parent."""
 _CLOSE_S = 2.0
-"""How long the library may take to close the camera, s."""
+"""Time limit for the library to close the camera, s."""
 
 
 class EventProcess:

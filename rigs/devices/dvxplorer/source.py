@@ -23,7 +23,7 @@ from sliplab.storage.streams import I64, U8, EventChunk, Json
 
 DEVICE = "event camera"
 COMMIT_MS = 2
-"""How often a USB camera hands over what it has, ms: its part of the latency."""
+"""Period at which a USB camera sends its data, ms: its part of the latency."""
 GREETING_S = 2.0
 """A stream that is connected to sends its header at once; it must be there by then, s."""
 UNKNOWN = "unknown"

@@ -21,7 +21,7 @@ from sliplab.rigs.core.pulse_code import SEEDS, CodeBits
 from sliplab.rigs.devices.sync_box.line import ALL_TO_HZ, LEAST_HZ, MOST_HZ, NAME, LineReader, seal
 
 TURN_S = 0.001
-"""How often the fake looks what is due."""
+"""Period at which the fake checks what is due."""
 LEAD_US = 2000
 """From GO to tick 0."""
 JOIN_S = 2.0

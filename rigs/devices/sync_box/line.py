@@ -8,7 +8,7 @@ from __future__ import annotations
 import zlib
 
 NAME = "sliplab-sync-box 2"
-"""What the box answers to `ID?`; the number is the protocol's."""
+"""Answer of the box to `ID?`; the number is the protocol's."""
 BAUD = 500_000
 """An exact divisor of the box's 16 MHz (115,200 is 2 % off), known to every operating system."""
 LEAST_HZ, MOST_HZ = 1.0, 1000.0

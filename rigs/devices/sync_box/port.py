@@ -18,11 +18,11 @@ from sliplab.rigs.devices.sync_box.settings import SyncBoxSettings
 
 DEVICE = "sync box"
 TRIES = 3
-"""How often a question is asked whose answer does not come, or comes garbled."""
+"""Tries of a request whose answer is missing or garbled."""
 READ_S = 0.05
 """The reading thread looks this often whether it shall end."""
 JOIN_S = 1.0
-"""How long `close` waits for the reading thread."""
+"""Time for which `close` waits for the reading thread."""
 MOST_ANSWERS = 64
 """Lines kept that nobody asked for."""
 

@@ -21,7 +21,7 @@ from typing import Any
 from sliplab.rigs.core.library_process import LibraryError, LibraryProcess
 
 START_S = 10.0
-"""How long the child may take to connect, upload the control script and see it run, s."""
+"""Time limit for the child to connect, upload the control script and see it run, s."""
 WATCHDOG_HZ = 1.0
 """The controller ends the program, and with it any move, unless it is written to this often.
 
@@ -29,11 +29,11 @@ A host that records cameras may keep a process waiting for half a second; and a 
 for a second more goes no further than its own target, which was held against all limits.
 """
 KICK_S = 0.1
-"""How often the child writes to the controller when there is nothing else to say, s."""
+"""Period at which the child writes to the controller when it has nothing else to send, s."""
 _IDLE_KICK_S = 1.0
 """The same once the controller's program has ended and there is nothing to keep alive."""
 _SELF_END_S = 2.0
-"""How much later than its parent's bound the child ends itself, s."""
+"""Time after its parent's bound at which the child ends itself, s."""
 _PARENT_GONE_STOP_S = 2.0
 _STOP_DECELERATION_M_S2 = 1.0
 

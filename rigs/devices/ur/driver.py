@@ -47,11 +47,11 @@ PORT_S = 1.0
 BEGIN_S = 1.0
 """From a move being taken to the controller saying that it runs, s."""
 OVERTIME_S = 3.0
-"""How much longer than half as long again a move may take before it is stopped, s."""
+"""Time beyond 1.5 times its duration after which a move is stopped, s."""
 STILL_S = 1.0
 """From a stop being asked for to the arm standing still, for each way of asking, s."""
 STOP_DECELERATION_MM_S2 = 1000.0
-"""How hard a stop brakes."""
+"""Deceleration of a stop."""
 ARRIVED_MM = 0.1
 """A move that ends further than this from its target was stopped by somebody."""
 STILL_MM_S = 0.01
@@ -59,7 +59,7 @@ STILL_MM_S = 0.01
 JUMP_S = 1.0
 """A controller clock that moves on by more than this from one packet to the next has jumped, s."""
 _NEWS_S = 0.1
-"""How long a packet with news of the state may be on its way, s."""
+"""Time limit for a packet with news of the state to arrive, s."""
 _UNKNOWN_NS = 1 << 62
 """A move is being handed over: nobody knows yet when the controller took it."""
 _FULL_SPEED = 0.999

@@ -93,18 +93,18 @@ class UrProgram:
         self.hung = False
         """The program says that it runs and takes no command."""
         self.speed_fraction = 1.0
-        """Where the pendant's speed slider stands; moves are slower by it."""
+        """Position of the pendant's speed slider; moves are slower by it."""
         self.powered = True
         self.clock_shift_s = 0.0
-        """What its packets say of the time, off what it is."""
+        """Error of the time in its packets."""
         self.refused: list[str] = []
-        """What it was asked for and does not simulate."""
+        """Requests that it does not simulate."""
         self._leg: tuple[Pose, float, float, float] | None = None
         """Target, speed and acceleration of the last move, and the slider's place."""
 
     @property
     def program_running(self) -> bool:
-        """Whether a program is on the controller, a paused one included."""
+        """True if a program is on the controller, a paused one included."""
         return self.runtime is not Runtime.STOPPED
 
     def cycle(self, t_s: float) -> None:

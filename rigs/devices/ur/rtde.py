@@ -181,7 +181,7 @@ OUTPUTS = (
     "target_speed_fraction",
     "output_int_register_2",
 )
-"""What the driver asks the stream for, in this order."""
+"""Fields that the driver asks the stream for, in this order."""
 _EMERGENCY = 0b1110_0000
 """System, robot and any emergency stop."""
 _PROTECTIVE = 0b111_0001_1100
@@ -224,9 +224,9 @@ class UrStatus:
     playing: bool
     """A program plays, ours or another."""
     off: str
-    """Why the arm is not switched on, in the words of its robot mode; empty if it is."""
+    """Reason for which the arm is not on, in the words of its robot mode; empty if it is."""
     speed_fraction: float
-    """Where the pendant's speed slider stands, 0 to 1."""
+    """Position of the pendant's speed slider, 0 to 1."""
     move_runs: bool
     """The control script says that an asynchronous move runs."""
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.detectors import (
     Detector,
     Labelled,
@@ -19,6 +18,7 @@ from sliplab.analysis.detectors.detectors import (
     learn,
 )
 from sliplab.analysis.detectors.latency import TrueSlip
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detection import Detections, detect
 from sliplab.analysis.detectors.latency import (
     TrialLatency,
     TrueSlip,
@@ -16,6 +15,7 @@ from sliplab.analysis.detectors.latency import (
     summarise_lead,
     true_slip,
 )
+from sliplab.analysis.detectors.smoothing_rule import Detections, detect
 from sliplab.protocols.settings import Detection
 from sliplab.storage.schema.label import TrialLabel
 

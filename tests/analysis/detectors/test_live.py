@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.live import (
     SPAN_NS,
     ClockFellBack,
@@ -19,6 +18,7 @@ from sliplab.analysis.detectors.live import (
     LiveDetector,
     StepRule,
 )
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.analysis.windows.windows import bin_events
 from sliplab.protocols.settings import Detection, Windows
 from sliplab.storage.streams import EventChunk

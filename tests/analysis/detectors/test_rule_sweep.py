@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detection import detect
 from sliplab.analysis.detectors.latency import (
     NEVER,
     TrueSlip,
@@ -21,6 +20,7 @@ from sliplab.analysis.detectors.rule_sweep import (
     score,
     sweep,
 )
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

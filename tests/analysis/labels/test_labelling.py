@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.analysis.labels.labelling import Label, label_places
 from sliplab.analysis.labels.places import Places
-from sliplab.analysis.labels.plate import PlateTrack
+from sliplab.analysis.labels.plate_tracking import PlateTrack
 from sliplab.protocols.settings import Labelling
 
 FRAME_NS = 10_000_000

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.detectors.detection import detect as detect_trial
 from sliplab.analysis.detectors.live import LiveDetector, counting_of
+from sliplab.analysis.detectors.smoothing_rule import detect as detect_trial
 from sliplab.analysis.networks.training import predict_counts
 from sliplab.analysis.windows.dataset import trial_windows
 from sliplab.analysis.windows.windows import bin_events

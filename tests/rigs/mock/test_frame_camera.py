@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sliplab.analysis.labels.plate import track_video
+from sliplab.analysis.labels.plate_tracking import track_video
 from sliplab.rigs.core.capabilities import Segment
 from sliplab.rigs.mock.devices import MockDevices, build_mock
 from sliplab.rigs.mock.settings import FrameCamera, MockSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sliplab.analysis.labels.plate import PlateTracker
+from sliplab.analysis.labels.plate_tracking import PlateTracker
 from sliplab.rigs.scene.frames import (
     ExposurePath,
     Exposures,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplab.analysis.detectors.detection import detect
+from sliplab.analysis.detectors.smoothing_rule import detect
 from sliplab.protocols.settings import Detection
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sliplab.analysis.labels.blobs import find_blobs
 from sliplab.analysis.labels.markers import track
-from sliplab.analysis.labels.plate import (
+from sliplab.analysis.labels.plate_tracking import (
     UNSEEN,
     PlatePose,
     PlateTracker,
