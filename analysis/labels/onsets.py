@@ -150,10 +150,10 @@ def paper_onsets(
 def rest_time(
     frame_ns: NDArray[np.int64], xy: NDArray[np.float64], within_px: float, unseen_ns: int
 ) -> int | None:
-    """The time of the first frame from which on something stays where it ends up, ns.
+    """Return the time of the first frame after which a point stays at its final position, ns.
 
-    The threshold that tells a slip's beginning tells its end: a place no farther than `within_px`
-    from the last one. What is still moving in the last frames comes to rest there.
+    It stays within `within_px` of that position, the threshold that a slip's onset has as well. A
+    point that still moves in the last frames comes to rest there.
 
     Args:
         frame_ns: (n,) int64, the frames' times, strictly increasing.

@@ -1,7 +1,7 @@
 """Events to the network's samples: crop, pool and count, once, for training and live alike.
 
 Every sample in the project, whether cut for training from a stored trial or taken from a running
-camera, comes out of these functions, so a model never meets a tensor that was made another way.
+camera, comes out of these functions, so training and live inputs are identical.
 They read the sorted event columns in place; a campaign's hundreds of millions of events pass
 through at tens of millions a second on one core.
 """
@@ -201,7 +201,7 @@ def _raise_for_status(state: int, columns: _Columns, width: int, height: int) ->
 @numba.njit(cache=True, nogil=True)
 def _fault(x: Any, y: Any, t: Any, width: int, height: int) -> int:
     """0, or _UNSORTED, or one plus the index of the first event outside the sensor."""
-    # whole columns without a way out of the loop: the compiler takes many events at once
+    # no early exit, so that the loop is vectorised
     unsorted = False
     for i in range(1, t.size):
         unsorted |= t[i] < t[i - 1]
@@ -267,8 +267,8 @@ def _list(
             while i < t.size and t[i] < end:
                 column, row, positive = of_x[x[i]], of_y[y[i]], p[i] != 0
                 i += 1
-                # half of the events have the other polarity, in no order that a processor could
-                # guess: they go on a last place that nobody reads, without a branch
+                # half of the events have the other polarity, unpredictable for the processor:
+                # they are written to a dummy last cell, without a branch
                 selected = (column >= 0) & (row >= 0) & (both | (positive == asked))
                 place = ((both & positive) * cells + row) * cells + column if selected else nowhere
                 found = plane[place]

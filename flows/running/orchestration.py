@@ -1,4 +1,4 @@
-"""Prefect as this project runs it: embedded by default, at home in the store, silent off-line.
+"""Prefect as this project runs it: embedded by default, its home in the store, no telemetry.
 
 `prepare` must run before Prefect is imported, because Prefect reads its settings then. A server
 that the user names with PREFECT_API_URL is used instead of the embedded one.
@@ -51,7 +51,7 @@ _servers: dict[str, EmbeddedServer] = {}
 _store: Path | None = None
 _link: ServerLink | None = None
 _lost_servers: set[str] = set()
-"""Servers of which the line was said; one that answers again is taken out."""
+"""Servers already reported as unreachable; removed once they answer."""
 
 
 class Opaque(Generic[T]):
@@ -91,7 +91,7 @@ def prepare(store: Path) -> None:
 
 
 def _ask_loopback_directly() -> None:
-    """Except the loopback from the proxies that the environment names: they cannot reach it."""
+    """Exclude the loopback from the proxies that the environment names: they cannot reach it."""
     kept = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
     names = [name.strip() for name in kept.split(",") if name.strip()]
     names += [name for name in _LOOPBACK if name not in names]

@@ -109,7 +109,7 @@ class Rig:
     def close(self) -> None:
         """Give every device back, the arm stopped first; safe to call more than once.
 
-        A device that does not answer has nothing to give back, and must not keep the others.
+        A device that fails must not stop the others from being closed.
 
         Raises:
             ArmFault: everything was given back, but the arm could not be seen to stand still.
@@ -251,7 +251,7 @@ class Rig:
                 self.arm.stop()
                 return depth - speed_mm_s * rate.LATE_S - self.touch_mm
         state = self.arm.state()
-        if not state.healthy:  # a stopped arm touched nothing, but the plane is not to blame
+        if not state.healthy:  # the arm was stopped; the taught plane may still be right
             raise arm_fault(state, "touching off")
         raise RigError(
             "arm",
@@ -340,7 +340,7 @@ class Rig:
     def stop_streams(self, sink: Sink, with_frames: bool) -> None:
         """Stop the pulses, and read what the cameras still hold before and after they stop.
 
-        Events that come later than `tail_s` after the motion tell nothing; a pulse or a frame does.
+        Events later than `tail_s` after the motion are discarded; late pulses and frames are read.
         """
         if with_frames and self.timing.frames == "exposure line":
             self.frames.stop()
@@ -367,7 +367,7 @@ class Rig:
             sink.add_frame_camera_reads(self.frames.read_clock())
 
     def begin_trial(self, home: Position, seed: int) -> None:
-        """To where a motion begins; only then is a simulated trial's randomness drawn."""
+        """Move to the start position, then let a simulation draw its random values."""
         self.move(Move("home", home, RETRACT_SPEED_MM_S), self.position(), None)
         if self.simulation is not None:
             self.simulation.begin_trial(seed)
@@ -419,7 +419,7 @@ class Rig:
     def _stop_arm(self) -> RigError | None:
         """Stop the arm; why that could not be done or seen, None if it stands still.
 
-        Whoever asks again meanwhile, with another Ctrl-C, must not keep it from being stopped.
+        A second Ctrl-C must not interrupt the stop.
         """
         for _ in range(_INTERRUPTIONS):
             try:
