@@ -161,8 +161,9 @@ def _memory(long: int) -> Figures:
     held: dict[int, tuple[float, float]] = {}
 
     def look(taken: int) -> None:
-        if taken in {long // 10, long}:
-            held[taken] = (resident_mb(), resident_mb(server.pid))
+        for mark in (long // 10, long):
+            if taken >= mark and mark not in held:
+                held[mark] = (resident_mb(), resident_mb(server.pid))
 
     from sliplab.flows.collect import BATCH
 

@@ -38,7 +38,7 @@ def test_each_set_of_trials_is_a_column() -> None:
     assert table.columns[1:] == ("slides", "falling plates", "slides with nuisances")
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["trials"] == ["60", "12", "24"]
-    assert rows["onsets of trials that are wrong without a doubt"] == ["–", "1", "0"]
+    assert rows["onsets of trials that are wrong without a doubt"] == ["–", "0", "0"]
     assert label_truth({"trials": 3.0, "slip_bias_ms": float("nan")}).rows == [
         ["trials", "3"],
         ["the same, median with its sign (ms)", "–"],
