@@ -21,7 +21,7 @@ from sliplab.analysis.networks import training
 from sliplab.analysis.networks.window_checks import Chance
 from sliplab.analysis.windows.dataset import recorded_span
 from sliplab.analysis.windows.sample_sets import by_id, load_samples, split_trials
-from sliplab.flows import evaluate as evaluate_flows
+from sliplab.flows import window_checks as check_flows
 from sliplab.flows.collect import collect
 from sliplab.flows.evaluate import evaluate
 from sliplab.flows.label import check_folder, check_labels, check_required
@@ -226,9 +226,9 @@ def test_other_methods_are_kept_and_the_report_tells_of_them(
     store = store_of(ran)
     campaigns = collected(store)
     monkeypatch.setattr(window_baselines, "NAMES", {"logistic_cells": 1, "cnn_frame": 1})
-    first = evaluate_flows.window_baselines(store, campaigns)
+    first = check_flows.window_baselines(store, campaigns)
     assert (first["done"], first["fresh"]) == (2, 0)
-    assert evaluate_flows.window_baselines(store, campaigns)["done"] == 0
+    assert check_flows.window_baselines(store, campaigns)["done"] == 0
     assert report(store, campaigns)["done"] == 1
     kinematic = summary_json(store)["kinematic"]
     for name, share in first["argmax"].items():
@@ -261,12 +261,12 @@ def test_a_check_that_fails_ends_the_command(
     store = store_of(ran)
     campaigns = collected(store)
     fair = Chance((0.3, 0.36), 0.2, 0.45, 0.8, 0.999)
-    monkeypatch.setattr(evaluate_flows, "shuffled_chance", lambda *_: fair)
-    assert evaluate_flows.window_checks(store, campaigns)["orders"] == 6
+    monkeypatch.setattr(check_flows, "shuffled_chance", lambda *_: fair)
+    assert check_flows.window_checks(store, campaigns)["orders"] == 6
     leak = Chance((0.9, 0.91), 0.85, 0.95, 0.92, 0.999)
-    monkeypatch.setattr(evaluate_flows, "shuffled_chance", lambda *_: leak)
+    monkeypatch.setattr(check_flows, "shuffled_chance", lambda *_: leak)
     with pytest.raises(StoreError, match="shuffled labels"):
-        evaluate_flows.window_checks(store, campaigns)
+        check_flows.window_checks(store, campaigns)
 
 
 def test_detectors_are_compared_at_equal_rates(ran: tuple[list[RunRequest], Outcome]) -> None:
