@@ -69,6 +69,8 @@ def emulate(emulator: Any, path: F64, optics: EventOptics, threshold: F64) -> Ev
     """
     import torch
 
+    # as many threads as cores of the comparison: others would wait for each other on the one core
+    torch.set_num_threads(1)
     device = emulator(
         pos_thres=optics.threshold, neg_thres=optics.threshold, sigma_thres=0.0, cutoff_hz=0.0,
         leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_period_s=optics.refractory_us * 1e-6,
