@@ -124,7 +124,7 @@ def _left_out(falls: bool, closed: int, trials: int) -> list[str]:
         )
     if closed < trials:
         stated.append(
-            f"L0 is told for {closed} of {trials} trials: a retraction that also goes sideways "
+            f"L0 is stated for {closed} of {trials} trials: a retraction that also goes sideways "
             "has no closed form."
         )
     return stated

@@ -101,7 +101,7 @@ def taught_frame(file: RigFile) -> PlateFrame:
 
 
 def tool_of(file: RigFile) -> Pose:
-    """The tool that the arm's controller is told of, from the flange: as taught, else as given."""
+    """The tool set in the arm's controller, from the flange: as taught, else as given."""
     taught = file.calibration.tool_centre_point
     if file.devices is None:
         return Pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -53,9 +53,9 @@ def choose_level(rig: RigFile, plan: Plan) -> Choice | None:
     """The level of physics for a plan on a simulated rig; None on a real one."""
     if not rig.simulated:
         return None
-    told = rig.scene.scene.level
-    if told != "auto":
-        return Choice(int(told[1]), "told so by the rig file (mock.scene.level)")
+    stated = rig.scene.scene.level
+    if stated != "auto":
+        return Choice(int(stated[1]), "set by the rig file (mock.scene.level)")
     slides = slides_of(plan)
     if not slides:
         return Choice(

@@ -167,11 +167,11 @@ class RigFile(StrictModel):
         """The simulated camera draws at the scale that the rig file promises, or has measured."""
         if self.mock is None:
             return self
-        told, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
-        if abs(told - drawn) > SCALE_ERROR * drawn:
+        stated, drawn = self.frame_camera.scale_px_per_mm, self.mock.frame_camera.px_per_mm
+        if abs(stated - drawn) > SCALE_ERROR * drawn:
             raise KeyedError(
                 "frame_camera.scale_px_per_mm",
-                told,
+                stated,
                 f"must be mock.frame_camera.px_per_mm = {drawn:g}",
             )
         return self

@@ -45,7 +45,7 @@ def held(file: RigFile, store: Path | None = None) -> Iterator[None]:
     """Hold a rig for this program while the block runs.
 
     Args:
-        store: where its data go, to be told to whoever is refused.
+        store: where its data go, shown to whoever is refused.
 
     Raises:
         Locked: another program has it; the message says which, whose and since when.

@@ -222,8 +222,8 @@ def find_faults(
     found = []
     for name in COMMANDS:
         limit: int | None = getattr(calibration.max_age, name)
-        told = name in calibration.max_age.model_fields_set
-        if limit is None or not (told or (name in needed and not simulated)):
+        stated = name in calibration.max_age.model_fields_set
+        if limit is None or not (stated or (name in needed and not simulated)):
             continue
         fault = _too_old(name, getattr(calibration, name), limit, today)
         found += [fault] if fault else []

@@ -102,7 +102,8 @@ class StraightMotion:
     May be asked from any thread, for times that do not run back.
 
     Args:
-        on_line: told of every new way and since when it holds, s; in the thread that moves.
+        on_line: called with every new path and the time from which it holds, s; in the moving
+            thread.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 A regular train looks the same after a shift by one period, so a device that misses its first
 pulse would be aligned wrongly by one tick. Three codes say where in the train one is; which one a
-sync box sends is told by the rig file (`protocols.timing.Timing.code`):
+sync box sends is set by the rig file (`protocols.timing.Timing.code`):
 
 * ``lfsr``: bits of a maximal linear-feedback shift register of 32 bits. A run of 32 comes again
   after 4,294,967,295 ticks (497 days at 100 Hz), and every seed begins somewhere else: two trials

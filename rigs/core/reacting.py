@@ -58,7 +58,7 @@ class Reaction:
 
     Attributes:
         phase: the motion that it cut short.
-        stop_ms: from when the slip was told of until the arm stood still.
+        stop_ms: from when the slip was reported until the arm stood still.
         stopped_mm: where it stood then: x, y, depth in plate coordinates.
         depth_mm: its depth in the end.
     """
@@ -131,7 +131,7 @@ def _react(rig: Rig, phase: str, reflex: Reflex, watcher: Watcher) -> Reaction:
     stop_ms = (rig.clock.now_ns() - began_ns) / 1e6
     here = at = rig.position()
     if reflex.kind == "press":
-        # what is measured scatters about what was told; the limit holds whatever it says
+        # what is measured scatters about the command; the limit holds whatever it says
         depth = min(at.depth_mm + reflex.press_mm, reflex.deepest_mm)
         if depth > at.depth_mm:
             at = Position(at.x_mm, at.y_mm, depth)

@@ -140,15 +140,15 @@ class Rig:
 
     def describe(self) -> dict[str, Json]:
         """Return settings, counts and losses of the trial that just ran, by device."""
-        told = {}
+        described = {}
         cameras = ("event_camera", self.events), ("frame_camera", self.frames)
         for name, device in (("arm", self.arm), *cameras):
             if hasattr(device, "describe"):
-                told[name] = device.describe()
+                described[name] = device.describe()
         losses = getattr(self.sync, "losses", None)
         if losses is not None:
-            told["sync_box"] = {"losses": vars(losses)}
-        return told
+            described["sync_box"] = {"losses": vars(losses)}
+        return described
 
     def run_trial(
         self,
@@ -388,7 +388,7 @@ class Rig:
 
         A device that fails while it is stopped does not keep the others from being stopped. Then
         what went wrong first is raised; but an arm that could not be stopped or moved clear, and a
-        plate that nobody has caught, are always told of.
+        plate that nobody has caught, are always reported.
         """
         try:
             yield

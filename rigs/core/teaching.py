@@ -46,7 +46,7 @@ class Creep:
         speed_mm_s: creeping speed, at most `MOST_CREEP_MM_S`.
         search_mm: hard limit beyond the plane that the rig assumes.
         clearance_mm: how far before that plane creeping begins.
-        after_mm: how much farther it may go, within the limit, when events have told of a touch
+        after_mm: how much farther it may go, within the limit, after events have shown a touch
             and the markers, which are looked at, have not.
     """
 
@@ -249,7 +249,7 @@ def jogged(rig: Rig, prompts: list[tuple[str, str]]) -> list[Pose]:
         if not rig.operator.ask("jog", prompt, word) or rig.should_stop():
             raise StopRequested
         state = rig.arm.state()
-        if state in _UNTRUE:  # others, such as local control, only keep it from being told to move
+        if state in _UNTRUE:  # others, such as local control, only keep it from being commanded
             raise arm_fault(state, word)
         pose = rig.arm.pose()
         rig.wait(0.2)

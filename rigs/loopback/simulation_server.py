@@ -187,7 +187,7 @@ class SimulationServer:
         self._stamps_us.clear()
 
     def truth(self, reference_arm_ns: int, hold_arm_ns: int | None = None) -> dict[str, Any]:
-        """The truth of a trial after these moments of the clock that the arm's times are told by.
+        """Return the truth of a trial after these moments of the arm's clock.
 
         See `rigs.mock.truth.truth_of`.
         """

@@ -216,7 +216,7 @@ AnyFault = (
     | DeviceGone
 )
 Fault = Annotated[AnyFault, Field(discriminator="kind")]
-"""One fault, told apart by its `kind`."""
+"""One fault, discriminated by its `kind`."""
 KINDS: tuple[str, ...] = tuple(
     get_args(model.model_fields["kind"].annotation)[0] for model in get_args(AnyFault)
 )

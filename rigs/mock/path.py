@@ -104,7 +104,7 @@ _X, _Y = 6, 7
 
 
 class Deviation:
-    """Deviation of the tool from where it was told to be, as an arm state to be added."""
+    """Deviation of the tool from its commanded position, as an arm state to be added."""
 
     def __init__(
         self, book: FaultBook, plane: ContactPlane, commanded: Callable[[I64], F64]
@@ -222,7 +222,7 @@ class ArmPath:
         return states + self.deviation.at(t_ns)[:, columns] if self.deviation else states
 
     def commanded(self, t_ns: I64, columns: slice = EVERY) -> F64:
-        """The same, as the arm was told: without its deviation."""
+        """The same, as commanded: without its deviation."""
         result = np.empty((len(t_ns), columns.stop - columns.start))
         # each leg holds from its start to that of the next
         begins = np.searchsorted(t_ns, np.array([leg.start_ns for leg in self.legs], np.int64))

@@ -3,7 +3,7 @@
 Rows stand on a global grid: every `step_ms` while the plate is held, every millisecond while it
 may fall, and nothing is computed beyond the present; one more stands where the plate meets its
 stop. Which rows there are depends on what the
-plate was told and when, never on who looked how often.
+plate was commanded and when, never on who looked how often.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Time moves only when the virtual clock waits, and the physics follow when a device looks: the
 state then advances on a fixed grid of steps up to the present. A trial's data depend on the rig's
-settings, the trial's seed and what the devices were told, never on what ran before: `begin_trial`
+settings, the trial's seed and the commands to the devices, never on what ran before: `begin_trial`
 puts the skin at rest, sets the true time to 0 and draws everything that varies from trial to
 trial from the seed.
 """

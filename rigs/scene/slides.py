@@ -1,7 +1,7 @@
 """One straight slide by contact alone: forces and slips of a trial without any device.
 
 Levels, grids and benchmarks need thousands of slides and no clock, camera or store. Onsets are
-exact at any step; its length only says how often forces are told.
+exact at any step; its length only says how often forces are reported.
 """
 
 from __future__ import annotations

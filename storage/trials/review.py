@@ -4,7 +4,7 @@
 
 A decision names the label that it was made on by that label's key, so that it can be told when the
 label has changed since. The last decision counts; the ones before it stay. Of two people who decide
-on one trial at the same time, both keep their decisions, or the second one is told.
+on one trial at the same time, both keep their decisions, or the second one is warned.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ class AbbArm(ArmDriver):
         self.connect()
 
     def state(self) -> ArmState:
-        """The arm's state as it was told last; never waits."""
+        """The arm's state as last reported; never waits."""
         if self._lost is not None or self._status is None:
             return ArmState.DISCONNECTED
         if self._status.state is not ArmState.READY:

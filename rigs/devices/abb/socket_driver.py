@@ -108,7 +108,7 @@ class AbbSocketArm(ArmDriver):
         return last.pose
 
     def now_ns(self) -> int:
-        """The host's monotonic clock, which is what this arm's times are told by, ns."""
+        """The host's monotonic clock, which stamps this arm's times, ns."""
         return time.monotonic_ns()
 
     def health(self) -> DeviceHealth:

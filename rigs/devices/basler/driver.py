@@ -273,7 +273,7 @@ class BaslerCamera:
         except self._genicam.GenericException as error:
             raise RigError(DEVICE, f"it does not begin to grab: {error}") from None
         wired = self.stamping.grade == "hardware trigger" and settings.sync_line is not None
-        told = GrabSettings(
+        grab_settings = GrabSettings(
             stamping=self.stamping,
             mid_exposure_ns=self.mid_exposure_ns,
             first_id=1 if self._device.IsGigE() else 0,
@@ -284,7 +284,7 @@ class BaslerCamera:
             first_ns=round(settings.first_frame_s * 1e9) if settings.trigger == "free run" else 0,
             stall_ns=0 if settings.trigger == "software" else round(settings.stall_s * 1e9),
         )
-        self._grab, self._running = Grab(self._device, told, self._ends), True
+        self._grab, self._running = Grab(self._device, grab_settings, self._ends), True
 
     def trigger(self) -> None:
         """Ask for one frame, where the trigger is `software`.

@@ -55,7 +55,7 @@ class ServerError(RuntimeError):
 
 
 class DvxplorerServer:
-    """A process that makes packets, and sends them when told to.
+    """A process that makes packets, and sends them on command.
 
     Args:
         source: makes the packets; it is called in the process, so it must be a module's function

@@ -61,8 +61,8 @@ class FakeSyncBox:
         now_ns: the box's clock; any origin, it shows 0 when the box gets power or is reset.
         exposure_us: where the camera's output is wired, exposures begin this long after each
             tick; None where it is not.
-        on_train: told of every train before its first tick; and with None and the number of ticks
-            sent when it has ended. In the box's thread.
+        on_train: called with every train before its first tick, and at its end with None and the
+            number of ticks sent. In the box's thread.
 
     Attributes:
         port: name of the pty.
@@ -115,7 +115,7 @@ class FakeSyncBox:
             self._say(f"B {NAME}")
 
     def silence(self, silent: bool = True) -> None:
-        """Hang: neither read nor send, until told otherwise."""
+        """Hang: neither read nor send, until restored."""
         with self._lock:
             self._silent = silent
 
@@ -125,7 +125,7 @@ class FakeSyncBox:
             self._corrupt = lines
 
     def drop(self, reports: int) -> None:
-        """Drop the next `reports` reports as with a full buffer: they are counted, and told."""
+        """Drop the next `reports` reports as with a full buffer: they are counted and reported."""
         with self._lock:
             self._drop = reports
 

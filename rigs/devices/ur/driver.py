@@ -279,7 +279,7 @@ class UrArm(ArmDriver):
                 would wait in vain for an arm without power.
         """
 
-        def ending() -> bool:  # a program that was just told to end takes a cycle or two
+        def ending() -> bool:  # a program that was just asked to end takes a cycle or two
             return self._status is not None and self._status.program
 
         state = self.state()
