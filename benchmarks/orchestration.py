@@ -26,7 +26,13 @@ from typing import Any
 from benchmarks.catalogues import catalogue_figures
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, spread
 from benchmarks.start_up import startup_seconds
-from sliplab.flows.running.orchestration import Opaque, begin, embedded, prepare, run
+from sliplab.flows.running.orchestration import (
+    Opaque,
+    configure_prefect,
+    embedded,
+    run,
+    start_server,
+)
 
 DRAIN_LIMIT_S = 120.0
 
@@ -50,8 +56,8 @@ def measure(
     """Everything in one go."""
     figures: Figures = {}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        prepare(Path(folder))  # before Prefect is imported
-        begin()
+        configure_prefect(Path(folder))  # before Prefect is imported
+        start_server()
         figures |= _compare(trials, runs)
         figures |= _memory(long)
     figures |= catalogue_figures(records, runs)

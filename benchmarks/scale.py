@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.measure import RUNS, Figures, Seconds, alternate, one_core, rate, spread
-from benchmarks.trials import run_session
+from benchmarks.trials import open_session
 from sliplab.analysis.clocks.refit import fit_again
 from sliplab.analysis.labels import labelling
 from sliplab.analysis.networks import training
@@ -43,7 +43,7 @@ def measure(trials: int = 1, runs: int = RUNS, s3: bool = True) -> Figures:
     )
     figures: Figures = {}
     for rig, prefix in (("rehearsal", "tracks_"), ("mock", "video_")):
-        with run_session(rig, trials) as taking:
+        with open_session(rig, trials) as taking:
             taking.take()
             campaign = taking.session.campaign
             store = Store.open(campaign.folder.parent.parent)

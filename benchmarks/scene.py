@@ -29,7 +29,7 @@ import numpy as np
 from benchmarks.emulator import FRAME_NS, emulate, find_emulator
 from benchmarks.measure import RUNS, SEED, Figures, alternate, one_core, rate, ratio, spread
 from benchmarks.slides import CHUNK_S, HOLD_S, LENGTH_MM, loads_of_slide
-from benchmarks.trials import run_session
+from benchmarks.trials import open_session
 from sliplab.analysis.sweeps.scene_error import match_events
 from sliplab.rigs.mock.physics import springs_of
 from sliplab.rigs.mock.settings import MockSettings, skin_of
@@ -73,8 +73,8 @@ def _whole(runs: int, trials: int) -> Figures:
     seconds: dict[str, list[float]] = {"tracks": [], "video": []}
     # shares of the sample in turn, so that every trial is taken once and rounds can be compared
     with (
-        run_session("rehearsal", count * (runs + 1)) as tracks,
-        run_session("mock", runs + 1) as video,
+        open_session("rehearsal", count * (runs + 1)) as tracks,
+        open_session("mock", runs + 1) as video,
     ):
         amounts: dict[str, list[float]] = {"tracks": [], "video": []}
 

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 
 
 @dataclass(frozen=True)
-class RunSession:
+class OpenSession:
     """A session at a simulated rig with its store, ready to take trials."""
 
     session: Session
@@ -45,7 +45,7 @@ class RunSession:
 
 
 @contextmanager
-def run_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[RunSession]:
+def open_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[OpenSession]:
     """A session that can take `count` random trials of a protocol's grid."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         text = yaml.safe_load((ROOT / "protocols" / f"{protocol}.yaml").read_text("utf-8"))
@@ -62,14 +62,14 @@ def run_session(rig: str, count: int, protocol: str = "kinematic") -> Iterator[R
         chosen = np.random.default_rng(SEED).choice(len(every), count, replace=False)
         session = Session(run_request.plan, run_request.rig, device, campaign)
         try:
-            yield RunSession(session, [every[index] for index in sorted(chosen)])
+            yield OpenSession(session, [every[index] for index in sorted(chosen)])
         finally:
             device.close()
 
 
 def main(rig: str) -> None:
     """One trial, and what it took."""
-    with run_session(rig, 1) as work:
+    with open_session(rig, 1) as work:
         work.take()
     print(f"{peak_mb():.1f}")
 

@@ -14,7 +14,7 @@ from prefect.cache_policies import NO_CACHE
 
 from sliplab.flows.collecting.progress import shown
 from sliplab.flows.collecting.requests import carry_out, refuse_paused, store_lock
-from sliplab.flows.collecting.session import Session, refresh, run_session
+from sliplab.flows.collecting.session import Session, open_session, refresh
 from sliplab.flows.planning.run_request import RunRequest, check_disk
 from sliplab.flows.running import stopping
 from sliplab.flows.running.orchestration import Opaque, run
@@ -47,7 +47,7 @@ def collect_flow(run_request: Opaque[RunRequest]) -> dict[str, Any]:
     request = run_request.content
     with (
         shown(request) as progress,
-        run_session(request) as work,
+        open_session(request) as work,
         timed(Store(request.store), f"collect {request.campaign}"),
     ):
         session, trials = work.session, work.trials

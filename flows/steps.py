@@ -26,7 +26,7 @@ def prepare_store(folder: Path) -> None:
     from sliplab.flows.running import orchestration
     from sliplab.storage.trials.store import Store
 
-    orchestration.prepare(Store.create(folder).folder)
+    orchestration.configure_prefect(Store.create(folder).folder)
 
 
 def run_step(

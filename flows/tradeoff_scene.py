@@ -81,7 +81,7 @@ def tradeoff_scene(
         total += scene_runs.EVENT_TRIALS * (2 + 2 * len(assumed.CONTACT + assumed.CAMERA))
     if dask is not None:
         make_folder(folder)
-        orchestration.prepare(folder)
+        orchestration.configure_prefect(folder)
     with connected(dask) as cluster, console.bar("trade-off (runs)", total) as bar:
         scene_runs.timed(changed(rig, REFERENCE.change), plan, jobs[0].trial, 0)  # compiles
         wall_s = [scene_runs.wall_seconds(job, ROUNDS, bar.advance) for job in jobs]

@@ -168,7 +168,7 @@ class _Progress:
         self._bar.advance(1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict")
         svg = training_curves(self._records, self._best.epoch, simulated=self._simulated)
         write_text(self._model.curves_path, svg)
-        if not orchestration.private():
+        if not orchestration.uses_private_server():
             with suppress(Exception):
                 self._show(svg)
 

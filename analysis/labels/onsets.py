@@ -37,7 +37,9 @@ class Onsets:
     per_marker_ns: NDArray[np.int64]
 
 
-def mean_places(xy: NDArray[np.float64], frames: slice | NDArray[np.bool_]) -> NDArray[np.float64]:
+def mean_positions(
+    xy: NDArray[np.float64], frames: slice | NDArray[np.bool_]
+) -> NDArray[np.float64]:
     """Mean place of each marker over the frames in which it was seen, (m, 2) pixels.
 
     Args:
@@ -67,7 +69,9 @@ def mean_places(xy: NDArray[np.float64], frames: slice | NDArray[np.bool_]) -> N
     return mean
 
 
-def on_plate(xy: NDArray[np.float64], plate_xy: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def relative_to_plate(
+    xy: NDArray[np.float64], plate_xy: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
     """Markers relative to the plate's own marker, so that what remains is motion on the plate.
 
     Args:
@@ -91,10 +95,10 @@ def displacements(
     """Distance of each marker from its mean place over the reference frames, (n, m) pixels.
 
     NaN where the marker or the plate is unknown in that frame, or in all of the reference frames.
-    Arguments and errors as for `mean_places` and `on_plate`.
+    Arguments and errors as for `mean_positions` and `relative_to_plate`.
     """
-    xy = on_plate(xy, plate_xy)
-    moved = xy - mean_places(xy, reference_frames)
+    xy = relative_to_plate(xy, plate_xy)
+    moved = xy - mean_positions(xy, reference_frames)
     return np.hypot(moved[:, :, 0], moved[:, :, 1])
 
 

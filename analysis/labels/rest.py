@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sliplab.analysis.labels.camera_shift import CameraShift, camera_shift, no_shift
-from sliplab.analysis.labels.onsets import mean_places, on_plate
+from sliplab.analysis.labels.onsets import mean_positions, relative_to_plate
 from sliplab.analysis.labels.places import SURE_PX, Places
 
 F64 = npt.NDArray[np.float64]
@@ -67,9 +67,9 @@ def offsets(places: Places, frame_ns: I64, start_ns: int, reference_ms: float) -
         "hold_end": held & (frame_ns >= start_ns - length_ns),
     }
     sure = places.sigma <= SURE_PX
-    xy = on_plate(np.where(sure[..., None], places.flat_xy, np.nan), places.flat_plate)
+    xy = relative_to_plate(np.where(sure[..., None], places.flat_xy, np.nan), places.flat_plate)
     sigma = np.where(sure, places.sigma, np.nan)
-    away = xy - _either(*(mean_places(xy, frames) for frames in parts.values()))
+    away = xy - _either(*(mean_positions(xy, frames) for frames in parts.values()))
     if places.plate is None:
         camera = camera_shift(away)
         away = away - camera.px[:, None, :]
@@ -77,7 +77,7 @@ def offsets(places: Places, frame_ns: I64, start_ns: int, reference_ms: float) -
     else:
         camera = no_shift(len(frame_ns))
         sigma = np.hypot(sigma, places.plate.sigma[:, None])
-    rests = {name: mean_places(away, frames) for name, frames in parts.items()}
+    rests = {name: mean_positions(away, frames) for name, frames in parts.items()}
     return Offsets(away, sigma, camera, rests)
 
 

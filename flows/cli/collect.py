@@ -119,7 +119,7 @@ def collect(
     check_disk([run_request])
     prepare_store(store)
     if run_request.due_trials(Store(store).campaign(run_request.campaign)):
-        orchestration.begin()  # starts while the imports below load
+        orchestration.start_server()  # starts while the imports below load
     from sliplab.flows.collect import collect as run
 
     result = run(run_request)

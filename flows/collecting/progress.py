@@ -170,7 +170,7 @@ class _Page:
         self._over = threading.Event()
         self._artifact: Any = None
         self._misses = 0
-        self._public = not orchestration.private()
+        self._public = not orchestration.uses_private_server()
         settings = contextvars.copy_context()  # Prefect's settings do not come along by themselves
         self._thread = threading.Thread(
             target=settings.run, args=(self._report_until_end,), name="page", daemon=True
@@ -180,7 +180,7 @@ class _Page:
     def end(self) -> None:
         """Send the last report; wait for it, up to a limit."""
         self._over.set()
-        if self._thread.is_alive() and not orchestration.lost():
+        if self._thread.is_alive() and not orchestration.is_unreachable():
             self._thread.join(STOP_LIMIT_S if stopping.requested() else END_LIMIT_S)
 
     def _report_until_end(self) -> None:
@@ -208,7 +208,7 @@ class _Page:
                 try:
                     report(client)
                 except TransportError as error:
-                    orchestration.lose(orchestration.reason_of(error))
+                    orchestration.report_unreachable(orchestration.reason_of(error))
                     return
                 except Exception:
                     continue
@@ -220,7 +220,7 @@ class _Page:
         except Exception as error:
             self._misses += 1
             if self._misses == LOST_AFTER:
-                orchestration.lose(orchestration.reason_of(error))
+                orchestration.report_unreachable(orchestration.reason_of(error))
             return False
         self._misses = 0
         return True

@@ -1,6 +1,6 @@
 """One session at a rig: locks, recovery after a crash, one trial after the other, the trial gate.
 
-`run_session` opens a session: it holds the store and the rig, cleans up what a crash left, and
+`open_session` opens a session: it holds the store and the rig, cleans up what a crash left, and
 builds the rig. `Session` takes trials and commits the good ones; `TrialGate` decides between two
 trials whether the next one may begin. None of them knows Prefect: `flows.collect` decides in what
 batches trials are taken. The store is the only record of progress, so a session may die at any
@@ -62,7 +62,7 @@ class WindowOver(CampaignStopped):
 
 
 @dataclass(frozen=True)
-class RunSession:
+class OpenSession:
     """An open session and its work.
 
     Attributes:
@@ -77,7 +77,7 @@ class RunSession:
 
 
 @contextmanager
-def run_session(run_request: RunRequest) -> Iterator[RunSession]:
+def open_session(run_request: RunRequest) -> Iterator[OpenSession]:
     """Open a session for a collection; the rig is closed when the block ends.
 
     Raises:
@@ -101,7 +101,7 @@ def run_session(run_request: RunRequest) -> Iterator[RunSession]:
             )
             session.gate, gate.fresh_start = gate, session.fresh_start
             try:
-                yield RunSession(session, gate, trials, left_out)
+                yield OpenSession(session, gate, trials, left_out)
             finally:
                 rig.close()
 
@@ -222,9 +222,9 @@ class Session:
 
     def _warm_and_zero(self, trial: Trial) -> None:
         """Warm up the skin and find depth zero, unless that is done."""
-        upkeep = self.plan.protocol.collection.maintenance
-        if upkeep.warm_up is not None and not self._warm:
-            warm_up = upkeep.warm_up
+        maintenance = self.plan.protocol.collection.maintenance
+        if maintenance.warm_up is not None and not self._warm:
+            warm_up = maintenance.warm_up
             self.rig.press(
                 float(warm_up.depth),
                 float(warm_up.speed),
@@ -232,11 +232,13 @@ class Session:
                 warm_up.presses,
             )
             self._warm = True
-        if upkeep.rezero is not None:
+        if maintenance.rezero is not None:
             slot = self.plan.rezero_task(trial).slot
             if slot != self._zero_slot:
                 seed = hash_integer(self.plan.protocol.collection.seed, "rezero", slot)
-                self.rig.touch_off(float(upkeep.rezero.speed), float(upkeep.rezero.search), seed)
+                self.rig.touch_off(
+                    float(maintenance.rezero.speed), float(maintenance.rezero.search), seed
+                )
                 self._zero_slot = slot
 
     def _mounted(self, trial: Trial) -> bool:
@@ -437,8 +439,8 @@ class TrialGate:
             CampaignStopped: the disk has no room for it, or a pause was not ended in time.
             WindowOver: the trial does not fit into the window.
         """
-        if self._look():
-            self._stand_still(trial)
+        if self._process_requests():
+            self._wait_while_paused(trial)
         if trial.id in self._skipped:
             return False
         self._check_window(trial)
@@ -457,7 +459,7 @@ class TrialGate:
 
     def more(self) -> list[Trial]:
         """Return pending trials that were asked for again meanwhile, in the plan's order."""
-        self._look()
+        self._process_requests()
         retakes, self._retakes = self._retakes, set()
         if not retakes:
             return []
@@ -465,7 +467,7 @@ class TrialGate:
             t for t in pending_trials(self._run_request.plan, self._campaign) if t.id in retakes
         ]
 
-    def _look(self) -> Request | None:
+    def _process_requests(self) -> Request | None:
         """Carry out new requests; return the one by which the store is paused, if it is."""
         names = self._names()
         if names != self._seen:
@@ -502,14 +504,14 @@ class TrialGate:
                 f"{trial.id}; the next collection continues"
             )
 
-    def _stand_still(self, trial: Trial) -> None:
+    def _wait_while_paused(self, trial: Trial) -> None:
         """Wait until the pause is over."""
         console.say(
             f"paused before {trial.id} ({self._paused}); `sliplab resume {self._store.folder}` "
             "goes on"
         )
         waited = 0.0
-        while request := self._look():
+        while request := self._process_requests():
             self._check_window(trial)
             if waited >= PAUSE_LIMIT_S:
                 raise CampaignStopped(

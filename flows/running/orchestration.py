@@ -1,7 +1,7 @@
 """Prefect as this project runs it: embedded by default, its home in the store, no telemetry.
 
-`prepare` must run before Prefect is imported, because Prefect reads its settings then. A server
-that the user names with PREFECT_API_URL is used instead of the embedded one.
+`configure_prefect` must run before Prefect is imported, for Prefect reads its settings then. A
+server that the user names with PREFECT_API_URL is used instead of the embedded one.
 
 No campaign waits for its server (docs/decisions/0095). Prefect's engine calls it in the flow's own
 thread, when a run begins and when it ends; `ServerLink` gives each of these requests a limit. A run
@@ -77,7 +77,7 @@ class Pickled(Opaque[T]):
         return type(self), (self.content,)
 
 
-def prepare(store: Path) -> None:
+def configure_prefect(store: Path) -> None:
     """Point Prefect at the store's own home, unless the user has set one; the store must exist."""
     global _store
     _store = store.resolve()
@@ -98,7 +98,7 @@ def _ask_loopback_directly() -> None:
     os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(names)
 
 
-def begin() -> None:
+def start_server() -> None:
     """Start the embedded server, if a flow will need it, and go on without waiting for it."""
     if "PREFECT_API_URL" not in os.environ:
         embedded()
@@ -122,7 +122,7 @@ def embedded() -> EmbeddedServer:
     return _servers[home]
 
 
-def private() -> bool:
+def uses_private_server() -> bool:
     """Return True if the server is this program's own, with no page, or there is none."""
     from prefect.settings import PREFECT_API_URL
 
@@ -203,12 +203,12 @@ class _NotSent(Exception):
     """A request was not sent, because the one before it failed."""
 
 
-def lost() -> bool:
+def is_unreachable() -> bool:
     """Return True if the server of the flow that runs now, or ran last, did not answer."""
     return _link is not None and _link.server in _lost_servers
 
 
-def lose(reason: str) -> None:
+def report_unreachable(reason: str) -> None:
     """Say that the server of the flow that runs now does not answer."""
     if _link is not None:
         _link.lose(reason)
@@ -248,15 +248,15 @@ class _Work:
 
     def __init__(self, do: Callable[[Any], Any], link: ServerLink) -> None:
         self._do, self._link = do, link
-        self.began: Callable[[], None] = lambda: None
-        self.begun = False
+        self.on_start: Callable[[], None] = lambda: None
+        self.started = False
         self.result: Any = None
         self.error: BaseException | None = None
 
     def do(self, argument: Any) -> Any:
         """Do it, and keep its result or its error."""
-        self.begun = True
-        self.began()
+        self.started = True
+        self.on_start()
         try:
             self.result = self._do(argument)
         except BaseException as error:
@@ -300,7 +300,7 @@ def run(flow: Any, argument: Opaque[Any], cluster: Cluster | None = None) -> Any
             stack.enter_context(temporary_settings(updates={**limited_settings(), **own}))
             client = stack.enter_context(link.client())
             if _store is not None:
-                run_records.close_dead(_store, link.server, client)
+                run_records.close_killed_runs(_store, link.server, client)
             flow_run = client.create_flow_run(flow)
         except Exception as error:
             if cluster is not None:
@@ -325,7 +325,7 @@ def _reported(
 
     store, run_id = _store, str(flow_run.id)
     if store is not None:
-        work.began = lambda: run_records.begin(store, run_id, flow.name, link.server)
+        work.on_start = lambda: run_records.begin(store, run_id, flow.name, link.server)
     reported_flow: Any = Flow(
         do,
         name=flow.name,
@@ -341,7 +341,7 @@ def _reported(
         run_flow(reported_flow, flow_run=flow_run, parameters={"argument": argument})
         delivered = True
     except Exception as error:
-        if not work.begun:
+        if not work.started:
             link.lose(error)
             with suppress(BaseException):  # it is kept, and raised below
                 _without_server(work, argument)
@@ -350,9 +350,9 @@ def _reported(
     except BaseException as error:  # Ctrl-C, during the work or while its end was reported
         interrupted = error
         delivered = error is work.error
-    if store is not None and work.begun:
+    if store is not None and work.started:
         if not delivered:
-            run_records.owe(store, run_id, *work.end)
+            run_records.record_undelivered_end(store, run_id, *work.end)
         run_records.end(store, run_id, *work.end, "flow")
     if work.error is not None:
         raise work.error
@@ -394,7 +394,7 @@ def close() -> bool:
 
     # it says as a warning how much it has left to send
     logging.getLogger(EventsWorker.__name__).setLevel(logging.ERROR)
-    limit_s = LOST_S if lost() else END_S
+    limit_s = LOST_S if is_unreachable() else END_S
     waited: Any = EventsWorker.drain_all(timeout=limit_s, at_exit=False)
     _, left = waited
     if left:

@@ -72,8 +72,8 @@ def end(store: Path, run: str, state: str, message: str, by: str) -> bool:
     return write_new_json(folder / f"{run}.end.json", said)
 
 
-def owe(store: Path, run: str, state: str, message: str) -> None:
-    """Keep how a flow run ended for a server that did not answer; `close_dead` reports it."""
+def record_undelivered_end(store: Path, run: str, state: str, message: str) -> None:
+    """Keep an end that the server did not take; `close_killed_runs` reports it."""
     said = {"state": state, "message": message, "when": now()}
     write_new_json(_folder(store) / f"{run}.owed.json", said)
 
@@ -107,7 +107,7 @@ def open_runs(store: Path) -> list[Json]:
     return found
 
 
-def close_dead(store: Path, server: str, client: Any = None) -> list[Json]:
+def close_killed_runs(store: Path, server: str, client: Any = None) -> list[Json]:
     """Close what killed processes of this machine left open on `server`, and report owed ends.
 
     Prefect gets the report first: a program that dies in between does both again.

@@ -69,7 +69,7 @@ async def watch(page: PageServer | None, store: Path, server: str, stopped: asyn
             if lost:
                 console.say("Prefect's server answers again")
                 with suppress(Exception):  # the next start does it again
-                    await asyncio.to_thread(run_records.close_dead, store, server)
+                    await asyncio.to_thread(run_records.close_killed_runs, store, server)
             misses, lost = 0, False
             continue
         misses += 1

@@ -182,7 +182,9 @@ def _carry_out(run_id: str, flow_name: str) -> None:
         except Exception as error:
             link.lose(error)
             if (kept := run_records.end_of(here.folder, run_id)) is not None:
-                run_records.owe(here.folder, run_id, kept["state"], kept["message"])
+                run_records.record_undelivered_end(
+                    here.folder, run_id, kept["state"], kept["message"]
+                )
     if not orchestration.close():
         os._exit(0)
 

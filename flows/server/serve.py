@@ -63,7 +63,7 @@ def serve(
         protocols = _protocols(folders, schedules)
         here = Service(str(store.folder.resolve()), rig, name, server, os.getpid(), protocols)
         here.export_environment()
-        for item in run_records.close_dead(store.folder, server):
+        for item in run_records.close_killed_runs(store.folder, server):
             console.say(f"closed: {item['flow']} {item['run']}, whose process was killed")
         asyncio.run(_serve(here, schedules, url, page, poll_s))
 

@@ -38,7 +38,7 @@ RETRACT_SPEED_MM_S = 10.0
 TAIL_S = 0.1
 """Time for which cameras are read after the last pulse, unless a rig says otherwise."""
 _MOVE_GRACE_S = 10.0
-_INTERRUPTIONS = 10
+_STOP_RETRIES = 10
 """Retries of a stop that was interrupted."""
 
 
@@ -98,7 +98,7 @@ class Rig:
     ending: tuple[Callable[[], None], ...] = ()
     _reported: str = field(default="", init=False)
     """Failure of a stop that `safely` has raised already."""
-    _hangs: bool = field(default=False, init=False)
+    _plate_uncaught: bool = field(default=False, init=False)
     """The plate was let go and not caught: it hangs on the sensor, or falls."""
 
     def connect(self) -> None:
@@ -224,7 +224,9 @@ class Rig:
             self.begin_trial(start, seed)
             self.events.start()
             self.wait(QUIET_S)
-            zero = self._creep(search_mm, speed_mm_s, RateTouch(self.central_events()))
+            zero = self._approach_until_touch(
+                search_mm, speed_mm_s, RateTouch(self.central_events())
+            )
             self.events.stop()
             self.move(Move("release", start, RETRACT_SPEED_MM_S), self.position(), None)
         self.plate_frame = self.plate_frame.with_zero(zero)
@@ -241,7 +243,7 @@ class Rig:
             self.wait(seconds, sink)
             self.stop_streams(sink, False)
 
-    def _creep(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
+    def _approach_until_touch(self, search_mm: float, speed_mm_s: float, rate: RateTouch) -> float:
         target = Position(0.0, 0.0, search_mm)
         self.arm.start([Segment(self.plate_frame.pose(target), speed_mm_s)])
         while not self.arm.progress().done:
@@ -278,9 +280,9 @@ class Rig:
         if isinstance(step, PlateStep):
             if self.plate is None:
                 raise RigError("plate", f"this rig has no sliding plate to {step.action}")
-            self._hangs = step.action == "release" or self._hangs
+            self._plate_uncaught = step.action == "release" or self._plate_uncaught
             self.plate.act(step.action, step.seconds)
-            self._hangs = step.action == "release"
+            self._plate_uncaught = step.action == "release"
         self.wait(step.seconds, sink)
         return StepTimes(index, step.phase, start, self.arm.now_ns())
 
@@ -404,14 +406,14 @@ class Rig:
             if fault is not None and str(fault) != str(error):
                 if isinstance(error, RigError) and error.device == "arm":
                     fault = ArmFault("arm", f"{_text(error)}. It {_text(fault)}")
-                raise self._plate_noted(fault) from error
-            if self._hangs and isinstance(error, RigError):
-                raise self._plate_noted(error) from error
+                raise self._with_plate_warning(fault) from error
+            if self._plate_uncaught and isinstance(error, RigError):
+                raise self._with_plate_warning(error) from error
             raise
 
-    def _plate_noted(self, error: RigError) -> RigError:
+    def _with_plate_warning(self, error: RigError) -> RigError:
         """The same error, with a word on a plate that nobody has caught."""
-        if not self._hangs:
+        if not self._plate_uncaught:
             return error
         text = f"{_text(error)}. The plate was let go and nobody has caught it: catch it first"
         return ArmFault("arm", text) if error.device == "arm" else RigError(error.device, text)
@@ -421,7 +423,7 @@ class Rig:
 
         A second Ctrl-C must not interrupt the stop.
         """
-        for _ in range(_INTERRUPTIONS):
+        for _ in range(_STOP_RETRIES):
             try:
                 self.arm.stop()
             except KeyboardInterrupt:

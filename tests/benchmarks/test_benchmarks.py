@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks import kept, measure
-from benchmarks.trials import run_session
+from benchmarks.trials import open_session
 
 TINY: dict[str, dict[str, Any]] = {
     "storage": {"events": 30_000, "frames": 3, "size": 96, "runs": 1},
@@ -156,7 +156,7 @@ def test_an_unknown_name_is_refused(
 
 
 def test_a_stretch_takes_whole_trials_and_knows_how_long_they_are() -> None:
-    with run_session("rehearsal", 2, "pilot") as work:
+    with open_session("rehearsal", 2, "pilot") as work:
         trial = work.trials[0]
         assert work.take(1) == work.session.plan.seconds(trial)
         assert work.session.taken == 1

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from sliplab.flows.collecting.session import run_session
+from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.run_request import RunRequest, make_request
 from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store
@@ -52,7 +52,7 @@ def run_request(folder: Path, trials: int, video: bool = False) -> RunRequest:
 
 def collect(wanted: RunRequest) -> None:
     """Take what the store lacks, as `sliplab collect` does below Prefect."""
-    with run_session(wanted) as work:
+    with open_session(wanted) as work:
         work.session.rig.connect()
         work.session.take(work.trials)
 

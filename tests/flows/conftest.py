@@ -20,12 +20,12 @@ os.environ["PREFECT_HOME"] = _HOME
 from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
 from sliplab.flows.report import report_folder  # noqa: E402
-from sliplab.flows.running.orchestration import prepare  # noqa: E402
+from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
 from sliplab.flows.study import Outcome, study  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402
 from sliplab.storage.trials.store import Store  # noqa: E402
 
-prepare(Path(_HOME))
+configure_prefect(Path(_HOME))
 
 
 def tiny() -> dict[str, Any]:

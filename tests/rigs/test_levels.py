@@ -64,11 +64,11 @@ def test_a_rough_scene_hides_even_large_deflection(rig: RigFile) -> None:
 
 
 def test_what_the_rig_file_says_is_done(rig: RigFile) -> None:
-    told = changed(rig, level="L1")
-    choice = choose_level(told, plan_of("pilot"))
-    assert (choice.level, "told so" in choice.reason) == (1, True)
+    stated = changed(rig, level="L1")
+    choice = choose_level(stated, plan_of("pilot"))
+    assert (choice.level, "set by the rig file (mock.scene.level)" in choice.reason) == (1, True)
     assert with_level(rig, plan_of("pilot")).mock.scene.level == "L3"
-    assert with_level(told, plan_of("pilot")).mock.scene.level == "L1"
+    assert with_level(stated, plan_of("pilot")).mock.scene.level == "L1"
 
 
 def test_the_expected_slip_is_that_of_the_closed_forms(rig: RigFile) -> None:

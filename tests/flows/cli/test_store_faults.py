@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sliplab.flows.__main__ import main
-from sliplab.flows.collecting.session import run_session
+from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.campaign_trials import pending_trials
 from sliplab.flows.planning.run_request import make_request
 from sliplab.storage.files import read_json, write_json
@@ -97,7 +97,7 @@ def test_a_second_writer_is_refused_and_told_who_is_first(whole: Path, sliplab: 
     with exclusive(whole / "store" / ".lock", "the store"):
         with (
             pytest.raises(Locked, match=r"in use by another program .*pid"),
-            run_session(run_request),
+            open_session(run_request),
         ):
             raise AssertionError("two writers")
         for command in (["verify", "--quarantine"], ["migrate"]):
@@ -121,7 +121,7 @@ def test_an_older_store_is_brought_forward_by_hand_and_by_collecting(
             assert (code, found["format"], found["from"]) == (0, FORMAT, [1])
             assert Path(found["copies"][0], "store.json").is_file()
         else:
-            with run_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
+            with open_session(make_request(whole / "p.yaml", whole / "rig.yaml", whole / "store")):
                 assert Store.open(whole / "store").format == FORMAT
     code, found, _ = sliplab("migrate", whole / "store", "--json")
     assert found is not None

@@ -10,7 +10,7 @@ import pytest
 
 from sliplab.flows.calibrating.measurement import CalibrationSession, Finding, Measurement
 from sliplab.flows.cli.rigs import _about
-from sliplab.flows.collecting.session import run_session
+from sliplab.flows.collecting.session import open_session
 from sliplab.flows.planning.preflight import check_devices
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.protocols import load_plan
@@ -56,7 +56,7 @@ def test_collect_is_refused(tmp_path: Path) -> None:
             Locked,
             match=r"the arm at .* is in use .*pid .* for the store /data/other",
         ),
-        run_session(run_request(tmp_path)),
+        open_session(run_request(tmp_path)),
     ):
         pass
     # and takes the store's lock along: nothing stands in the way of another rig

@@ -11,7 +11,7 @@ import pytest
 
 from sliplab.flows.collecting import session as session_module
 from sliplab.flows.collecting.requests import CampaignStopped, carry_out, refuse_paused
-from sliplab.flows.collecting.session import Session, TrialGate, WindowOver, run_session
+from sliplab.flows.collecting.session import Session, TrialGate, WindowOver, open_session
 from sliplab.flows.planning.campaign_trials import excluded_trials, pending_trials
 from sliplab.flows.planning.run_request import RunRequest, describe_campaign, make_request
 from sliplab.flows.running import stopping
@@ -146,7 +146,7 @@ def test_an_old_stop_stops_nothing_that_begins_later(tmp_path: Path) -> None:
     run_request = make_request(
         tmp_path / "a" / "p.yaml", tmp_path / "a" / "rig.yaml", tmp_path / "a" / "store"
     )
-    with run_session(run_request) as work_now:
+    with open_session(run_request) as work_now:
         work_now.session.rig.connect()
         work_now.session.take(work_now.trials)
         assert work_now.session.taken == 3
@@ -232,7 +232,7 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
     wanted = crash.run_request(tmp_path, 4)
 
     def night() -> None:
-        with run_session(replace(wanted, until=500.0)) as work:
+        with open_session(replace(wanted, until=500.0)) as work:
             work.gate.clock = after(3)
             work.session.rig.connect()
             work.session.take(work.trials)
@@ -250,7 +250,7 @@ def test_a_window_ends_between_trials_and_nothing_is_lost(tmp_path: Path) -> Non
 
 def test_a_pause_ends_with_its_window(tmp_path: Path) -> None:
     wanted = replace(crash.run_request(tmp_path, 2), until=500.0)
-    with run_session(wanted) as work:
+    with open_session(wanted) as work:
         control.ask(Store.open(wanted.store), "pause")
         work.gate.clock, work.gate.wait = after(3), lambda seconds: None
         with pytest.raises(WindowOver):

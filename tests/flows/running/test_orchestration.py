@@ -86,10 +86,10 @@ def test_a_lost_server_gets_one_limited_request_tried_twice(
         with pytest.raises(orchestration._NotSent):  # "failed" must not follow a lost "completed"
             client.send(end)
     assert limits == [BEGIN_S, BEGIN_S, LOST_S, END_S, LOST_S]
-    assert not orchestration.lost()
+    assert not orchestration.is_unreachable()
     link.lose("nothing came")
     link.lose("nothing came")
-    assert orchestration.lost()
+    assert orchestration.is_unreachable()
 
 
 def _tables(path: Path) -> set[str]:

@@ -224,13 +224,13 @@ def test_runs_of_killed_processes_are_closed_at_the_next_start(
         run_records.end(service.folder, runs[3], "COMPLETED", "", "flow")
         client.set_flow_run_state(runs[3], Completed(), force=True)
 
-        closed = run_records.close_dead(service.folder, "embedded")
+        closed = run_records.close_killed_runs(service.folder, "embedded")
         states = [client.read_flow_run(run).state for run in runs]
     assert [item["run"] for item in closed] == runs[:1]  # on this machine, and gone
     assert [state.type.value for state in states] == ["CRASHED", *["RUNNING"] * 2, "COMPLETED"]
     assert f"its process was killed (pid {gone.pid}" in states[0].message
     assert read_json(folder / f"{runs[0]}.end.json")["by"] == "next start"
-    assert run_records.close_dead(service.folder, "embedded") == []
+    assert run_records.close_killed_runs(service.folder, "embedded") == []
     assert not run_records.end(service.folder, runs[0], "COMPLETED", "", "flow")  # the first stands
 
 
