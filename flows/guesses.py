@@ -143,7 +143,7 @@ class Guesses:
 
 
 def _windows_by_trial(judged: Judged, with_campaign: bool) -> dict[str, list[int]]:
-    """Return by trial its windows that were called rightly, and all of its windows."""
+    """Return by trial its windows that were classified correctly, and all of its windows."""
     samples = judged.samples
     names = [f"{c}/{trial}" if with_campaign else trial for c, trial in samples.trials]
     hits = window_groups.strict_hits(judged.counts, samples.y)

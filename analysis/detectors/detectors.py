@@ -3,7 +3,7 @@
 A detector says how strongly everything up to a window speaks for slip having begun; a threshold
 on that makes it a detection. So detectors of any kind can be set to the same rate of false alarms
 (`detectors.detector_comparison`) and then compared by how late they are. No other comparison
-is fair: each can be made as quick as one likes by letting it cry slip more often.
+is fair: each can be made as quick as one likes by allowing it more false alarms.
 """
 
 from __future__ import annotations

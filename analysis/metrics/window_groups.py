@@ -107,7 +107,7 @@ def by_tenth(
     """Recall of each class by tenths of its phase, ten rows a class.
 
     Args:
-        hits: (n,), 1 where a window was called rightly.
+        hits: (n,), 1 where a window was classified correctly.
         fraction: (n,), where in its class's phase the middle of the window lies, 0..1; windows
             outside, or NaN, are left out.
     """

@@ -194,6 +194,8 @@ def failure_section(folder: Path, trials: Sequence[TrialOutcome]) -> FailureSect
             command += f" --campaign {shlex.quote(row.campaign)}"
         latencies = (row.latency_incipient_ms, row.latency_gross_ms, row.lead_ms)
         wrong = f"{row.campaign}: {', '.join(_wrong(row))}"
+        if row.late_gross_ms is not None:
+            wrong += f", {row.late_gross_ms:.0f} ms after it ended"
         rows.append([command, wrong, *(number(value, 0) for value in latencies)])
     columns = (
         "look at the trial", "what went wrong", "incipient latency (ms)", "gross latency (ms)",
@@ -207,12 +209,12 @@ def failure_section(folder: Path, trials: Sequence[TrialOutcome]) -> FailureSect
 
 
 def _wrong(row: TrialOutcome) -> list[str]:
-    """Return what went wrong in a trial, in words."""
+    """Return the causes for which a trial failed, in words that trials share."""
     if row.outcome == "without_onsets":
         return ["no onset in the label, cannot be judged"]
     found = [f"incipient {WORDS[row.outcome]}"] if row.outcome in _FAILED else []
     if row.gross == "late":
-        found.append(f"gross late, {row.late_gross_ms:.0f} ms after it ended")
+        found.append("gross late")
     elif row.gross in _FAILED:
         found.append(f"gross {WORDS[row.gross]}")
     return found

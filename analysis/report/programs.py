@@ -130,7 +130,7 @@ def skin_section(
     if groups:
         drawn = [item for of in groups.values() for item in of]
         line = None if strict is None else (strict, "this network, its own skin")
-        svg = shares(groups, "windows called rightly (%)", simulated=simulated, line=line)
+        svg = shares(groups, "windows classified correctly (%)", simulated=simulated, line=line)
         figure = Figure(svg, name="skins", data=share_data(drawn))
     columns = ("left out, or skin", "trials", "windows", "right", "95 %", "levels that were seen")
     return SkinSection(command, figure, Table(columns, rows))

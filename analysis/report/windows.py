@@ -189,7 +189,9 @@ def _factors(kinematic: Kinematic, simulated: bool) -> Figure:
     line = None if strict is None else (strict, "all test windows")
     named = [replace(it, name=f"{factor} {it.name}") for factor, of in groups.items() for it in of]
     return Figure(
-        intervals.shares(groups, "windows called rightly (%)", simulated=simulated, line=line),
+        intervals.shares(
+            groups, "windows classified correctly (%)", simulated=simulated, line=line
+        ),
         name="accuracy-by-factor",
         data=share_data(named),
     )

@@ -215,6 +215,17 @@ def test_failures_have_a_command_that_shows_them(store: Store) -> None:
     many = failure_section(store.folder, [row] * (MOST_FAILURES + 1))
     assert len(many.table.rows) == MOST_FAILURES
     assert "summary.json" in render_section(many, simulated=True)[1]
+    late = [
+        row.model_copy(
+            update={"outcome": "detected_first", "gross": "late", "late_gross_ms": late_ms}
+        )
+        for late_ms in (359.0, 579.4)
+    ]
+    grouped = failure_section(store.folder, late)  # one cause, each by how much in its own row
+    assert grouped.causes == [("gross late", 2)]
+    assert [line[1].split(", ")[1] for line in grouped.table.rows] == [
+        "359 ms after it ended", "579 ms after it ended"
+    ]  # fmt: skip
     none = render_section(failure_section(store.folder, [fine]), simulated=True)[1]
     assert "0 of 1 judged trials failed in some way." in none
     assert "<table" not in none

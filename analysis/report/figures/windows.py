@@ -56,7 +56,7 @@ def confusion(matrix: Array, *, simulated: bool) -> str:
             colour = "white" if share[i, j] > 0.6 else "black"
             axes.text(j, i, text, ha="center", va="center", fontsize=8, color=colour)
         said = [*CLASS_WORDS, "undecided"]
-        name_cells(axes, CLASS_WORDS, said, "true class", "class said by the network")
+        name_cells(axes, CLASS_WORDS, said, "true class", "predicted class")
         return svg_text(figure, simulated)
 
 
@@ -100,7 +100,7 @@ def reliability(rows: Sequence[LeadShare], *, simulated: bool) -> str:
         low_high = np.array(spans, np.float64).reshape(-1, 2)
         off = 100 * np.stack([shares - low_high[:, 0], low_high[:, 1] - shares]).clip(0)
         top.errorbar(places, 100 * shares, off, fmt="o", color=BLUE, ms=4, lw=1, capsize=2)
-        top.set_ylabel("windows called\nrightly (%)")
+        top.set_ylabel("windows classified\ncorrectly (%)")
         top.set_ylim(-3, 103)
         low.bar(places, [row.n for row in rows], color=GREY, width=0.7)
         low.set_ylabel("windows")

@@ -41,9 +41,9 @@ DRAWN: dict[str, tuple[Callable[[bool], str], tuple[str, ...]]] = {
     "shares": (
         lambda simulated: shares(
             {"depth": [Share("2.4 mm", 0.9, 0.85, 0.95), Share("2.6 mm", None, None, None)]},
-            "windows called rightly (%)", simulated=simulated, line=(0.92, "all"),
+            "windows classified correctly (%)", simulated=simulated, line=(0.92, "all"),
         ),
-        ("windows called rightly (%)", "depth", "2.4 mm", "2.6 mm", "all"),
+        ("windows classified correctly (%)", "depth", "2.4 mm", "2.6 mm", "all"),
     ),
     "differences": (
         lambda simulated: differences([("lead", 12.0, 3.0, 20.0)], "ms", simulated=simulated),
