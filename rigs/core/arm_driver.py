@@ -7,6 +7,7 @@ says of a path while it runs, and what becomes of one that fails, is the same fo
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -57,10 +58,11 @@ class Run:
             self.thread.join(within_s)
 
 
-class ArmDriver:
+class ArmDriver(ABC):
     """A base for drivers of arms that follow a path in a thread of their own.
 
-    A subclass has `state`, and follows a path in `_follow_path`.
+    A subclass has `state`, and follows a path in `_follow_path` and gives one up in
+    `_give_up`.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -70,9 +72,9 @@ class ArmDriver:
         """Reason for which the arm cannot be reached; None while it can."""
         self._run = Run((), done=True)
 
+    @abstractmethod
     def state(self) -> ArmState:
         """Return the arm's state; never waits."""
-        raise NotImplementedError
 
     def progress(self) -> Progress:
         """Return how far the path has come.
@@ -106,17 +108,18 @@ class ArmDriver:
         finally:
             run.done = True
             self._path_is_over()
-            self._stream.wake()
 
+    @abstractmethod
     def _follow_path(self, run: Run) -> None:
         """Wait for each segment to end, and note it in `run.finished`. May raise anything."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _give_up(self) -> None:
         """Stop what nobody follows any more."""
 
     def _path_is_over(self) -> None:
-        """Take note that a path's thread has come to its end."""
+        """Wake whoever waits for poses: the path's thread has come to its end."""
+        self._stream.wake()
 
     def _refuse(self, path: Sequence[Segment], moving: bool) -> None:
         """Raise RigError for an empty path, or for one that comes too early."""

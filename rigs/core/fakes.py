@@ -10,6 +10,7 @@ import asyncio
 import math
 import socket
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -214,7 +215,7 @@ class FaultPlan:
             self._happen(fault.kind)
 
 
-class FakeController:
+class FakeController(ABC):
     """A base for fakes of arm controllers: `start` opens the ports, `close` gives them back.
 
     Args:
@@ -242,21 +243,21 @@ class FakeController:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    @abstractmethod
     def start(self) -> None:
         """Open the ports and run. Raises OSError if one of them is taken."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """Cut every connection and give the ports back."""
-        raise NotImplementedError
 
+    @abstractmethod
     def happen(self, kind: Kind) -> None:
         """Make something go wrong now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def restore(self) -> None:
         """Put everything right, as a person would."""
-        raise NotImplementedError
 
     def pose(self) -> Pose:
         """Return where the tool centre point is now."""

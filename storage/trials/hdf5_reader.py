@@ -10,7 +10,6 @@ import os
 from bisect import bisect_left
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import h5py
@@ -195,12 +194,7 @@ class StreamReader:
     def __enter__(self) -> StreamReader:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def event_times(self) -> I64:

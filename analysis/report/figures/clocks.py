@@ -49,7 +49,7 @@ def uncertainty_by_trial(
         devices: name, with its grade, to numbers of trials and microseconds.
         starts: the number of each campaign's first trial.
     """
-    marks = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"))
+    marks = zip(COLOURS.values(), ("o", "s", "^"), strict=True)  # devices come in this order
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(WIDTH, 2.8))
         for (name, (numbers, values)), (colour, mark) in zip(devices.items(), marks, strict=False):

@@ -573,6 +573,7 @@ class AbbArm(ArmDriver):
     def _path_is_over(self) -> None:
         if self._has_stopped(self._began_s):
             self._may_move = False
+        super()._path_is_over()
 
     def _why_given_up(self) -> str | None:
         """Return why the path is to be given up, if it is: no poses, or another speed."""

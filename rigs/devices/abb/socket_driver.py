@@ -213,6 +213,9 @@ class AbbSocketArm(ArmDriver):
         if link is not None:
             link.close()
 
+    def _give_up(self) -> None:
+        """Send nothing more: the arm stands still at the end of its piece."""
+
     def _follow_path(self, run: Run) -> None:
         """Send piece after piece."""
         at = self._leaves_from
