@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,18 +13,17 @@ from sliplab.analysis.campaigns import Collected, training_campaigns
 from sliplab.analysis.labels.reviewed import Labels
 from sliplab.analysis.networks import gradients, model_file, training
 from sliplab.analysis.networks.models import Model, begun, comparison_models, wanted_models
-from sliplab.analysis.networks.training import EpochRecord
-from sliplab.analysis.report.figures.windows import training_curves
 from sliplab.analysis.trial_work import Done, EachTrial, Make, TrialWork, in_order
 from sliplab.analysis.windows.dataset import SampleSet
 from sliplab.analysis.windows.sample_sets import load_samples
 from sliplab.flows.label import report_states
-from sliplab.flows.running import console, orchestration
+from sliplab.flows.running import console
 from sliplab.flows.running.orchestration import Opaque, run
 from sliplab.flows.running.parallel_map import each_trial
 from sliplab.flows.running.run_records import timed
+from sliplab.flows.ui.train_view import training_progress
 from sliplab.protocols.errors import InputError
-from sliplab.storage.files import write_bytes, write_json, write_text
+from sliplab.storage.files import write_bytes, write_json
 from sliplab.storage.schema.model import ModelSamples, TrainedModel, ValidationAccuracy
 from sliplab.storage.trials.store import Store, StoreError
 
@@ -41,7 +37,7 @@ def train_one(job: Opaque[tuple[Model, SampleSet, SampleSet, bool]]) -> int:
     model, train, validation, simulated = job.content
     settings = model.settings
     model.path.parent.mkdir(parents=True, exist_ok=True)
-    with _progress(model, settings.training.epochs, simulated) as progress:
+    with training_progress(model, settings.training.epochs, simulated) as progress:
         fitted = training.fit(
             train.windows,
             train.y,
@@ -138,63 +134,6 @@ def _check_device(item: Collected) -> None:
             device,
             f"there is none here; must be one of {', '.join(there)}",
         )
-
-
-@contextmanager
-def _progress(model: Model, epochs: int, simulated: bool) -> Iterator[_Progress]:
-    """Show the training of a model while the block runs."""
-    with console.bar(f"train {model.title} (epochs)", epochs) as bar:
-        yield _Progress(model, bar, simulated)
-
-
-class _Progress:
-    """Progress display of a training: a bar, and a plot drawn after each epoch.
-
-    The plot is in the store and on Prefect's page. Where the page cannot be reached, the store
-    has it.
-    """
-
-    def __init__(self, model: Model, bar: Any, simulated: bool) -> None:
-        self._model, self._bar, self._simulated = model, bar, simulated
-        self._records: list[dict[str, Any]] = []
-        self._best: EpochRecord | None = None
-        self._artifact: Any = None
-
-    def epoch(self, record: EpochRecord) -> None:
-        """An epoch is over."""
-        self._records.append(asdict(record))
-        if self._best is None or record.merit > self._best.merit:
-            self._best = record
-        self._bar.advance(1, f"loss {record.loss:.3f}, validation {record.val_strict:.3f} strict")
-        svg = training_curves(self._records, self._best.epoch, simulated=self._simulated)
-        write_text(self._model.curves_path, svg)
-        if not orchestration.uses_private_server():
-            with suppress(Exception):
-                self._show(svg)
-
-    def _show(self, svg: str) -> None:
-        """On the page of the flow run; made at the first epoch, changed after."""
-        from prefect.client.orchestration import get_client
-        from prefect.client.schemas.actions import ArtifactCreate, ArtifactUpdate
-        from prefect.context import get_run_context
-
-        data = "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
-        words = f"training curves of {self._model.title}, {len(self._records)} epochs"
-        with get_client(sync_client=True) as client:
-            if self._artifact is not None:
-                client.update_artifact(self._artifact, ArtifactUpdate(data=data, description=words))
-                return
-            run: Any = get_run_context()
-            made = client.create_artifact(
-                ArtifactCreate(
-                    key=f"train-{self._model.title.replace(' ', '-')}-curves",
-                    type="image",
-                    data=data,
-                    description=words,
-                    flow_run_id=run.task_run.flow_run_id,
-                )
-            )
-            self._artifact = made.id
 
 
 def sample_maker(store: Store, split: str, cluster: Cluster | None) -> EachTrial:
