@@ -9,7 +9,7 @@ faults.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
@@ -25,18 +25,14 @@ from sliplab.analysis.sweeps.scene_tradeoff import (
     compare_variants,
     variants,
 )
-from sliplab.analysis.sweeps.scene_windows import SceneWindows, look, pooled
-from sliplab.analysis.sweeps.sensitivity import Outcome
 from sliplab.protocols import Plan, Trial
 from sliplab.protocols.program import Move
 from sliplab.rigs.build import build_rig
 from sliplab.rigs.core.rig import Rig, TrialRun
 from sliplab.rigs.levels import HIGHEST, expected_onsets, slides_of
-from sliplab.rigs.mock.physics import springs_of
-from sliplab.rigs.mock.settings import Clocks, MockSettings, skin_of
+from sliplab.rigs.mock.settings import Clocks, skin_of
 from sliplab.rigs.rig_file import RigFile
 from sliplab.rigs.scene.onsets import retraction_onsets
-from sliplab.rigs.scene.slides import run_slide
 from sliplab.storage.streams import EventChunk, NullSink
 
 MOTION = frozenset({"slide", "retract"})
@@ -44,10 +40,6 @@ PERFECT = Clocks(
     arm_ppm=0, event_camera_ppm=0, frame_camera_ppm=0, sync_box_ppm=0, offset_h=0,
     pulse_jitter_us=0, frame_jitter_us=0,
 )  # fmt: skip
-EVENT_TRIALS = 2
-"""Trials of a sensitivity analysis that are run as a whole, for event rates."""
-STEP_MM = 0.05
-"""Step of the contact in a slide that is simulated by contact alone, mm."""
 _SMALL_PX = 32
 
 
@@ -220,70 +212,3 @@ def wall_seconds(job: VariantJob, rounds: int, advance: Callable[[], None]) -> d
             found[variant] = min(found[variant], timed(rig, job.plan, job.trial, seed))
             advance()
     return found
-
-
-@dataclass(frozen=True)
-class OutcomeJob:
-    """A setting of a sensitivity analysis.
-
-    Attributes:
-        known: an outcome that has the onsets of this one; None where they may differ.
-    """
-
-    rig: RigFile
-    plan: Plan
-    trials: Sequence[Trial]
-    other_seed: bool = False
-    known: Outcome | None = None
-
-
-def outcome(job: OutcomeJob, advance: Callable[[], None] | None = None) -> Outcome:
-    """Return onsets by contact alone, and event rates of whole runs of the first trials.
-
-    Args:
-        advance: called after each whole run.
-    """
-    rig, plan, analysis = job.rig, job.plan, job.plan.protocol.analysis
-    variant = Variant(HIGHEST, rig.scene.scene.step_ms, other_seed=job.other_seed)
-    seen: list[Seen] = []
-    counted: list[SceneWindows] = []
-    for trial in job.trials[:EVENT_TRIALS]:
-        seen.append(run(with_true_times(rig), plan, trial, variant.seed(trial)))
-        counted.append(look(seen[-1], analysis.windows, analysis.samples, trial.seed))
-        if advance is not None:
-            advance()
-    rates = pooled(counted)["events_per_s"]
-    if job.known is not None:
-        return Outcome(job.known.onsets_s, rates)
-    onsets = [_slide_onsets(rig.scene, plan, t, variant.seed(t)) for t in job.trials]
-    slides = [onset for onset in onsets if onset is not None]
-    # a falling plate has no contact-only run: its whole runs are taken
-    known = slides or [_seen_onsets(item) for item in seen]
-    return Outcome(np.array(known, np.float64).reshape(-1, 2), rates)
-
-
-def _slide_onsets(
-    mock: MockSettings, plan: Plan, trial: Trial, seed: int
-) -> tuple[float, float] | None:
-    """Return first slip and duration of incipient slip by contact alone, s; None: no slide."""
-    slides = slides_of(replace(plan, trials=(trial,)))
-    if not slides:
-        return None
-    (slide,) = slides
-    steps = plan.program(trial).steps
-    at = next(step.to for step in steps if isinstance(step, Move) and step.phase == "press")
-    to = next(step.to for step in steps if isinstance(step, Move) and step.phase == "slide")
-    done = run_slide(
-        springs_of(mock, skin_of(mock), seed), slide.depth_mm, slide.speed_mm_s,
-        math.degrees(math.atan2(to.y_mm - at.y_mm, to.x_mm - at.x_mm)),
-        length_mm=at.distance_mm(to), press_mm_s=slide.press_mm_s, settled_s=slide.settled_s,
-        step_mm=STEP_MM,
-    )  # fmt: skip
-    slipped = done.slipped_s
-    first = float(np.nanmin(slipped)) if np.isfinite(slipped).any() else math.nan
-    return first, float(slipped[0]) - first
-
-
-def _seen_onsets(seen: Seen) -> tuple[float, float]:
-    first, centre = (math.nan if slip is None else slip * 1e-9 for slip in seen.slips)
-    return first, centre - first

@@ -24,12 +24,12 @@ from sliplab.analysis.sweeps.scene_tradeoff import (
 from sliplab.flows import scene_runs
 from sliplab.flows.running import console, orchestration
 from sliplab.flows.running.cluster import connected
-from sliplab.flows.scene_runs import OutcomeJob, VariantJob, changed, closed_form, outcome
-from sliplab.protocols import Plan
+from sliplab.flows.scene_runs import VariantJob, changed, closed_form
+from sliplab.flows.scene_sensitivity import EVENT_TRIALS, measure_sensitivity
 from sliplab.protocols.errors import InputError
 from sliplab.protocols.plan import load_plan
-from sliplab.rigs.levels import at_level, choose_level, with_level
-from sliplab.rigs.rig_file import RigFile, check_plan, load_rig_file
+from sliplab.rigs.levels import at_level, choose_level
+from sliplab.rigs.rig_file import check_plan, load_rig_file
 from sliplab.storage.files import make_folder, write_json, write_text
 
 if TYPE_CHECKING:
@@ -37,11 +37,7 @@ if TYPE_CHECKING:
 
 ROUNDS = 2
 STEPS = (1, 2, 4, 8, 16, 32)
-CONTACT_TRIALS = 12
-"""Trials of a sensitivity analysis that onsets are taken from."""
 PAGE, NUMBERS, TABLE = "tradeoff.html", "tradeoff.json", "sensitivity.md"
-Each = Callable[..., list[Any]]
-"""Call a function on jobs, and ``done=`` after each; return all results in order."""
 
 
 def tradeoff_scene(
@@ -78,7 +74,7 @@ def tradeoff_scene(
     compared = len({*variants(families), REFERENCE}) + 1  # and another seed
     total = len(jobs) * (compared + ROUNDS * count)
     if sensitivity:
-        total += scene_runs.EVENT_TRIALS * (2 + 2 * len(assumed.CONTACT + assumed.CAMERA))
+        total += EVENT_TRIALS * (2 + 2 * len(assumed.CONTACT + assumed.CAMERA))
     if dask is not None:
         make_folder(folder)
         orchestration.configure_prefect(folder)
@@ -103,7 +99,7 @@ def tradeoff_scene(
                 families, wall_s, done, closed, plan.protocol.analysis.windows,
                 {"level": planned.name, "reason": planned.reason},
             ),
-            "left_out": _left_out(falls, sum(form is not None for form in closed), len(jobs)),
+            "left_out": page.left_out(falls, sum(form is not None for form in closed), len(jobs)),
         }  # fmt: skip
         if sensitivity:
             result["sensitivity"] = measure_sensitivity(rig, plan, bar.advance, each)
@@ -114,50 +110,6 @@ def tradeoff_scene(
         write_text(folder / TABLE, text)
     write_text(folder / PAGE, page.render(result))
     return result
-
-
-def _left_out(falls: bool, closed: int, trials: int) -> list[str]:
-    stated = []
-    if falls:
-        stated.append(
-            "Longer steps are left out: while a plate may fall the scene steps by a millisecond."
-        )
-    if closed < trials:
-        stated.append(
-            f"L0 is stated for {closed} of {trials} trials: a retraction that also goes sideways "
-            "has no closed form."
-        )
-    return stated
-
-
-def measure_sensitivity(
-    rig: RigFile, plan: Plan, advance: Callable[[], None], each: Each | None = None
-) -> dict[str, Any]:
-    """Return the change of onsets and event rates by each assumed number, as `sensitivity_table`.
-
-    Args:
-        advance: called after each whole run, or, with `each`, after a setting's runs.
-        each: makes the settings elsewhere.
-    """
-    rig = with_level(rig, plan)
-    trials = sample_trials(plan, CONTACT_TRIALS)
-    base = outcome(OutcomeJob(rig, plan, trials), advance)
-    names = assumed.CONTACT + assumed.CAMERA
-    values = {name: assumed.value_of(rig.scene, name) for name in names}
-    other_seed = assumed.Setting()
-    jobs = {other_seed: OutcomeJob(rig, plan, trials, other_seed=True)}
-    # without a rigid base, or something else that is switched off
-    for setting in assumed.lower_and_higher([name for name, value in values.items() if value]):
-        known = base if setting.parameter in assumed.CAMERA else None
-        other = changed(rig, setting.change(rig.scene))
-        jobs[setting] = OutcomeJob(other, plan, trials, known=known)
-    if each is None:
-        made = [outcome(job, advance) for job in jobs.values()]
-    else:
-        made = each(outcome, list(jobs.values()), done=advance)
-    outcomes = dict(zip(jobs, made, strict=True))
-    event_trials = min(scene_runs.EVENT_TRIALS, len(trials))
-    return assumed.sensitivity_table(values, base, outcomes, outcomes.pop(other_seed), event_trials)
 
 
 def everywhere(

@@ -6,6 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy.typing as npt
+
+from sliplab.analysis.detectors.predictions import trial_counts
+from sliplab.analysis.labels import label_errors
+from sliplab.analysis.networks import model_file
+from sliplab.analysis.networks.models import choose_model, wanted_models
 from sliplab.analysis.networks.training import Fitted
 from sliplab.analysis.report import clocks, windows
 from sliplab.analysis.report.campaign import collected_section, quality_section
@@ -30,8 +36,8 @@ from sliplab.analysis.report.programs import (
     tradeoff_section,
 )
 from sliplab.analysis.report.sensitivity import sensitivity_section
-from sliplab.analysis.report.summary import Sources
-from sliplab.analysis.report.trial import Example, output_section, trial_section
+from sliplab.analysis.report.sources import Sources
+from sliplab.analysis.report.trial import Example, choose_example, output_section, trial_section
 from sliplab.storage.schema.summary import SeedsUsed, Summary
 
 
@@ -45,8 +51,26 @@ class Shown:
     """
 
     fitted: Fitted
-    example: tuple[Example, Mapping[str, Any]] | None
+    example: tuple[Example, Mapping[str, npt.NDArray[Any]]] | None
     distances: Mapping[str, Mapping[str, Sequence[float]]]
+
+
+def read_shown(sources: Sources) -> Shown:
+    """Read what the page shows besides the summary's numbers."""
+    store, campaigns, evaluation = sources.store, list(sources.campaigns), sources.evaluation
+    models = wanted_models(store, campaigns, evaluation.reviewed is not None)
+    model = choose_model(models)
+    example = choose_example(campaigns, evaluation.trials)
+    counts: Mapping[str, npt.NDArray[Any]] = {}
+    if example is not None:
+        rule = evaluation.detection[example.item.name]
+        trial = example.recording.trial_id
+        counts = trial_counts(store, example.item.name, trial, rule)
+    return Shown(
+        model_file.load(model.path),
+        None if example is None else (example, counts),
+        label_errors.distances(store, campaigns),
+    )
 
 
 @dataclass(frozen=True)

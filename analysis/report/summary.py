@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -12,16 +11,13 @@ from sliplab.analysis.campaigns import Collected
 from sliplab.analysis.report.campaign import references_of
 from sliplab.analysis.report.holdout import holdout_part
 from sliplab.analysis.report.outcomes import account, trial_intervals, trial_outcome
+from sliplab.analysis.report.sources import Sources
 from sliplab.protocols.phases import Press
 from sliplab.protocols.presets import PAPER, at
 from sliplab.protocols.settings import AnalysisSettings, Detection
 from sliplab.storage.schema.evaluation import (
-    Evaluation,
     Experiments,
-    LabelCheck,
     OtherEvaluation,
-    TrainedBaseline,
-    WindowIntervals,
 )
 from sliplab.storage.schema.summary import (
     Difference,
@@ -32,7 +28,6 @@ from sliplab.storage.schema.summary import (
     Sync,
     TrialOutcome,
 )
-from sliplab.storage.trials.store import Store
 
 Json = dict[str, Any]
 
@@ -45,34 +40,6 @@ _WINDOWS = (
     "reliability", "calibration", "by_factor", "by_tenth", "no_slip", "by_trial", "work", "beside",
 )  # fmt: skip
 """Keys that the summary takes over from the evaluation's windows; docs/metrics.md."""
-
-
-@dataclass(frozen=True)
-class Sources:
-    """Results of earlier steps that a summary is made of.
-
-    Attributes:
-        settings: of training.
-        networks: results of other networks, by name.
-        baselines: of other methods, by name; window_intervals: of the test windows.
-        label_check: of labels with video; holds: slips in the hold, by campaign.
-        planned_bytes: of the committed trials, by campaign.
-        step_seconds: wall time of each step.
-        programs: results of other programs, by name.
-    """
-
-    store: Store
-    campaigns: Sequence[Collected]
-    settings: AnalysisSettings
-    evaluation: Evaluation
-    networks: Mapping[str, OtherEvaluation]
-    baselines: Mapping[str, TrainedBaseline]
-    window_intervals: WindowIntervals | None
-    label_check: LabelCheck | None
-    holds: Mapping[str, Json]
-    planned_bytes: Mapping[str, int]
-    step_seconds: Mapping[str, float]
-    programs: Mapping[str, Json]
 
 
 def make_summary(sources: Sources) -> Summary:

@@ -76,6 +76,26 @@ def render(result: Result) -> str:
     return render_page("tradeoff_scene.html", **values)
 
 
+def left_out(falls: bool, closed: int, trials: int) -> list[str]:
+    """Return the sentences that say which variants a trade-off leaves out, and why.
+
+    Args:
+        falls: a plate may fall in these trials.
+        closed: number of trials that have a closed form, of `trials`.
+    """
+    stated = []
+    if falls:
+        stated.append(
+            "Longer steps are left out: while a plate may fall the scene steps by a millisecond."
+        )
+    if closed < trials:
+        stated.append(
+            f"L0 is stated for {closed} of {trials} trials: a retraction that also goes sideways "
+            "has no closed form."
+        )
+    return stated
+
+
 def scene_cost(result: Result) -> SceneCost:
     """Return figure and table of cost and error."""
     series = {

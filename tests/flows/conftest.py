@@ -17,9 +17,9 @@ from tests.conftest import ROOT, SMALL
 _HOME = tempfile.mkdtemp(prefix="sliplab-prefect-")
 os.environ["PREFECT_HOME"] = _HOME
 
+from sliplab.analysis.report.sources import report_folder  # noqa: E402
 from sliplab.flows.collect import collect  # noqa: E402
 from sliplab.flows.planning.run_request import RunRequest, make_request  # noqa: E402
-from sliplab.flows.report import report_folder  # noqa: E402
 from sliplab.flows.running.orchestration import configure_prefect  # noqa: E402
 from sliplab.flows.study import Outcome, study  # noqa: E402
 from sliplab.storage.files import read_json  # noqa: E402

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
+from sliplab.analysis.report.sources import report_folder
 from sliplab.flows.planning.run_request import RunRequest
-from sliplab.flows.report import against, report_folder
+from sliplab.flows.report import against
 from sliplab.flows.study import Outcome
 from sliplab.storage.trials.store import Store
 from tests.flows.browser import PATIENCE_MS, launched, needs_browser

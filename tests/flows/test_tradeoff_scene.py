@@ -14,7 +14,7 @@ from sliplab.analysis.report.tradeoff_scene import render, sensitivity_markdown
 from sliplab.analysis.sweeps import sensitivity
 from sliplab.analysis.sweeps.runner import sample_trials
 from sliplab.analysis.sweeps.scene_tradeoff import Variant
-from sliplab.flows import scene_runs
+from sliplab.flows import scene_sensitivity
 from sliplab.flows import tradeoff_scene as tradeoff
 from sliplab.flows.running import stopping
 from sliplab.flows.scene_runs import changed, closed_form, ideal, run
@@ -141,10 +141,10 @@ def test_sensitivity_of_what_follows_from_the_law(
     monkeypatch.setattr(sensitivity, "CONTACT", ("scene.friction.kinetic",))
     camera = ("event_camera.shift_mm_per_n", "event_camera.noise_hz")
     monkeypatch.setattr(sensitivity, "CAMERA", camera)
-    monkeypatch.setattr(scene_runs, "EVENT_TRIALS", 1)
+    monkeypatch.setattr(scene_sensitivity, "EVENT_TRIALS", 1)
     quiet = changed(rig, {"event_camera": {"noise_hz": 0.0}})
     runs: list[int] = []
-    found = tradeoff.measure_sensitivity(quiet, plan, lambda: runs.append(1))
+    found = scene_sensitivity.measure_sensitivity(quiet, plan, lambda: runs.append(1))
     rows = {row["parameter"]: row["change"] for row in found["rows"]}
     grip, shift = rows["scene.friction.kinetic"], rows["event_camera.shift_mm_per_n"]
     # u = mu N / k_t: slip comes later, nearly in proportion, with more friction

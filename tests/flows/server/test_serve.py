@@ -51,7 +51,9 @@ def server() -> Iterator[EmbeddedServer]:
 def service(server: EmbeddedServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
     """This process as the one that serves a store that is not there yet."""
     monkeypatch.setenv("SLIPLAB_SERVICE", "")
-    monkeypatch.setattr(orchestration, "uses_private_server", lambda: False)  # as if somebody could look
+    monkeypatch.setattr(
+        orchestration, "uses_private_server", lambda: False
+    )  # as if somebody could look
     store = Store.create(tmp_path / "store")
     here = str(tmp_path)
     found = Service(str(store.folder), str(RIG), "here", "embedded", os.getpid(), (here,))

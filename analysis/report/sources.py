@@ -1,0 +1,126 @@
+"""Results of earlier steps that a report is made of, and the key of them all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sliplab.analysis.campaigns import Collected
+from sliplab.analysis.evaluation import baselines as window_baselines
+from sliplab.analysis.evaluation import networks as other_networks
+from sliplab.analysis.evaluation import windows as window_scores
+from sliplab.analysis.evaluation.evaluation import evaluation_of
+from sliplab.analysis.labels import label_errors
+from sliplab.analysis.networks.models import training_settings
+from sliplab.analysis.report.clocks import PAGE as CLOCKS
+from sliplab.analysis.report.programs import Json, read_programs
+from sliplab.protocols.settings import AnalysisSettings
+from sliplab.storage.schema.evaluation import (
+    Evaluation,
+    LabelCheck,
+    OtherEvaluation,
+    TrainedBaseline,
+    WindowIntervals,
+)
+from sliplab.storage.trials.derived import Derived, make_key
+from sliplab.storage.trials.store import Store
+
+STEP = "report"
+VERSION = 10
+
+
+def report_folder(store: Store) -> Path:
+    """Return the folder of the report."""
+    return store.folder / "report"
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Results of earlier steps that a summary is made of.
+
+    Attributes:
+        settings: of training.
+        networks: results of other networks, by name.
+        baselines: of other methods, by name; window_intervals: of the test windows.
+        label_check: of labels with video; holds: slips in the hold, by campaign.
+        planned_bytes: of the committed trials, by campaign.
+        step_seconds: wall time of each step.
+        programs: results of other programs, by name.
+    """
+
+    store: Store
+    campaigns: Sequence[Collected]
+    settings: AnalysisSettings
+    evaluation: Evaluation
+    networks: Mapping[str, OtherEvaluation]
+    baselines: Mapping[str, TrainedBaseline]
+    window_intervals: WindowIntervals | None
+    label_check: LabelCheck | None
+    holds: Mapping[str, Json]
+    planned_bytes: Mapping[str, int]
+    step_seconds: Mapping[str, float]
+    programs: Mapping[str, Json]
+
+
+def report_key(store: Store, campaigns: list[Collected]) -> str:
+    """Return the key of all that the report is made of.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    evaluation = evaluation_of(store)
+    collected = [
+        [
+            item.name,
+            item.plan.collection_hash,
+            len(item.campaign.quarantined()),
+            [recording.checksum for _, recording in item.trials],
+        ]
+        for item in campaigns
+    ]
+    reviewed = evaluation.reviewed is not None
+    others = other_networks.kept(store, campaigns, reviewed).values()
+    inputs = [
+        evaluation.key,
+        collected,
+        (report_folder(store) / CLOCKS).exists(),
+        sorted(found.key for found in others),
+        window_baselines.fresh_keys(store),
+        read_programs(store),
+        Derived.of(store, label_errors.CHECK).key(label_errors.CHECK),
+        # commands in the page name the store's folder
+        str(store.folder.resolve()),
+    ]
+    return make_key(STEP, VERSION, inputs, None)
+
+
+def read_sources(
+    store: Store,
+    campaigns: list[Collected],
+    planned_bytes: Mapping[str, int],
+    step_seconds: Mapping[str, float],
+) -> Sources:
+    """Read the results that earlier steps kept.
+
+    Args:
+        planned_bytes, step_seconds: as of `Sources`.
+
+    Raises:
+        StoreError: there is no evaluation of this version yet.
+    """
+    evaluation = evaluation_of(store)
+    return Sources(
+        store,
+        campaigns,
+        settings=training_settings(campaigns),
+        evaluation=evaluation,
+        networks=other_networks.kept(store, campaigns, evaluation.reviewed is not None),
+        baselines=window_baselines.baselines(store),
+        window_intervals=window_scores.window_intervals(store, evaluation.key),
+        label_check=label_errors.read_check(store),
+        holds=label_errors.holds_compared(store, campaigns),
+        planned_bytes=planned_bytes,
+        step_seconds=step_seconds,
+        programs=read_programs(store),
+    )
