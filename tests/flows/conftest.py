@@ -54,6 +54,15 @@ def summary_json(store: Store) -> dict[str, Any]:
     return read_json(report_folder(store) / "summary.json")
 
 
+def shape_of(data: Any) -> Any:
+    """Keys in their order and types of JSON data; a list is what its first item is."""
+    if isinstance(data, dict):
+        return {key: shape_of(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [shape_of(data[0])] if data else []
+    return type(data).__name__
+
+
 def six_trials(folder: Path, rig: Path) -> Path:
     """A store with the six slides, shortened, and nothing derived from them."""
     data = tiny()

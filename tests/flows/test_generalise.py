@@ -15,13 +15,15 @@ from sliplab.analysis.report.programs import read_programs
 from sliplab.analysis.sweeps import generalisation
 from sliplab.analysis.sweeps.generalisation import markdown
 from sliplab.analysis.sweeps.runner import Json, Task, task_sweep
-from sliplab.flows import other_rig
+from sliplab.flows import generalise, other_rig
 from sliplab.flows.generalise import Generalisation, measure_generalisation
 from sliplab.flows.planning.run_request import RunRequest
 from sliplab.flows.study import Outcome
 from sliplab.protocols.errors import InputError
+from sliplab.storage.files import read_json
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
+from tests.flows.conftest import shape_of
 
 
 @pytest.fixture(scope="module")
@@ -111,11 +113,61 @@ def test_the_table_has_a_row_for_each_result() -> None:
     assert "| speed 1 | no trials |" in text
 
 
+EXAMPLE = """{
+ "results": {
+  "skin 101": {
+   "argmax": 0.8333333333333334,
+   "high": null,
+   "key": "k1",
+   "low": null,
+   "n": 4,
+   "recall": {
+    "gross": 1.0,
+    "incipient": 0.5,
+    "no_slip": 1.0
+   },
+   "share": 0.75,
+   "trials": 1
+  },
+  "speed 1 mm/s": {
+   "key": "k2",
+   "left out": "no train trials"
+  }
+ },
+ "simulated": true
+}
+"""
+
+
+def test_the_file_is_the_same_to_the_byte(tmp_path: Path) -> None:
+    results = generalise._Results(tmp_path / "results.json", "results", {"simulated": True})
+    counts = np.array([[3, 0, 0], [0, 3, 0], [0, 0, 0], [0, 0, 5]])
+    y, trial = np.array([0, 1, 1, 2]), np.zeros(4, np.int64)
+    tasks = [
+        Task("skin 101", "k1", lambda: generalisation.scored(counts, y, trial)),
+        Task("speed 1 mm/s", "k2", lambda: {"left out": "no train trials"}),
+    ]
+    assert task_sweep(tasks, results).run() == 2
+    assert results.path.read_text() == EXAMPLE
+    assert "| speed 1 mm/s | no train trials |" in (tmp_path / "results.md").read_text()
+
+
+def test_a_trained_level_has_these_keys(store: Store) -> None:
+    kept = read_json(store.folder / "derived/generalisation/results.json")
+    assert shape_of(kept["results"]["direction 0 deg"]) == {
+        "argmax": "float", "high": "NoneType", "key": "str", "low": "NoneType", "n": "int",
+        "recall": {"gross": "float", "incipient": "float", "no_slip": "float"},
+        "seen": "float", "share": "float", "trained_on": "int", "trials": "int",
+    }  # fmt: skip
+
+
 def test_the_command_line(store: Store, tmp_path: Path) -> None:
     asked = ("--factor", "direction", "--skins", "1", "--trials", "4", "--epochs", "1")
     done = here("generalise", str(store.folder), *asked, "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
+    assert list(said) == ["step", "simulated", "made", "results", "file"]
+    assert said["results"] == read_json(Path(said["file"]))["results"]
     assert (said["simulated"], said["made"]) == (True, 0)
     assert "skin 101" in said["results"]
     shown = here("generalise", str(store.folder), *asked)

@@ -21,6 +21,7 @@ from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.derived import Derived
 from sliplab.storage.trials.store import Store, StoreError
 from tests.command_line import here
+from tests.flows.conftest import shape_of
 
 Json = dict[str, Any]
 GUESS = "event_camera.contrast"
@@ -68,6 +69,54 @@ def test_a_change_is_seen_and_compared_trial_by_trial(store: Store) -> None:
     none = changes(base, base)
     assert none["strict"] == (0.0, 0.0)
     assert all(span in (None, (0.0, 0.0)) for span in none.values())
+
+
+LATENCY = dict.fromkeys(
+    ("false_early", "late", "max", "mean", "median", "min", "missed", "n", "p95", "std"), "float"
+) | dict.fromkeys(("false_early", "late", "missed", "n"), "int")
+TRIAL = {
+    "campaign": "str",
+    "condition": {"depth": "str", "direction": "str", "speed": "str"},
+    "depth_zero_mm": "float",
+    "detected_gross_ns": "int",
+    "detected_incipient_ns": "int",
+    "end_ns": "int",
+    "experiment": "str",
+    "gross_ns": "int",
+    "incipient_ns": "int",
+    "latency": {
+        "false_early_gross": "bool", "false_early_incipient": "bool", "late_gross_ms": "NoneType",
+        "late_incipient_ms": "NoneType", "latency_gross_ms": "float",
+        "latency_incipient_ms": "float", "lead_ms": "float", "missed_gross": "bool",
+        "missed_incipient": "bool",
+    },
+    "trial": "str",
+}  # fmt: skip
+
+
+def test_a_setting_has_these_keys(store: Store) -> None:
+    file = read_json(store.folder / "derived/guesses/results.json")
+    assert list(file) == ["change", "settings", "simulated"]
+    assert (file["change"], file["simulated"]) == (0.2, True)
+    base, lower, _ = file["settings"].values()
+    assert (base["factor"], base["parameter"], base["value"]) == (1.0, None, None)
+    assert (lower["factor"], lower["parameter"]) == (0.8, GUESS)
+    found = shape_of(lower)
+    kinematic = found["experiments"].pop("kinematic")
+    assert list(found["experiments"]) == ["disturbance", "gravity"]
+    assert kinematic == {
+        "latency_ms": {"gross": LATENCY, "incipient": LATENCY},
+        "lead_ms": dict(sorted({**LATENCY, "detected_first": "int"}.items())),
+        "trials": "int",
+        "without_onsets": "int",
+    }
+    assert list(found) == [
+        "experiments", "factor", "key", "parameter", "trials", "value", "windows",
+    ]  # fmt: skip
+    assert found["trials"] == [TRIAL]
+    slides = {row["trial"] for row in lower["trials"] if row["campaign"] == "tiny"}
+    assert found["windows"] == {name: ["int"] for name in slides}
+    assert all(len(pair) == 2 for pair in lower["windows"].values())
 
 
 def test_what_is_kept_is_not_measured_again_and_leaves_no_store(store: Store) -> None:
@@ -128,6 +177,10 @@ def test_how_it_is_said_on_the_command_line(store: Store) -> None:
     done = here("guesses", store.folder, "--guess", GUESS, "--json")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
+    assert list(told) == ["simulated", "trials", "measured", "settings", "file"]
+    assert told["settings"] == {
+        name: figures(setting) for name, setting in kept(store).items()
+    }  # fmt: skip
     assert told["trials"] == {"tiny": 2, "tiny_gravity": 2}
     assert list(told["settings"]) == list(kept(store))
     table = here("guesses", store.folder, "--guess", GUESS)

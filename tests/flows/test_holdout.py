@@ -20,7 +20,7 @@ from sliplab.flows.study import Outcome
 from sliplab.storage.files import read_json, write_json
 from sliplab.storage.trials.store import Store, StoreError
 from tests.conftest import ROOT
-from tests.flows.conftest import summary_json
+from tests.flows.conftest import shape_of, summary_json
 
 SEEDS = (5, 6)
 """Not the release's: no test may look at its trials."""
@@ -113,6 +113,34 @@ def test_its_figures_stand_beside_those_of_the_test_trials(store: Store) -> None
     rows = holdout_rows(holdout_part(kept))
     assert rows[0][0] == "windows right, strict"
     assert rows[0][2] == f"4 trials, {summary['windows']['strict']['n']} windows"
+
+
+SHARE = {"high": "float", "low": "float", "n": "int", "share": "float", "trials": "int"}
+BY_CLASS = {"gross": "float", "incipient": "float", "no_slip": "float"}
+
+
+def test_the_file_has_these_keys(store: Store) -> None:
+    found = shape_of(read_json(store.folder / "holdout/results.json"))
+    assert list(found) == [
+        "evaluations", "key", "kinematic", "model", "protocol_seed", "rows", "simulated",
+        "skin_seed", "trials", "windows",
+    ]  # fmt: skip
+    assert found["evaluations"] == [
+        {"at": "str", "model": "str", "strict": "float", "version": "str"}
+    ]
+    assert found["windows"] == {
+        "accuracy": {"argmax": "float", "margin": "float", "n": "int", "strict": "float"},
+        "argmax": SHARE, "balance": BY_CLASS, "confusion": [["int"]], "precision": BY_CLASS,
+        "recall": BY_CLASS, "strict": SHARE,
+    }  # fmt: skip
+    assert list(found["kinematic"]) == ["latency_ms", "lead_ms", "trials", "without_onsets"]
+    assert list(found["rows"][0]) == [
+        "campaign", "condition", "detected_gross_ns", "detected_incipient_ns", "end_ns",
+        "experiment", "gross_ns", "incipient_ns", "latency", "trial",
+    ]  # fmt: skip
+    numbers = ("key", "model", "protocol_seed", "simulated", "skin_seed", "trials")
+    types = ["str", "str", "int", "bool", "int", "int"]
+    assert [found[name] for name in numbers] == types
 
 
 def test_a_file_of_another_shape_is_named(store: Store) -> None:
